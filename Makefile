@@ -1,0 +1,32 @@
+# Every target makes .venv first (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
+SHELL := /bin/bash
+BIN := .venv/bin
+RUN ?= runs/demo
+
+.PHONY: demo test test-all bench lint venv clean
+
+## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
+demo: venv
+	$(BIN)/attnwarp-eval run quick --out $(RUN)
+
+## lint, types and the tests that fit in a coffee break
+test: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+## everything, the thorough checks too
+test-all: lint
+	$(BIN)/python -m pytest
+
+bench: venv
+	$(BIN)/python -m attnwarp.render.bench
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+venv:
+	@scripts/venv.sh
+
+clean:
+	rm -rf .venv build dist *.egg-info .mypy_cache .ruff_cache

@@ -1,0 +1,44 @@
+"""Checks at the public doors: return the value unchanged, or say which argument, what came, what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+
+def shape(value: torch.Tensor | np.ndarray, expected: Sequence[int | str | None], name: str) -> None:
+    """Raise ValueError unless ``value`` has the ``expected`` shape.
+
+    An int must match; None or a string (a name for the reader, such as "N") matches any length.
+    """
+    actual = tuple(value.shape)
+    fits = len(actual) == len(expected) and all(
+        not isinstance(e, int) or a == e for a, e in zip(actual, expected, strict=True)
+    )
+    if not fits:
+        wanted = ", ".join("any" if e is None else str(e) for e in expected)
+        raise ValueError(f"{name}: got shape {actual}, expected ({wanted})")
+
+
+def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
+    """Raise ValueError naming the first row of ``value`` that holds a NaN or an infinity."""
+    array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    bad = ~np.isfinite(array)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name}: {array[where]} at index {where}; {int(bad.sum())} of {array.size} values are not finite"
+        )
+
+
+def one_of(value: str, allowed: Sequence[str], name: str) -> str:
+    """Return ``value`` if it is among ``allowed``, else raise ValueError that lists what is."""
+    if value not in allowed:
+        import difflib
+
+        near = difflib.get_close_matches(str(value), list(allowed), n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}{hint}")
+    return value

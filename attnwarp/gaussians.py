@@ -1,0 +1,134 @@
+"""Gaussians: a scene as 2D (surfel) or 3D Gaussian splats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import _check
+
+Kind = Literal["2d", "3d"]
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); a colour c is stored as (c - 0.5) / SH_C0."""
+
+
+@dataclass(eq=False)
+class Gaussians:
+    """N Gaussian splats.
+
+    Args:
+        kind: "2d" for flat discs with two scales (2DGS), "3d" for ellipsoids with three (3DGS).
+        means: (N, 3) centres, float32 or float64, relative to ``origin``, in scene units.
+        quats: (N, 4) rotations as wxyz, any length but zero. They turn the splat's own axes into world axes; the third
+            axis of a 2D splat is its normal.
+        scales: (N, 2) for "2d", (N, 3) for "3d": standard deviations, linear, positive, in scene units.
+        opacities: (N,) in [0, 1].
+        sh: (N, (degree + 1)^2, 3) spherical-harmonic coefficients of sRGB colour, degree 0 to 3, in the layout of the
+            common PLY files: colour = max(0, sum_k sh_k Y_k(direction) + 0.5).
+        origin: (3,) float64 world position of the coordinate zero of ``means``. Keeps far-away scenes exact.
+        antialiased: the splats were fitted with the antialiased (opacity-compensated) 3DGS rasteriser.
+
+    Raises:
+        ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is not positive, an
+            opacity outside [0, 1]; the message names the argument and the first bad row.
+    """
+
+    kind: Kind
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    sh: torch.Tensor
+    origin: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    antialiased: bool = False
+
+    def __post_init__(self) -> None:
+        _check.one_of(self.kind, ("2d", "3d"), "kind")
+        n = self.means.shape[0] if self.means.ndim else 0
+        _check.shape(self.means, ("N", 3), "means")
+        _check.shape(self.quats, (n, 4), "quats")
+        _check.shape(self.scales, (n, 2 if self.kind == "2d" else 3), "scales")
+        _check.shape(self.opacities, (n,), "opacities")
+        _check.shape(self.sh, (n, "K", 3), "sh")
+        if self.sh.shape[1] not in (1, 4, 9, 16):
+            raise ValueError(
+                f"sh: got {self.sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16 (degree 0 to 3)"
+            )
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            tensor = getattr(self, name)
+            if tensor.dtype not in (torch.float32, torch.float64):
+                raise ValueError(f"{name}: got {tensor.dtype}, expected float32 or float64")
+            _check.finite(tensor, name)
+        self.origin = np.array(self.origin, dtype=np.float64)
+        _check.shape(self.origin, (3,), "origin")
+        _check.finite(self.origin, "origin")
+        self._refuse(self.quats.detach().norm(dim=-1) == 0, "quats", "zero quaternion")
+        self._refuse((self.scales.detach() <= 0).any(dim=-1), "scales", "a scale that is not positive")
+        opacity = self.opacities.detach()
+        self._refuse((opacity < 0) | (opacity > 1), "opacities", "opacity outside [0, 1]")
+
+    @staticmethod
+    def _refuse(bad: torch.Tensor, name: str, what: str) -> None:
+        if bool(bad.any()):
+            index = int(torch.nonzero(bad)[0, 0])
+            raise ValueError(f"{name}: {what} at index {index} ({int(bad.sum())} of {bad.shape[0]} rows)")
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+    @staticmethod
+    def sh_from_rgb(rgb: torch.Tensor) -> torch.Tensor:
+        """(N, 1, 3) degree-0 coefficients of (N, 3) sRGB colours in [0, 1]."""
+        _check.shape(rgb, ("N", 3), "rgb")
+        return ((rgb - 0.5) / SH_C0)[:, None, :]
+
+    def rotations(self) -> torch.Tensor:
+        """(N, 3, 3) rotation matrices; column k is the splat's axis k in world coordinates."""
+        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=-1).unbind(-1)
+        rows = [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ]  # fmt: skip
+        return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+    def normals(self) -> torch.Tensor:
+        """(N, 3) unit normals in world coordinates, of arbitrary sign.
+
+        The third axis of a 2D splat, the axis of the smallest scale of a 3D one.
+        """
+        R = self.rotations()
+        if self.kind == "2d":
+            return R[:, :, 2]
+        axis = self.scales.argmin(dim=-1)
+        return R.gather(2, axis[:, None, None].expand(-1, 3, 1))[:, :, 0]
+
+    def world_means(self) -> npt.NDArray[np.float64]:
+        """(N, 3) float64 centres in world coordinates, origin included."""
+        return self.means.detach().cpu().numpy().astype(np.float64) + self.origin
+
+    def select(self, index: torch.Tensor) -> Gaussians:
+        """The splats that a (N,) boolean mask or (M,) integer index names, in that order."""
+        return self._map(lambda tensor: tensor[index])
+
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:
+        """A copy in another floating dtype or on another device."""
+        return self._map(lambda tensor: tensor.to(dtype=dtype, device=device))
+
+    def detach(self) -> Gaussians:
+        """The same values, outside autograd."""
+        return self._map(torch.Tensor.detach)
+
+    def _map(self, change: Any) -> Gaussians:
+        names = ("means", "quats", "scales", "opacities", "sh")
+        return replace(self, **{name: change(getattr(self, name)) for name in names})

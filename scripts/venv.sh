@@ -1,0 +1,64 @@
+#!/usr/bin/env bash
+# Make .venv with the tested versions and this checkout in it, from whatever the machine has.
+# A stamp that holds the hash of pyproject.toml and constraints.txt makes a second call free.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+venv=.venv
+stamp=$venv/.installed
+want=$(cat pyproject.toml constraints.txt scripts/venv.sh | sha256sum | cut -d' ' -f1)
+[ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ] && exit 0
+
+say() { printf '%s\n' "$*" >&2; }
+
+find_python() {
+    for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11; do
+        if command -v "$candidate" >/dev/null 2>&1 &&
+            "$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; then
+            command -v "$candidate"
+            return
+        fi
+    done
+    say "attnwarp: needs Python 3.11, 3.12 or 3.13 and found none; install one, or name it: make PYTHON=/path/to/python3.11"
+    exit 2
+}
+
+as_root() {
+    if [ "$(id -u)" = 0 ]; then "$@"; elif command -v sudo >/dev/null 2>&1; then sudo -n "$@"; else return 1; fi
+}
+
+make_venv() {
+    # Debian ships Python without ensurepip unless python3-venv is installed, so there are several ways in.
+    rm -rf "$venv"
+    if "$python" -c 'import ensurepip, venv' >/dev/null 2>&1; then
+        "$python" -m venv "$venv" && return
+    fi
+    if command -v uv >/dev/null 2>&1; then
+        uv venv --seed --python "$python" "$venv" && return
+    fi
+    if "$python" -m virtualenv --version >/dev/null 2>&1; then
+        "$python" -m virtualenv --python "$python" "$venv" && return
+    fi
+    if "$python" -m pip --version >/dev/null 2>&1; then
+        # A bare environment, and the machine's own pip to put a pip into it.
+        rm -rf "$venv"
+        "$python" -m venv --without-pip "$venv" && "$python" -m pip --python "$venv/bin/python" install --quiet pip && return
+    fi
+    if command -v apt-get >/dev/null 2>&1; then
+        say "attnwarp: this Python cannot make virtual environments; installing Debian's python3-venv"
+        if as_root apt-get update -qq && as_root apt-get install -y -qq python3-venv >&2; then
+            rm -rf "$venv"
+            "$python" -m venv "$venv" && return
+        fi
+    fi
+    say "attnwarp: cannot make a virtual environment with $python; install python3-venv (Debian: sudo apt-get install python3-venv) or uv"
+    exit 2
+}
+
+python=$(find_python)
+[ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
+say "attnwarp: installing the tested versions into $venv (a few minutes the first time)"
+# torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+printf '%s' "$want" >"$stamp"
