@@ -1,0 +1,270 @@
+"""What a study's YAML says, and the cells that follow from it."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval.errors import InputError
+
+if TYPE_CHECKING:
+    from attnwarp.settings import WarpSettings
+
+    from attnwarp_eval.scene import Scene
+
+PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1}
+"""Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get new ids."""
+
+ProbeName = Literal["calibration", "depth", "warp"]
+
+
+class StudyError(InputError):
+    """A study that cannot be run; the message names the file, what came and what to do."""
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Splats(_Model):
+    """Gaussians sampled on the scene's surfaces."""
+
+    kind: Literal["2d", "3d"] = "2d"
+    count: Annotated[int, Field(ge=1, le=5_000_000)] = 40_000
+    position_noise: Annotated[float, Field(ge=0)] = 0.0
+    normal_noise: Annotated[float, Field(ge=0, le=90)] = 0.0
+
+    @field_validator("kind", mode="before")
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        return value.lower() if isinstance(value, str) else value
+
+
+class Variant(_Model):
+    """One row of a table: where depth comes from, and how the warp is made."""
+
+    preset: str = "corrected"
+    set: dict[str, Any] = Field(default_factory=dict)
+    geometry: Literal["splats", "truth"] = "splats"
+    splats: dict[str, Any] = Field(default_factory=dict)
+
+    def settings(self) -> WarpSettings:
+        """The preset with this variant's own fields."""
+        from attnwarp.settings import preset
+
+        return preset(self.preset, **self.set)
+
+
+class Ablation(_Model):
+    """A table of the report: variants against a baseline, paired on scene and view."""
+
+    title: str
+    baseline: str
+    variants: list[str]
+    note: str = ""
+
+
+class Front(_Model):
+    """A figure of the report: error against seconds for these variants."""
+
+    title: str
+    variants: list[str]
+
+
+class Pictures(_Model):
+    """Which variants and views are kept as pictures."""
+
+    variants: list[str] = Field(default_factory=list)
+    views: list[str] = Field(default_factory=list)
+
+
+class Study(_Model):
+    """A study: scenes x variants x seeds x probes, and what the report shows of them."""
+
+    name: str
+    title: str = ""
+    description: str = ""
+    size: Annotated[int, Field(ge=16, le=4096)] = 512
+    scenes: Annotated[list[str], Field(min_length=1)]
+    views: list[str] = Field(default_factory=list, description="target views by name; all of them if empty")
+    seeds: Annotated[list[int], Field(min_length=1)] = [0]
+    spp: Annotated[int, Field(ge=1)] = 16
+    feature_sizes: Annotated[list[int], Field(min_length=1)] = [512, 64, 32]
+    feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
+    splats: Splats = Splats()
+    variants: Annotated[dict[str, Variant], Field(min_length=1)]
+    probes: Annotated[dict[ProbeName, list[str]], Field(min_length=1)]
+    ablations: list[Ablation] = Field(default_factory=list)
+    fronts: list[Front] = Field(default_factory=list)
+    pictures: Pictures = Pictures()
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Study:
+        used: list[tuple[str, list[str]]] = [(f"probes.{p}", v) for p, v in self.probes.items()]
+        used += [(f"ablations.{i}", [a.baseline, *a.variants]) for i, a in enumerate(self.ablations)]
+        used += [(f"fronts.{i}", f.variants) for i, f in enumerate(self.fronts)]
+        used += [("pictures.variants", self.pictures.variants)]
+        for where, names in used:
+            for name in names:
+                if name not in self.variants:
+                    raise ValueError(f"{where}: no variant {name!r}{_did_you_mean(name, self.variants)}")
+        for name, values in (("scenes", self.scenes), ("seeds", self.seeds), ("views", self.views)):
+            if len(set(values)) != len(values):
+                raise ValueError(f"{name}: something is named twice in {values}")
+        for name, variant in self.variants.items():
+            try:
+                variant.settings()
+                self.splats_of(variant)
+            except (ValueError, TypeError) as error:
+                raise ValueError(f"variants.{name}: {error}") from None
+        return self
+
+    def splats_of(self, variant: Variant) -> Splats:
+        """The study's splats with the variant's own fields."""
+        return Splats.model_validate({**self.splats.model_dump(), **variant.splats})
+
+    def cells(self, scenes: dict[str, Scene]) -> list[Cell]:
+        """Every cell of the study, scene by scene; variants of the same content share one.
+
+        Args:
+            scenes: the loaded scenes by name.
+
+        Raises:
+            StudyError: a view that a scene lacks.
+        """
+        found: dict[str, Cell] = {}
+        for scene_name in self.scenes:
+            scene = scenes[scene_name]
+            views = self._views_of(scene)
+            shown = tuple(v for v in self.pictures.views if v in views)
+            for probe, names in self.probes.items():
+                for name in names:
+                    for seed in self.seeds:
+                        spec = self._spec(scene, views, probe, self.variants[name], seed)
+                        pictures = shown if name in self.pictures.variants or probe == "calibration" else ()
+                        cell = Cell(spec, scene_name, name, probe, seed, (name,), pictures)
+                        if cell.id in found:
+                            old = found[cell.id]
+                            cell = Cell(
+                                spec,
+                                scene_name,
+                                old.variant,
+                                probe,
+                                seed,
+                                (*old.labels, name),
+                                old.pictures or pictures,
+                            )
+                        found[cell.id] = cell
+        return list(found.values())
+
+    def _views_of(self, scene: Scene) -> list[str]:
+        known = [c.name for c in scene.targets]
+        for name in self.views:
+            if name not in known:
+                raise StudyError(f"views: scene {scene.name!r} has no view {name!r}{_did_you_mean(name, known)}")
+        return [name for name in known if not self.views or name in self.views]
+
+    def _spec(self, scene: Scene, views: list[str], probe: ProbeName, variant: Variant, seed: int) -> dict[str, Any]:
+        """Only what decides the probe's numbers: two variants that differ elsewhere share a cell."""
+        settings = variant.settings().to_dict()
+        spec: dict[str, Any] = {
+            "probe": probe,
+            "protocol": PROTOCOLS[probe],
+            "scene": scene.content_hash,
+            "size": self.size,
+            "views": views,
+            "seed": seed,
+        }
+        if probe == "calibration":
+            return {
+                **spec,
+                "feature_sizes": self.feature_sizes,
+                "feature_channels": self.feature_channels,
+                "spp": self.spp,
+            }
+        if variant.geometry == "truth":
+            spec["geometry"] = "truth"
+        else:
+            spec["splats"] = self.splats_of(variant).model_dump()
+            spec["spp"] = self.spp
+        if probe == "depth":
+            return {**spec, "depth": settings["depth"], "depth_statistic": settings["depth_statistic"]}
+        return {
+            **spec,
+            "spp": self.spp,
+            "settings": settings,
+            "feature_sizes": self.feature_sizes,
+            "feature_channels": self.feature_channels,
+        }
+
+
+def _did_you_mean(name: str, known: Any) -> str:
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(map(repr, known))}"
+
+
+def shipped_studies() -> dict[str, Path]:
+    """Studies that come with the package, by name."""
+    folder = Path(str(resources.files("attnwarp_eval") / "studies"))
+    return {p.stem: p for p in sorted(folder.glob("*.yaml"))}
+
+
+def load_study(name_or_path: str, **overrides: Any) -> Study:
+    """Read a study by the name of a shipped one or by the path of a YAML file.
+
+    Args:
+        name_or_path: such as ``quick`` or ``my/study.yaml``.
+        overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
+
+    Raises:
+        StudyError: no such study, not YAML, an unknown key or a value out of range.
+    """
+    shipped = shipped_studies()
+    path = shipped.get(name_or_path, Path(name_or_path))
+    if not path.is_file():
+        raise StudyError(
+            f"{name_or_path}: no such study{_did_you_mean(name_or_path, shipped)}, or give a YAML file's path"
+        )
+    try:
+        data = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise StudyError(f"{path}: not YAML: {error}") from None
+    if not isinstance(data, dict):
+        raise StudyError(f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}")
+    data.update({k: v for k, v in overrides.items() if v is not None})
+    try:
+        return Study.model_validate(data)
+    except ValidationError as error:
+        raise StudyError(f"{path}: {explain(error)}") from None
+
+
+def explain(error: ValidationError) -> str:
+    """Pydantic's findings in one readable text: where, what was wrong, and the nearest known key."""
+    lines = []
+    for item in error.errors():
+        where = ".".join(str(p) for p in item["loc"]) or "study"
+        message = str(item["msg"]).removeprefix("Value error, ")
+        if item["type"] == "extra_forbidden":
+            message = f"unknown key{_did_you_mean(str(item['loc'][-1]), _known_keys(item['loc']))}"
+        lines.append(f"{where}: {message}" if item["loc"] else message)
+    return "; ".join(lines)
+
+
+def _known_keys(location: tuple[Any, ...]) -> list[str]:
+    model: type[BaseModel] = Study
+    inner: dict[str, type[BaseModel]] = {
+        "splats": Splats,
+        "variants": Variant,
+        "ablations": Ablation,
+        "fronts": Front,
+        "pictures": Pictures,
+    }
+    if len(location) > 1 and location[0] in inner:
+        model = inner[str(location[0])]
+    return list(model.model_fields)

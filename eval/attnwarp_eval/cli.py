@@ -1,0 +1,195 @@
+"""The command line: attnwarp-eval. Nothing heavy is imported until a command needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from attnwarp_eval.ablation.run import Plan, Summary
+    from attnwarp_eval.ablation.store import Store
+
+PASS, REGRESSION, USAGE, TOO_LITTLE = 0, 1, 2, 3
+"""Exit codes. 1 is kept for a regression; an unusable input is 2; a run that measured too little is 3."""
+
+app = typer.Typer(
+    name="attnwarp-eval",
+    help="Check warps, masks and depth of Gaussian scenes against exact truth, and report what accuracy costs in time.",
+    epilog="Exit codes: 0 pass, 1 regression, 2 wrong usage or input, 3 nothing or too little was measured.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+scenes_app = typer.Typer(
+    help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
+)
+app.add_typer(scenes_app, name="scenes")
+
+
+def fail(message: str, code: int = USAGE) -> typer.Exit:
+    """Say what went wrong on stderr; raise what this returns."""
+    typer.echo(f"attnwarp-eval: {message}", err=True)
+    return typer.Exit(code)
+
+
+@contextmanager
+def clear_errors() -> Iterator[None]:
+    """Turn errors about a person's input into one clear line and exit code 2."""
+    from attnwarp_eval.errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        raise fail(str(error)) from None
+
+
+def _split(text: str | None) -> list[str] | None:
+    return [part.strip() for part in text.split(",") if part.strip()] if text else None
+
+
+@app.command()
+def run(
+    study: Annotated[str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")] = "quick",
+    out: Annotated[Path | None, typer.Option(help="The run's folder; runs/<study> if left out.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")] = 1,
+    scenes: Annotated[str | None, typer.Option(help="Only these scenes (comma-separated names or paths).")] = None,
+    size: Annotated[int | None, typer.Option(min=16, max=4096, help="Image size in px, not the study's.")] = None,
+    keep_going: Annotated[bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")] = True,
+) -> None:
+    """Run a study and write its report. Killed half-way and started again, it goes on where it was."""
+    from attnwarp_eval.ablation import run as runner
+    from attnwarp_eval.ablation.store import Store
+    from attnwarp_eval.ablation.study import load_study
+
+    with clear_errors():
+        loaded = load_study(study, scenes=_split(scenes), size=size)
+        store = Store(out or Path("runs") / loaded.name)
+        with store.lock():
+            planned = runner.plan(loaded, store)
+            summary = _watch(planned, store, jobs, keep_going)
+            _write_report(store)
+    _print_failures(summary)
+    if not summary.complete:
+        missing = summary.expected - summary.reused - summary.computed
+        raise fail(f"{missing} of {summary.expected} cells were not measured; run again to retry them", TOO_LITTLE)
+
+
+def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
+    """Run with a progress bar on a terminal, or a line a cell where there is none."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from attnwarp_eval.ablation import run as runner
+
+    console = Console(stderr=True)
+    reused = f", {planned.reused} already done" if planned.reused else ""
+    console.print(
+        f"study [bold]{planned.study.name}[/bold]: {len(planned.cells)} cells{reused} -> {store.root}",
+        highlight=False,
+    )
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("starting", total=len(planned.cells), completed=planned.reused)
+        finished = planned.reused
+
+        def listen(event: str, info: dict[str, Any]) -> None:
+            nonlocal finished
+            if event == "start":
+                bar.update(task, description=info["title"])
+                return
+            finished += 1
+            bar.advance(task)
+            if event == "failed" or not console.is_terminal:
+                word = "" if event == "done" else f" FAILED: {info['error']}"
+                console.print(f"[{finished}/{len(planned.cells)}] {info['title']}{word}", markup=False, highlight=False)
+
+        return runner.execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
+
+
+def _print_failures(summary: Summary) -> None:
+    if not summary.failures:
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("scene", "variant", "probe", "error", title="failed cells")
+    for failure in summary.failures:
+        table.add_row(failure["scene"], failure["variant"], failure["probe"], failure["error"])
+    Console(stderr=True).print(table)
+
+
+def _write_report(store: Store, *, timings: bool = True) -> None:
+    from attnwarp_eval.report import write_report
+
+    for path in write_report(store, timings=timings):
+        typer.echo(path)
+
+
+@app.command()
+def report(
+    run: Annotated[Path, typer.Argument(help="The run's folder.")],
+    timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
+) -> None:
+    """Make report.md, report.html and results.jsonl again from the cells of a run."""
+    from attnwarp_eval.ablation.store import Store
+
+    with clear_errors():
+        _write_report(Store(run), timings=timings)
+
+
+@app.command()
+def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:
+    """Recompute the hashes of a run's cells and pictures and compare with the list of expected cells."""
+    from attnwarp_eval.ablation.store import Store
+
+    with clear_errors():
+        problems = Store(run).verify()
+    for what, items in (
+        ("damaged", problems.damaged),
+        ("failed", problems.failed),
+        ("missing", problems.missing),
+        ("not of this study (kept)", problems.unexpected),
+    ):
+        for item in items:
+            typer.echo(f"{what}: {item}")
+    if not problems.ok:
+        bad = len(problems.damaged) + len(problems.failed) + len(problems.missing)
+        raise fail(f"{run}: {bad} problems in {problems.checked} cells; run the study again to mend them", TOO_LITTLE)
+    typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
+
+
+@app.command()
+def studies() -> None:
+    """List the studies that ship with the package."""
+    from attnwarp_eval.ablation.study import load_study, shipped_studies
+
+    for name in shipped_studies():
+        loaded = load_study(name)
+        typer.echo(f"{name:12} {loaded.title}")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()
