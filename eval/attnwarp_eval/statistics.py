@@ -30,6 +30,7 @@ class Interval:
         scenes, views: how many of each went in.
         undefined: values that were NaN, left out and counted.
         detectable: the smallest difference that would have been seen (80 % power at 5 %); NaN with under two scenes.
+        p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with under two scenes.
     """
 
     mean: float
@@ -39,6 +40,7 @@ class Interval:
     views: int
     undefined: int
     detectable: float
+    p: float
 
     @property
     def known(self) -> bool:
@@ -66,17 +68,18 @@ def interval(values: Table, *, resamples: int = 2000, seed: int = 0, level: floa
     groups = [v for v in kept.values() if len(v)]
     views = sum(len(v) for v in groups)
     if not groups:
-        return Interval(np.nan, np.nan, np.nan, 0, 0, undefined, np.nan)
+        return Interval(np.nan, np.nan, np.nan, 0, 0, undefined, np.nan, np.nan)
     mean = float(np.mean([v.mean() for v in groups]))
     count = len(groups)
     if count < 2:
-        return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan)
+        return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan, np.nan)
     rng = np.random.default_rng(seed)
     means = np.stack([v[rng.integers(len(v), size=(resamples, len(v)))].mean(axis=1) for v in groups], axis=1)
     drawn = np.take_along_axis(means, rng.integers(count, size=(resamples, count)), axis=1).mean(axis=1)
     error = float(drawn.std(ddof=1)) * np.sqrt(count / (count - 1))
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
-    return Interval(mean, mean - half, mean + half, count, views, undefined, POWER_FACTOR * error)
+    p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
+    return Interval(mean, mean - half, mean + half, count, views, undefined, POWER_FACTOR * error, p)
 
 
 def paired(a: Mapping[str, Mapping[str, float]], b: Mapping[str, Mapping[str, float]], *, seed: int = 0) -> Interval:
@@ -92,15 +95,35 @@ def paired(a: Mapping[str, Mapping[str, float]], b: Mapping[str, Mapping[str, fl
     return interval(differences, seed=seed)
 
 
-def verdict(difference: Interval, direction: Literal["higher", "lower"], atol: float = 0.0) -> Verdict:
+def benjamini_hochberg(p: Sequence[float]) -> list[float]:
+    """p-values adjusted for the false discovery rate (Benjamini & Hochberg 1995); NaN stays NaN and does not count."""
+    values = np.asarray(p, dtype=np.float64)
+    adjusted = np.full(values.shape, np.nan)
+    known = np.flatnonzero(np.isfinite(values))
+    order = known[np.argsort(values[known], kind="stable")]
+    smallest = 1.0
+    for rank in range(len(order), 0, -1):
+        smallest = min(smallest, float(values[order[rank - 1]]) * len(order) / rank)
+        adjusted[order[rank - 1]] = smallest
+    return [float(v) for v in adjusted]
+
+
+def verdict(
+    difference: Interval,
+    direction: Literal["higher", "lower"],
+    *,
+    atol: float = 0.0,
+    adjusted_p: float | None = None,
+) -> Verdict:
     """What a paired difference (ours - theirs) says: better, worse, or can't tell; never "equal".
 
     Args:
         difference: from :func:`paired`.
         direction: which values of the metric are better.
         atol: differences whose interval does not clear this size are not told apart.
+        adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05 nothing is told.
     """
-    if not difference.known:
+    if not difference.known or (adjusted_p is not None and not adjusted_p <= 0.05):
         return "can't tell"
     sign = 1.0 if direction == "higher" else -1.0
     low, high = sorted((sign * difference.low, sign * difference.high))

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from attnwarp_eval.statistics import front, interval, paired, verdict
+from attnwarp_eval.statistics import benjamini_hochberg, front, interval, paired, verdict
 from scipy import stats
 
 
@@ -92,3 +92,20 @@ def test_a_nan_neither_enters_the_front_nor_evicts_a_good_point():
     assert front([1.0, 0.5, 2.0], [1.0, np.nan, 0.5]) == [0, 2]
     assert front([np.nan, 1.0], [0.0, 1.0]) == [1]
     assert front([], []) == []
+
+
+def test_adjusted_p_values_are_scipys_and_nan_does_not_count():
+    p = [0.01, 0.04, 0.03, 0.5, 0.001]
+    assert benjamini_hochberg(p) == pytest.approx(stats.false_discovery_control(p))
+    with_nan = benjamini_hochberg([0.01, np.nan, *p[1:]])
+    assert np.isnan(with_nan[1])
+    assert [with_nan[0], *with_nan[2:]] == pytest.approx(stats.false_discovery_control(p))
+
+
+def test_the_p_value_is_the_t_tests_and_an_adjusted_one_silences_a_verdict():
+    means = np.array([1.0, 2.0, 4.0, 7.0])
+    result = interval({f"s{i}": [m] * 5 for i, m in enumerate(means)}, resamples=200_000)
+    assert result.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue, rel=0.02)
+    clear = interval({f"s{i}": [1.0 + 0.01 * i] for i in range(4)})
+    assert verdict(clear, "higher", adjusted_p=0.04) == "better"
+    assert verdict(clear, "higher", adjusted_p=0.06) == "can't tell"

@@ -15,7 +15,6 @@ from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
     from attnwarp.settings import WarpSettings
-
     from attnwarp_eval.scene import Scene
 
 PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1}
@@ -56,9 +55,11 @@ class Variant(_Model):
 
     def settings(self) -> WarpSettings:
         """The preset with this variant's own fields."""
-        from attnwarp.settings import preset
+        from attnwarp import _check
+        from attnwarp.settings import PRESETS, WarpSettings
 
-        return preset(self.preset, **self.set)
+        _check.one_of(self.preset, list(PRESETS), "preset")
+        return WarpSettings.from_dict({**PRESETS[self.preset].to_dict(), **self.set})
 
 
 class Ablation(_Model):
