@@ -1,0 +1,97 @@
+"""What every figure is: its unit, which way is better, and how closely two runs of it must agree.
+
+Nothing heavy is imported here, so that reports and comparisons can read it without the checks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Direction = Literal["higher", "lower", "zero", "none"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The specification of one figure.
+
+    Attributes:
+        name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
+            (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
+        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "share" (of 1), "ratio" or "pixels" (a
+            count).
+        direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
+            describe.
+        atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
+        description: one line for a reader of a report.
+        protocol: raised when the figure's numbers change meaning.
+    """
+
+    name: str
+    unit: str
+    direction: Direction
+    atol: float
+    rtol: float
+    description: str
+    protocol: int = 1
+
+
+class Registry(dict[str, Metric]):
+    """Metrics by name, which also answers to a result's key, whatever region or size stands behind the name."""
+
+    def __missing__(self, key: str) -> Metric:
+        name = ".".join(key.split(".")[:2])
+        if name == key or name not in self:
+            raise KeyError(key)
+        return self[name]
+
+
+_SPECS = (
+    Metric("warp.epe_median", "px", "lower", 1e-4, 1e-3, "median endpoint error, visible pixels"),
+    Metric("warp.epe_p95", "px", "lower", 1e-3, 1e-2, "95th percentile of the endpoint error, visible pixels"),
+    Metric("warp.epe_mean", "px", "lower", 1e-3, 1e-2, "mean endpoint error, visible pixels"),
+    Metric("warp.epe_median_layer", "layer px", "lower", 1e-4, 1e-3, "median endpoint error on the feature grid"),
+    Metric("warp.epe_p95_layer", "layer px", "lower", 1e-3, 1e-2, "95th percentile of it on the feature grid"),
+    Metric("warp.below_half_px", "share", "higher", 1e-4, 0, "visible pixels warped to within 0.5 px"),
+    Metric("warp.below_1px", "share", "higher", 1e-4, 0, "visible pixels warped to within 1 px"),
+    Metric("warp.below_2px", "share", "higher", 1e-4, 0, "visible pixels warped to within 2 px"),
+    Metric("warp.coverage", "share", "higher", 1e-4, 0, "visible pixels that have a position"),
+    Metric("warp.visible", "pixels", "none", 0, 0, "pixels that the source truly shows"),
+    Metric("warp.feature_accepted", "ratio", "lower", 1e-4, 1e-3, "relative feature error, accepted visible pixels"),
+    Metric("warp.feature_visible", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all visible pixels"),
+    Metric("warp.feature_injected", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all accepted surface"),
+    Metric("warp.feature_pixels", "pixels", "none", 0, 0, "accepted visible feature pixels"),
+    Metric("occlusion.precision", "share", "higher", 1e-4, 0, "of what the mask accepts, truly visible"),
+    Metric("occlusion.recall", "share", "higher", 1e-4, 0, "of what is truly visible, accepted"),
+    Metric("occlusion.f1", "share", "higher", 1e-4, 0, "harmonic mean of precision and recall"),
+    Metric("occlusion.false_positive_rate", "share", "lower", 1e-4, 0, "of surface not visible, accepted"),
+    Metric("occlusion.false_negative_rate", "share", "lower", 1e-4, 0, "of what is truly visible, rejected"),
+    Metric("occlusion.behind_share", "share", "lower", 1e-4, 0, "of what the mask accepts, behind the source camera"),
+    Metric("occlusion.hidden_share", "share", "lower", 1e-4, 0, "of what the mask accepts, hidden from the source"),
+    Metric("occlusion.visible_accepted", "pixels", "none", 0, 0, "visible pixels accepted"),
+    Metric("occlusion.visible_rejected", "pixels", "none", 0, 0, "visible pixels rejected"),
+    Metric("occlusion.hidden_accepted", "pixels", "none", 0, 0, "hidden pixels accepted"),
+    Metric("occlusion.hidden_rejected", "pixels", "none", 0, 0, "hidden pixels rejected"),
+    Metric("occlusion.outside_accepted", "pixels", "none", 0, 0, "pixels accepted whose point is not in the source"),
+    Metric("occlusion.outside_rejected", "pixels", "none", 0, 0, "pixels rejected whose point is not in the source"),
+    Metric("occlusion.behind_accepted", "pixels", "none", 0, 0, "pixels behind the source camera accepted"),
+    Metric("occlusion.behind_rejected", "pixels", "none", 0, 0, "pixels behind the source camera rejected"),
+    Metric("occlusion.empty_accepted", "pixels", "none", 0, 0, "pixels without a surface accepted"),
+    Metric("occlusion.ambiguous_accepted", "pixels", "none", 0, 0, "ambiguous pixels accepted, not scored"),
+    Metric("occlusion.ambiguous_rejected", "pixels", "none", 0, 0, "ambiguous pixels rejected, not scored"),
+    Metric("depth.abs_rel", "ratio", "lower", 1e-5, 1e-2, "mean of |z - z*| / z*"),
+    Metric("depth.rmse", "scene", "lower", 1e-5, 1e-2, "root mean square of z - z*"),
+    Metric("depth.bias", "scene", "zero", 1e-5, 1e-2, "mean of z - z*; negative is toward the camera"),
+    Metric("depth.bias_relative", "ratio", "zero", 1e-5, 1e-2, "mean of (z - z*) / z*; negative is toward the camera"),
+    Metric("depth.bias_median", "ratio", "zero", 1e-5, 1e-2, "median of (z - z*) / z*; negative is toward the camera"),
+    Metric("depth.delta_1_01", "share", "higher", 1e-4, 0, "pixels with max(z / z*, z* / z) < 1.01"),
+    Metric("depth.delta_1_25", "share", "higher", 1e-4, 0, "pixels with max(z / z*, z* / z) < 1.25"),
+    Metric("depth.normal_mean", "deg", "lower", 1e-2, 1e-2, "mean angle to the true normal"),
+    Metric("depth.normal_median", "deg", "lower", 1e-2, 1e-2, "median angle to the true normal"),
+    Metric("depth.coverage", "share", "higher", 1e-4, 0, "pixels with a surface that have a depth"),
+    Metric("depth.pixels", "pixels", "none", 0, 0, "pixels with a surface"),
+    Metric("depth.phantom", "pixels", "none", 0, 0, "pixels with a depth and no surface"),
+)
+
+METRICS = Registry({metric.name: metric for metric in _SPECS})
+"""Every figure the checks give."""
