@@ -1,0 +1,5 @@
+"""Gaussian splats to pictures: one door, several backends. See docs/rendering.md."""
+
+from attnwarp.render.api import Render, normal_from_depth, render
+
+__all__ = ["Render", "normal_from_depth", "render"]

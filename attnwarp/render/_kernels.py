@@ -1,0 +1,613 @@
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
+"""The numba kernels of the CPU backend; :mod:`attnwarp.render.cpu` calls them, and says how they fit together.
+
+Written so that LLVM vectorises them: the innermost loop runs over the 64 pixels of a tile, holds no branch and no
+call, and touches one flat buffer at constant offsets, so that no alias check is needed. exp is a polynomial, since
+LLVM has no vector exp here. Every sum that crosses tiles is formed in a fixed order, so the bits never depend on the
+number of threads. No kernel starts threads: they release the GIL and are handed ranges of work.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.extending import intrinsic
+
+from attnwarp.render import constants as K
+
+# NaN and infinity are left to IEEE rules: the selects below rely on comparisons with them.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
+inlined = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, forceinline=True)
+
+f32 = np.float32
+TILE = K.TILE
+PIXELS = TILE * TILE
+
+# Columns of the table of projected splats, float64. The reference point is the projected centre, or the principal
+# point for a 2D splat whose centre is not in front; coefficients are per pixel of offset from it.
+X0, Y0 = 0, 1
+UX, UY, U0, VX, VY, V0, WX, WY, W0 = 2, 3, 4, 5, 6, 7, 8, 9, 10  # 2D: u = U / W, v = V / W, z = Z0 / W
+CA, CB, CC, LX, LY, RXX, RXY, RYY = 2, 3, 4, 5, 6, 7, 8, 9  # 3D: conic; z = Z0 l / (l^2 + r)
+Z0, ZLO, ZHI, OPACITY = 11, 12, 13, 14
+GRADIENTS = 15  # columns up to here carry gradients
+FILTER, WMAX, CUT, BOUNDED, PEAK = 15, 16, 17, 18, 19
+COLUMNS = 20
+
+# Slots of a tile's buffer, each 64 floats.
+XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, WW = range(15)
+SLOTS = 15
+
+HUGE = 1e30
+LOG2E_HALF = f32(0.5 * math.log2(math.e))
+# exp2(x) on [-0.5, 0.5], the Taylor coefficients ln(2)^k / k!; relative error 2e-8.
+E1, E2, E3, E4, E5, E6 = (f32(math.log(2.0) ** k / math.factorial(k)) for k in range(1, 7))
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C20, C21, C22, C23, C24 = (
+    1.0925484305920792,
+    -1.0925484305920792,
+    0.31539156525252005,
+    -1.0925484305920792,
+    0.5462742152960396,
+)
+C30, C31, C32, C33 = -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154
+C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
+
+
+@intrinsic
+def _float_of_bits(typing: Any, bits: Any) -> Any:
+    """The float32 whose bits an int32 holds."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.bitcast(args[0], ir.FloatType())
+
+    return nb.float32(nb.int32), codegen
+
+
+@inlined
+def _gauss(rho):
+    """exp(-rho / 2) in float32 for rho >= 0, relative error 1.5e-7; about 1e-19 from rho = 88 on."""
+    y = -min(rho, f32(88.0)) * LOG2E_HALF
+    k = np.int32(y - f32(0.5))
+    f = y - f32(k)
+    p = f32(1.0) + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * (E5 + f * E6)))))
+    return p * _float_of_bits(np.int32((k + np.int32(127)) << np.int32(23)))
+
+
+@inlined
+def _harmonics(degree, x, y, z, out):
+    out[0] = C0
+    if degree > 0:
+        out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
+    if degree > 1:
+        out[4], out[5], out[6] = C20 * x * y, C21 * y * z, C22 * (2 * z * z - x * x - y * y)
+        out[7], out[8] = C23 * x * z, C24 * (x * x - y * y)
+    if degree > 2:
+        out[9], out[10], out[11] = C30 * y * (3 * x * x - y * y), C31 * x * y * z, C32 * y * (4 * z * z - x * x - y * y)
+        out[12] = C33 * z * (2 * z * z - 3 * x * x - 3 * y * y)
+        out[13], out[14] = C34 * x * (4 * z * z - x * x - y * y), C35 * z * (x * x - y * y)
+        out[15] = C36 * x * (x * x - 3 * y * y)
+
+
+@inlined
+def _axes(q, i, Q):
+    """Rotation of quaternion i into Q; returns the quaternion's length."""
+    w, x, y, z = q[i, 0], q[i, 1], q[i, 2], q[i, 3]
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / length, x / length, y / length, z / length
+    Q[0, 0], Q[0, 1], Q[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    Q[1, 0], Q[1, 1], Q[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    Q[2, 0], Q[2, 1], Q[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return length
+
+
+# view: the camera as numbers, float64. Rows of R, then t (with the splats' origin moved in), then the intrinsics.
+R00, TX, FX, SKEW, FY, CX, CY, WIDTH, HEIGHT, NEAR, FLAT, CENTER, ANTIALIASED, HARMONIC = (
+    0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23,
+)  # fmt: skip
+VIEW = 24
+
+
+@jit
+def project(first, last, view, m, q, s, o, values, channels, table, features, key):
+    """Splats first..last to their rows of ``table``, ``features`` and ``key``; the key is NaN where nothing can
+    show."""
+    R = view[:9].copy().reshape(3, 3)
+    fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
+    flat, center = view[FLAT] > 0, view[CENTER] > 0
+    degree = round(math.sqrt(values.shape[1] / 3)) - 1
+    Q = np.empty((3, 3))
+    a = np.empty((3, 3))
+    S = np.empty((3, 3))
+    PC = np.empty(3)
+    Y = np.empty(16)
+    kx, ky, kxy = 1 / fx, 1 / fy, -skew / (fx * fy)
+    for i in range(first, last):
+        key[i] = np.nan
+        if o[i] < K.ALPHA_MIN:
+            continue
+        c0 = R[0, 0] * m[i, 0] + R[0, 1] * m[i, 1] + R[0, 2] * m[i, 2] + view[TX]
+        c1 = R[1, 0] * m[i, 0] + R[1, 1] * m[i, 1] + R[1, 2] * m[i, 2] + view[TX + 1]
+        c2 = R[2, 0] * m[i, 0] + R[2, 1] * m[i, 1] + R[2, 2] * m[i, 2] + view[TX + 2]
+        _axes(q, i, Q)
+        for r in range(3):
+            for k in range(3):
+                a[r, k] = R[r, 0] * Q[0, k] + R[r, 1] * Q[1, k] + R[r, 2] * Q[2, k]
+        ahead = c2 > near
+        opacity = o[i]
+        spread = (s[i, 0] * a[2, 0]) ** 2 + (s[i, 1] * a[2, 1]) ** 2
+        if not flat:
+            spread += (s[i, 2] * a[2, 2]) ** 2
+        spread = math.sqrt(spread)
+        if not ahead and (not flat or c2 + K.EXTENT_SIGMAS * spread <= near):
+            continue
+        axis = 2
+        if not flat:
+            axis = 0
+            if s[i, 1] < s[i, axis]:
+                axis = 1
+            if s[i, 2] < s[i, axis]:
+                axis = 2
+        row = table[i]
+        row[:] = 0.0
+        if ahead:
+            row[X0], row[Y0] = (fx * c0 + skew * c1) / c2 + cx, fy * c1 / c2 + cy
+        else:
+            row[X0], row[Y0] = cx, cy
+        row[Z0] = c2
+        if flat:
+            n0, n1, n2 = a[0, 2], a[1, 2], a[2, 2]
+            length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+            nc = n0 * c0 + n1 * c1 + n2 * c2
+            if abs(nc) < K.EDGE_ON * length:
+                nc = -K.EDGE_ON * length if nc < 0 else K.EDGE_ON * length
+            depth = c2 if ahead else length
+            row[Z0] = depth
+            for k in range(2):
+                tc = (a[0, k] * c0 + a[1, k] * c1 + a[2, k] * c2) / nc
+                scale = depth / s[i, k]
+                gx, gy = scale * (a[0, k] - tc * n0), scale * (a[1, k] - tc * n1)
+                row[UX + 3 * k] = gx * kx
+                row[UY + 3 * k] = gy * ky + gx * kxy
+                row[U0 + 3 * k] = 0.0 if ahead else scale * (a[2, k] - tc * n2)
+            scale = depth / nc
+            row[WX] = scale * n0 * kx
+            row[WY] = scale * (n1 * ky + n0 * kxy)
+            row[W0] = 1.0 if ahead else scale * n2
+            row[FILTER] = 1.0 if ahead else 0.0
+            row[WMAX] = depth / near
+        else:
+            limit = K.JACOBIAN_MARGIN * view[WIDTH] / 2 / fx
+            px = min(max(c0 / c2, -cx / fx - limit), (view[WIDTH] - cx) / fx + limit)
+            limit = K.JACOBIAN_MARGIN * view[HEIGHT] / 2 / fy
+            py = min(max(c1 / c2, -cy / fy - limit), (view[HEIGHT] - cy) / fy + limit)
+            sxx, sxy, syy = 0.0, 0.0, 0.0
+            for k in range(3):
+                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * s[i, k] / c2
+                gy = fy * (a[1, k] - py * a[2, k]) * s[i, k] / c2
+                sxx += gx * gx
+                sxy += gx * gy
+                syy += gy * gy
+            sharp = sxx * syy - sxy * sxy
+            sxx += K.BLUR_3D
+            syy += K.BLUR_3D
+            det = sxx * syy - sxy * sxy
+            row[CA], row[CB], row[CC] = syy / det, -sxy / det, sxx / det
+            if view[ANTIALIASED] > 0:
+                opacity *= math.sqrt(max(sharp / det, K.COMPENSATION_MIN))
+                if opacity < K.ALPHA_MIN:
+                    continue
+            if not center:
+                row[PEAK] = 1.0
+                q0 = 0.0
+                for r in range(3):
+                    for k in range(3):
+                        S[r, k] = (
+                            a[r, 0] * a[k, 0] / s[i, 0] ** 2
+                            + a[r, 1] * a[k, 1] / s[i, 1] ** 2
+                            + a[r, 2] * a[k, 2] / s[i, 2] ** 2
+                        )
+                for r in range(3):
+                    PC[r] = S[r, 0] * c0 + S[r, 1] * c1 + S[r, 2] * c2
+                q0 = PC[0] * c0 + PC[1] * c1 + PC[2] * c2
+                lx, ly = c2 * PC[0] / q0, c2 * PC[1] / q0
+                # Denominator minus l^2: positive semidefinite, so the difference of large numbers is taken here in
+                # float64.
+                rxx, rxy, ryy = (
+                    c2 * c2 * S[0, 0] / q0 - lx * lx,
+                    c2 * c2 * S[0, 1] / q0 - lx * ly,
+                    c2 * c2 * S[1, 1] / q0 - ly * ly,
+                )
+                row[LX], row[LY] = lx * kx, ly * ky + lx * kxy
+                row[RXX] = rxx * kx * kx
+                row[RXY] = kx * (rxx * kxy + rxy * ky)
+                row[RYY] = rxx * kxy * kxy + 2 * rxy * kxy * ky + ryy * ky * ky
+        if center:
+            row[ZLO] = max(c2, near)
+            row[ZHI] = row[ZLO]
+        else:
+            row[ZLO] = max(c2 - K.EXTENT_SIGMAS * spread, near)
+            row[ZHI] = max(c2 + K.EXTENT_SIGMAS * spread, near)
+        row[OPACITY] = opacity
+        cut = 2 * math.log(opacity / K.ALPHA_MIN)
+        row[CUT] = cut
+        # The outline is an ellipse only if the whole disc lies in front of the camera plane.
+        row[BOUNDED] = 1.0 if not flat or (ahead and c2 - math.sqrt(cut) * spread > 1e-3 * c2) else 0.0
+        facing = a[0, axis] * c0 + a[1, axis] * c1 + a[2, axis] * c2
+        flip = -1.0 if facing > 0 else 1.0
+        for k in range(3):
+            features[i, channels + k] = flip * Q[k, axis]
+        if view[HARMONIC] > 0:
+            length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+            x = (R[0, 0] * c0 + R[1, 0] * c1 + R[2, 0] * c2) / length
+            y = (R[0, 1] * c0 + R[1, 1] * c1 + R[2, 1] * c2) / length
+            z = (R[0, 2] * c0 + R[1, 2] * c1 + R[2, 2] * c2) / length
+            _harmonics(degree, x, y, z, Y)
+            for k in range(3):
+                total = 0.5
+                for j in range((degree + 1) ** 2):
+                    total += Y[j] * values[i, 3 * j + k]
+                features[i, k] = max(total, 0.0)
+        else:
+            for k in range(channels):
+                features[i, k] = values[i, k]
+        key[i] = c2
+
+
+@jit
+def radix_order(key):
+    """Indices of the keys that are not NaN, ascending, equal ones in their order of input (LSD radix sort of bits)."""
+    n = 0
+    for i in range(key.shape[0]):
+        if key[i] == key[i]:
+            n += 1
+    index = np.empty(n, np.int32)
+    other = np.empty(n, np.int32)
+    bits = np.empty(n, np.uint32)
+    spare = np.empty(n, np.uint32)
+    raw = key.view(np.uint32)
+    j = 0
+    for i in range(key.shape[0]):
+        if key[i] == key[i]:
+            b = raw[i] if key[i] != 0 else np.uint32(0)
+            # Flipping makes the order of the bits that of the numbers: all bits of a negative, the sign of a positive.
+            bits[j] = ~b if b >> np.uint32(31) else b | np.uint32(0x80000000)
+            index[j] = i
+            j += 1
+    counts = np.empty(2048, np.int64)
+    for shift in (0, 11, 22):
+        counts[:] = 0
+        for i in range(n):
+            counts[(bits[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
+        total = 0
+        for i in range(2048):
+            here = counts[i]
+            counts[i] = total
+            total += here
+        for i in range(n):
+            d = (bits[i] >> np.uint32(shift)) & np.uint32(2047)
+            spare[counts[d]] = bits[i]
+            other[counts[d]] = index[i]
+            counts[d] += 1
+        bits, spare = spare, bits
+        index, other = other, index
+    return index
+
+
+@inlined
+def _strip(A, B, C, h, y1, y2):
+    """x-interval of the part of the ellipse A x^2 + 2 B x y + C y^2 <= h with y1 <= y <= y2; empty as (1, -1)."""
+    det = A * C - B * B
+    top = math.sqrt(h * A / det)
+    y1 = max(y1, -top)
+    y2 = min(y2, top)
+    if y1 > y2:
+        return 1.0, -1.0
+    width = math.sqrt(h * C / det)
+    at = -B * width / C
+    s1 = math.sqrt(max(A * h - det * y1 * y1, 0.0))
+    s2 = math.sqrt(max(A * h - det * y2 * y2, 0.0))
+    right = width if y1 <= at <= y2 else max(-B * y1 + s1, -B * y2 + s2) / A
+    left = -width if y1 <= -at <= y2 else min(-B * y1 - s1, -B * y2 - s2) / A
+    return left, right
+
+
+@inlined
+def _overlaps(row, x1, x2, y1, y2):
+    """Whether a 2D splat of any outline may show in a rectangle (relative to its reference point), by intervals."""
+    hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
+    w = row[W0] + row[WX] * mx + row[WY] * my + abs(row[WX]) * hx + abs(row[WY]) * hy
+    if w > 0:
+        w = min(w, row[WMAX])
+        u = max(abs(row[U0] + row[UX] * mx + row[UY] * my) - abs(row[UX]) * hx - abs(row[UY]) * hy, 0.0)
+        v = max(abs(row[V0] + row[VX] * mx + row[VY] * my) - abs(row[VX]) * hx - abs(row[VY]) * hy, 0.0)
+        if u * u + v * v <= row[CUT] * w * w * (1 + 1e-9):
+            return True
+    if row[FILTER] > 0:
+        dx, dy = max(abs(mx) - hx, 0.0), max(abs(my) - hy, 0.0)
+        return 2 * (dx * dx + dy * dy) <= row[CUT] * (1 + 1e-9)
+    return False
+
+
+@jit
+def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, entries):
+    """Count (fill = False) or write (True) the tiles that splats order[first:last] may show in.
+
+    Exact for ellipses: a tile is taken if and only if the outline rho <= cut meets the rectangle of its pixel centres.
+    ``cursor`` counts per tile, or holds the place in ``entries`` of the next one.
+    """
+    flat = view[FLAT] > 0
+    width, height = int(view[WIDTH]), int(view[HEIGHT])
+    slack = 1e-4  # pixels; covers the rounding of the outline, adds nothing that can be measured
+    for place in range(first, last):
+        i = order[place]
+        row = table[i]
+        x0, y0, cut = row[X0], row[Y0], row[CUT]
+        ellipse = row[BOUNDED] > 0
+        A, B, C, h, ex, ey = row[CA], row[CB], row[CC], cut, 0.0, 0.0
+        if flat and ellipse:
+            ux, uy, vx, vy, wx, wy = row[UX], row[UY], row[VX], row[VY], row[WX], row[WY]
+            A = ux * ux + vx * vx - cut * wx * wx
+            B = ux * uy + vx * vy - cut * wx * wy
+            C = uy * uy + vy * vy - cut * wy * wy
+            det = A * C - B * B
+            if not (A > 0 and C > 0 and det > 1e-12 * A * C):
+                ellipse = False
+            else:
+                ex = cut * (C * wx - B * wy) / det
+                ey = cut * (A * wy - B * wx) / det
+                h = cut * (1 + wx * ex + wy * ey)
+        ty1, ty2 = 0, tiles_y - 1
+        if ellipse:
+            reach = math.sqrt(h * A / (A * C - B * B))
+            low, high = ey - reach, ey + reach
+            if flat:
+                radius = math.sqrt(cut / 2)
+                low, high = min(low, -radius), max(high, radius)
+            low, high = low + y0 - 0.5 - slack, high + y0 - 0.5 + slack
+            if high < 0 or low > height - 1:
+                continue
+            ty1 = math.ceil(max(low, 0.0)) // TILE
+            ty2 = int(min(high, height - 1.0)) // TILE
+        for ty in range(ty1, ty2 + 1):
+            y1 = ty * TILE + 0.5 - y0 - slack
+            y2 = min(ty * TILE + TILE, height) - 0.5 - y0 + slack
+            if ellipse:
+                left, right = _strip(A, B, C, h, y1 - ey, y2 - ey)
+                left += ex
+                right += ex
+                if flat:
+                    dl, dr = _strip(2.0, 0.0, 2.0, cut, y1, y2)
+                    if right < left:
+                        left, right = dl, dr
+                    elif dl <= dr:
+                        left, right = min(left, dl), max(right, dr)
+                if right < left:
+                    continue
+                low, high = left + x0 - 0.5 - slack, right + x0 - 0.5 + slack
+                if high < 0 or low > width - 1:
+                    continue
+                p1 = math.ceil(max(low, 0.0))
+                p2 = int(min(high, width - 1.0))
+                if p1 > p2:
+                    continue
+                for tx in range(p1 // TILE, p2 // TILE + 1):
+                    t = ty * tiles_x + tx
+                    if fill:
+                        entries[cursor[t]] = i
+                    cursor[t] += 1
+            else:
+                for tx in range(tiles_x):
+                    x1 = tx * TILE + 0.5 - x0
+                    x2 = min(tx * TILE + TILE, width) - 0.5 - x0
+                    if _overlaps(row, x1, x2, y1, y2):
+                        t = ty * tiles_x + tx
+                        if fill:
+                            entries[cursor[t]] = i
+                        cursor[t] += 1
+
+
+@jit
+def place_cursors(counts, starts):
+    """Turn counts (chunk, tile) into the place of each chunk's first entry in each tile; fill ``starts`` (tiles +
+    1)."""
+    total = 0
+    for t in range(counts.shape[1]):
+        starts[t] = total
+        for c in range(counts.shape[0]):
+            here = counts[c, t]
+            counts[c, t] = total
+            total += here
+    starts[counts.shape[1]] = total
+
+
+@inlined
+def _shade_flat(buf, row, ox, oy):
+    """alpha, z and 1 / z of a 2D splat at the 64 pixels of the tile at (ox, oy)."""
+    sx, sy = ox - row[X0], oy - row[Y0]
+    ux, uy, u0 = f32(row[UX]), f32(row[UY]), f32(row[U0] + row[UX] * sx + row[UY] * sy)
+    vx, vy, v0 = f32(row[VX]), f32(row[VY]), f32(row[V0] + row[VX] * sx + row[VY] * sy)
+    wx, wy, w0 = f32(row[WX]), f32(row[WY]), f32(row[W0] + row[WX] * sx + row[WY] * sy)
+    dx, dy = f32(sx), f32(sy)
+    z0, iz0, zlo, zhi, ilo, ihi = (
+        f32(row[Z0]),
+        f32(1 / row[Z0]),
+        f32(row[ZLO]),
+        f32(row[ZHI]),
+        f32(1 / row[ZHI]),
+        f32(1 / row[ZLO]),
+    )
+    opacity, wmax = f32(row[OPACITY]), f32(row[WMAX])
+    filtered = f32(2.0) if row[FILTER] > 0 else f32(0.0)
+    unfiltered = f32(0.0) if row[FILTER] > 0 else f32(HUGE)
+    for p in range(PIXELS):
+        x = buf[XS * 64 + p]
+        y = buf[YS * 64 + p]
+        w = w0 + wx * x + wy * y
+        r = f32(1.0) / w
+        u = (u0 + ux * x + uy * y) * r
+        v = (v0 + vx * x + vy * y) * r
+        rho = u * u + v * v
+        rho = rho if (w > f32(0.0)) & (w <= wmax) else f32(HUGE)
+        ex = x + dx
+        ey = y + dy
+        rho = min(rho, filtered * (ex * ex + ey * ey) + unfiltered)
+        a = opacity * _gauss(rho)
+        a = a if a >= f32(K.ALPHA_MIN) else f32(0.0)
+        buf[AL * 64 + p] = min(a, f32(K.ALPHA_MAX))
+        z = min(max(z0 * r, zlo), zhi)
+        buf[ZZ * 64 + p] = z if w > f32(0.0) else zhi
+        buf[IZ * 64 + p] = min(max(w * iz0, ilo), ihi)
+
+
+@inlined
+def _shade_round(buf, row, ox, oy):
+    """alpha, z and 1 / z of a 3D splat at the 64 pixels of the tile at (ox, oy)."""
+    dx, dy = f32(ox - row[X0]), f32(oy - row[Y0])
+    ca, cb, cc = f32(row[CA]), f32(2 * row[CB]), f32(row[CC])
+    opacity = f32(row[OPACITY])
+    for p in range(PIXELS):
+        x = buf[XS * 64 + p] + dx
+        y = buf[YS * 64 + p] + dy
+        rho = max(ca * x * x + cb * x * y + cc * y * y, f32(0.0))
+        a = opacity * _gauss(rho)
+        a = a if a >= f32(K.ALPHA_MIN) else f32(0.0)
+        buf[AL * 64 + p] = min(a, f32(K.ALPHA_MAX))
+    if row[PEAK] > 0:
+        lx, ly, rxx, rxy, ryy = f32(row[LX]), f32(row[LY]), f32(row[RXX]), f32(2 * row[RXY]), f32(row[RYY])
+        z0, zlo, zhi = f32(row[Z0]), f32(row[ZLO]), f32(row[ZHI])
+        for p in range(PIXELS):
+            x = buf[XS * 64 + p] + dx
+            y = buf[YS * 64 + p] + dy
+            along = f32(1.0) + lx * x + ly * y
+            across = along * along + max(rxx * x * x + rxy * x * y + ryy * y * y, f32(0.0))
+            z = min(max(z0 * along / max(across, f32(1e-30)), zlo), zhi)
+            buf[ZZ * 64 + p] = z
+            buf[IZ * 64 + p] = f32(1.0) / z
+    else:
+        z, iz = f32(row[ZLO]), f32(1 / row[ZLO])
+        for p in range(PIXELS):
+            buf[ZZ * 64 + p] = z
+            buf[IZ * 64 + p] = iz
+
+
+@jit
+def forward(first, last, view, tiles_x, starts, entries, table, features, background, ndc_scale, color, alpha, depth,
+            median, normal, l1, l2, state, done, seen, counts):  # fmt: skip
+    """Composite the tiles first..last.
+
+    ``state`` (6, H, W) keeps what the backward pass needs, ``done`` the entries worked off in
+    each tile, ``seen`` the sum of weights of each entry, ``counts`` [pairs, contributing].
+    """
+    flat = view[FLAT] > 0
+    width, height = int(view[WIDTH]), int(view[HEIGHT])
+    channels = background.shape[0]
+    n = channels + 3
+    buf = np.empty((SLOTS + n) * 64, np.float32)
+    for p in range(PIXELS):
+        buf[XS * 64 + p] = f32(p % TILE) + f32(0.5)
+        buf[YS * 64 + p] = f32(p // TILE) + f32(0.5)
+    pairs, contributing = 0, 0
+    stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
+    for t in range(first, last):
+        begin, end = starts[t], starts[t + 1]
+        ty, tx = t // tiles_x, t % tiles_x
+        ox, oy = float(tx * TILE), float(ty * TILE)
+        cols, rows = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
+        for p in range(PIXELS):
+            # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
+            buf[TT * 64 + p] = f32(1.0) if (p % TILE < cols) & (p // TILE < rows) else f32(0.0)
+        buf[AA * 64 : WW * 64] = f32(0.0)
+        buf[SLOTS * 64 :] = f32(0.0)
+        # Depths are summed relative to one of the tile's own, which keeps the digits of thin layers far away.
+        zref = f32(0.0)
+        if begin < end:
+            zref = f32(min(max(table[entries[begin], Z0], table[entries[begin], ZLO]), table[entries[begin], ZHI]))
+        izref = f32(1.0) / zref if begin < end else f32(0.0)
+        e = begin
+        while e < end:
+            i = entries[e]
+            if flat:
+                _shade_flat(buf, table[i], ox, oy)
+            else:
+                _shade_round(buf, table[i], ox, oy)
+            step = f32(e - begin + 1)
+            total = f32(0.0)
+            drawn = f32(0.0)
+            for p in range(PIXELS):
+                T = buf[TT * 64 + p]
+                a = buf[AL * 64 + p] if stop < T else f32(0.0)
+                z = buf[ZZ * 64 + p] - zref
+                m = buf[IZ * 64 + p] - izref
+                w = a * T
+                A = buf[AA * 64 + p]
+                D = buf[DD * 64 + p]
+                wz = w * z
+                wm = w * m
+                buf[L1 * 64 + p] += wz * A - w * D
+                buf[AA * 64 + p] = A + w
+                buf[DD * 64 + p] = D + wz
+                buf[M1 * 64 + p] += wm
+                buf[M2 * 64 + p] += wm * m
+                hit = a > f32(0.0)
+                opens = hit & (half < T)
+                buf[MED * 64 + p] = z if opens else buf[MED * 64 + p]
+                buf[MEDK * 64 + p] = step if opens else buf[MEDK * 64 + p]
+                buf[LAST * 64 + p] = step if hit else buf[LAST * 64 + p]
+                buf[TT * 64 + p] = T - w
+                buf[WW * 64 + p] = w
+                total += w
+                drawn += f32(1.0) if hit else f32(0.0)
+            seen[e] = total
+            contributing += int(drawn)
+            if drawn > f32(0.0):
+                for c in range(n):
+                    f = features[i, c]
+                    for p in range(PIXELS):
+                        buf[(SLOTS + c) * 64 + p] += buf[WW * 64 + p] * f
+            e += 1
+            if (e - begin) % 4 == 0:
+                left = f32(0.0)
+                for p in range(PIXELS):
+                    left = max(left, buf[TT * 64 + p])
+                if left <= stop:
+                    break
+        done[t] = e - begin
+        pairs += (e - begin) * PIXELS
+        for r in range(rows):
+            for k in range(cols):
+                p = r * TILE + k
+                y, x = ty * TILE + r, tx * TILE + k
+                A, D, a1, a2 = buf[AA * 64 + p], buf[DD * 64 + p], buf[M1 * 64 + p], buf[M2 * 64 + p]
+                covered = buf[LAST * 64 + p] > 0
+                alpha[y, x] = A
+                depth[y, x] = zref + D / A if covered else f32(np.nan)
+                median[y, x] = zref + buf[MED * 64 + p] if covered else f32(np.nan)
+                l1[y, x] = f32(2.0) * buf[L1 * 64 + p]
+                l2[y, x] = f32(ndc_scale) * max(A * a2 - a1 * a1, f32(0.0))
+                for c in range(channels):
+                    color[y, x, c] = buf[(SLOTS + c) * 64 + p] + (f32(1.0) - A) * background[c]
+                for c in range(3):
+                    normal[y, x, c] = buf[(SLOTS + channels + c) * 64 + p]
+                state[0, y, x] = buf[TT * 64 + p]
+                state[1, y, x] = D
+                state[2, y, x] = a1
+                state[3, y, x] = a2
+                state[4, y, x] = buf[LAST * 64 + p]
+                state[5, y, x] = buf[MEDK * 64 + p]
+    counts[0] = pairs
+    counts[1] = contributing
+
+
+@jit
+def gather_weights(starts, done, entries, seen, weight):
+    """Add the entries' weights to their splats', tile by tile."""
+    for t in range(done.shape[0]):
+        for e in range(starts[t], starts[t] + done[t]):
+            weight[entries[e]] += seen[e]

@@ -1,0 +1,289 @@
+"""The definition of every output, by brute force: each splat against each pixel in float64 torch, through autograd.
+
+No tiles, no boxes, no cut-offs but those of ``constants.py``. Written as the papers write it (ray-plane intersection,
+EWA projection), not as the fast backend computes it, so that agreement between the two means something. Small scenes
+and small images only: memory is splats x pixels.
+
+Notation. c = R m + t is a splat's centre in camera axes, d = K^-1 (x, y, 1) the ray of a pixel with d_z = 1, so that a
+depth z is the point z d. w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), front to back by c_z.
+
+2D splats: the ray meets the plane at z = n.c / n.d in the splat's coordinates (u, v); rho = min(u^2 + v^2, 2 |x -
+x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z, the second only where near < c_z. Where
+the second decides, z of the plane may lie anywhere: it is bounded to the splat's own extent, c_z +- 3.33 sigma_z, and
+to near. Since |u, v| <= 3.33 wherever the first decides, the bound changes nothing there and z is continuous.
+
+3D splats: EWA, Sigma' = J Sigma_c J^T + 0.3 I with J at x/z clamped on each side of the image; centres at or before
+the near plane are not drawn. "peak" depth is where the 3D Gaussian is largest along the ray, z = d.P.c / d.P.d with P
+= Sigma_c^-1, bounded to the splat's extent in the same way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from attnwarp.render import constants, harmonics, order
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """The cut-offs of ``constants.py``. Tests move them a little to bracket what rounding may decide either way."""
+
+    alpha_min: float = constants.ALPHA_MIN
+    stop: float = constants.TRANSMITTANCE_STOP
+    median: float = constants.MEDIAN_TRANSMITTANCE
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a backend gets from the door: checked, and free of defaults. N splats, C channels.
+
+    ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3, 3) and ``pose`` the
+    (4, 4) world-to-camera transform, both float64; ``pose`` and ``background`` (C,) may require gradients.
+    """
+
+    kind: str
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    values: Tensor
+    harmonic: bool
+    origin: Tensor
+    K: Tensor
+    pose: Tensor
+    width: int
+    height: int
+    background: Tensor
+    depth: str
+    near: float
+    antialiased: bool
+    ndc: tuple[float, float]
+
+    @property
+    def channels(self) -> int:
+        """Channels of the rendered colour."""
+        return 3 if self.harmonic else int(self.values.shape[1])
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a backend returns; the fields are those of :class:`attnwarp.render.Render`."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    median_depth: Tensor
+    normal: Tensor
+    distortion_l1: Tensor
+    distortion_l2_ndc: Tensor
+    weight: Tensor
+    counters: dict[str, int]
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotations of (N, 4) quaternions wxyz of any length but zero."""
+    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
+
+
+def render(inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int = 1 << 22) -> Outputs:
+    """Render by brute force in float64; differentiable in every tensor of ``inputs``.
+
+    Args:
+        chunk: splat-pixel pairs held at once; rows of pixels are worked off in groups of about this size.
+    """
+    limits = thresholds or Thresholds()
+    means, quats, scales = inputs.means.double(), inputs.quats.double(), inputs.scales.double()
+    opacities, values, background = inputs.opacities.double(), inputs.values.double(), inputs.background.double()
+    K, pose, origin = inputs.K.double(), inputs.pose.double(), inputs.origin.double()
+    R = pose[:3, :3]
+    # The world's origin is moved to the splats' in float64 before any splat is touched.
+    centers = means @ R.T + (R @ origin + pose[:3, 3])
+    world_axes = rotation_matrices(quats)
+    axes = R @ world_axes
+    if inputs.harmonic:
+        direction = torch.nn.functional.normalize(centers @ R, dim=-1)
+        features = harmonics.color(values, direction)
+    else:
+        features = values
+    axis = torch.full((len(means),), 2) if inputs.kind == "2d" else scales.argmin(dim=-1)
+    pick = axis[:, None, None].expand(-1, 3, 1)
+    facing = (axes.gather(2, pick)[..., 0] * centers).sum(-1)
+    normals = world_axes.gather(2, pick)[..., 0] * torch.where(facing > 0, -1.0, 1.0)[:, None]
+
+    content = [t.detach().numpy() for t in (means, scales, quats, opacities, values.flatten(1))]
+    index = torch.from_numpy(order.front_to_back(centers[:, 2].detach().numpy().astype("float32"), content))
+    splats = _Splats(
+        centers[index], axes[index], scales[index], opacities[index], features[index], normals[index], inputs, K, limits
+    )
+
+    rows_at_once = max(1, chunk // max(1, len(means) * inputs.width))
+    parts = []
+    for top in range(0, inputs.height, rows_at_once):
+        bottom = min(inputs.height, top + rows_at_once)
+        y, x = torch.meshgrid(
+            torch.arange(top, bottom, dtype=torch.float64) + 0.5,
+            torch.arange(inputs.width, dtype=torch.float64) + 0.5,
+            indexing="ij",
+        )
+        parts.append(splats.composite(x.reshape(-1), y.reshape(-1)))
+    merged = [torch.cat([part[k] for part in parts]) for k in range(7)]
+    shape = (inputs.height, inputs.width)
+    color, normal = merged[0].reshape(*shape, -1), merged[4].reshape(*shape, 3)
+    alpha, depth, median, l1, l2 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6))
+    color = color + (1 - alpha)[..., None] * background
+    weight = torch.zeros(len(means), dtype=torch.float64).index_add(0, index, sum(part[7] for part in parts))
+    counters = {
+        "splats": len(means),
+        "pairs": len(means) * inputs.width * inputs.height,
+        "contributing": sum(int(part[8]) for part in parts),
+    }
+    return Outputs(color, alpha, depth, median, normal, l1, l2, weight, counters)
+
+
+@dataclass(frozen=True)
+class _Splats:
+    """Splats in compositing order, in camera axes."""
+
+    centers: Tensor
+    axes: Tensor
+    scales: Tensor
+    opacities: Tensor
+    features: Tensor
+    normals: Tensor
+    inputs: Inputs
+    K: Tensor
+    limits: Thresholds
+
+    def composite(self, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        """Colour over black, alpha, depth, median, normal, l1, l2 per pixel, weight per splat, contributing pairs."""
+        inputs, limits = self.inputs, self.limits
+        rays = torch.stack(_unproject(x, y, self.K), dim=-1)
+        raw, z, drawn = (self._disc if inputs.kind == "2d" else self._ellipsoid)(x, y, rays)
+        drawn = drawn & (raw >= limits.alpha_min)
+        alpha = torch.where(drawn, raw.clamp(max=constants.ALPHA_MAX), 0.0)
+        before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]
+        alpha = torch.where(before > limits.stop, alpha, 0.0)
+        drawn = alpha > 0
+        w = alpha * before
+        z = torch.where(drawn, z, 1.0)
+        color = w @ self.features
+        normal = w @ self.normals
+        total = w.sum(dim=1)
+        # The first splat drawn has w >= ALPHA_MIN: a pixel is either clearly covered or not covered at all.
+        covered = drawn.any(dim=1)
+        safe = torch.where(covered, total, 1.0)
+        nan = torch.full_like(total, torch.nan)
+        depth = torch.where(covered, (w * z).sum(dim=1) / safe, nan)
+        opens = drawn & (before > limits.median)
+        if opens.shape[1]:
+            last = opens.shape[1] - 1 - opens.flip(1).int().argmax(dim=1)
+            median = torch.where(covered, z.gather(1, last[:, None])[:, 0], nan)
+        else:
+            median = nan
+        near, far = inputs.ndc
+        m = far / (far - near) * (1 - near / z)
+        l1 = 2 * (w * (z * _before(w) - _before(w * z))).sum(dim=1)
+        l2 = (w * (m * m * _before(w) + _before(w * m * m) - 2 * m * _before(w * m))).sum(dim=1)
+        return color, total, depth, median, normal, l1, l2, w.sum(dim=0), drawn.sum()
+
+    def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
+        near = self.inputs.near
+        reach = constants.EXTENT_SIGMAS * variance_z.sqrt()
+        z = self.centers[:, 2]
+        return (z - reach).clamp(min=near), (z + reach).clamp(min=near)
+
+    def _disc(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        near, c = self.inputs.near, self.centers
+        tu, tv, n = self.axes.unbind(-1)
+        nc = (n * c).sum(-1)
+        floor = constants.EDGE_ON * c.norm(dim=-1)
+        tilted = torch.where(nc.abs() < floor, torch.where(nc < 0, -floor, floor), nc)
+        in_front = c[:, 2] > near
+        # Tilting an edge-on plane leaves it through the centre, so n.d changes by as much as n.c does.
+        nd = rays @ n.T + torch.where(in_front, (tilted - nc) / torch.where(in_front, c[:, 2], 1.0), 0.0)
+        # 1 / z is the linear quantity along a row of pixels; it passes through zero where the plane is parallel to the
+        # ray.
+        inverse = nd / tilted
+        ahead = inverse > 0
+        z = 1 / torch.where(ahead, inverse, 1.0)
+        hit = z[..., None] * rays[:, None] - c
+        u = (hit * tu).sum(-1) / self.scales[:, 0]
+        v = (hit * tv).sum(-1) / self.scales[:, 1]
+        meets = ahead & (z >= near)
+        far_away = torch.full_like(u, torch.inf)
+        rho = torch.where(meets, u * u + v * v, far_away)
+        xc, yc = _project(c, in_front, self.K)
+        square = (x[:, None] - xc) ** 2 + (y[:, None] - yc) ** 2
+        screen = torch.where(in_front, square / constants.FILTER_SIGMA_2D**2, far_away)
+        rho = torch.minimum(rho, screen)
+        drawn = torch.isfinite(rho)
+        alpha = self.opacities * torch.exp(-0.5 * torch.where(drawn, rho, 0.0))
+        if self.inputs.depth == "center":
+            return alpha, c[:, 2].clamp(min=near).expand_as(alpha), drawn
+        spread = (self.scales[:, 0] * tu[:, 2]) ** 2 + (self.scales[:, 1] * tv[:, 2]) ** 2
+        lo, hi = self._extent(spread)
+        bounded = torch.minimum(torch.maximum(z, lo), hi)
+        return alpha, torch.where(ahead, bounded, hi.expand_as(z)), drawn
+
+    def _ellipsoid(self, x: Tensor, y: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        inputs, c, K = self.inputs, self.centers, self.K
+        in_front = c[:, 2] > inputs.near
+        depth = torch.where(in_front, c[:, 2], 1.0)
+        half = self.axes * self.scales[:, None, :]
+        sigma = half @ half.transpose(1, 2)
+        limit = []
+        for k, size in ((0, inputs.width), (1, inputs.height)):
+            margin = constants.JACOBIAN_MARGIN * size / 2 / K[k, k]
+            slope = c[:, k] / depth
+            low, high = -K[k, 2] / K[k, k] - margin, (size - K[k, 2]) / K[k, k] + margin
+            limit.append(torch.minimum(torch.maximum(slope, low), high))
+        zero, inverse = torch.zeros_like(depth), 1 / depth
+        J = torch.stack([inverse, zero, -limit[0] * inverse, zero, inverse, -limit[1] * inverse], dim=-1).reshape(
+            -1, 2, 3
+        )
+        J = K[:2, :2] @ J
+        cov = J @ sigma @ J.transpose(1, 2)
+        blurred = cov + constants.BLUR_3D * torch.eye(2, dtype=torch.float64)
+        det = blurred[:, 0, 0] * blurred[:, 1, 1] - blurred[:, 0, 1] ** 2
+        opacity = self.opacities
+        if inputs.antialiased:
+            sharp = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
+            opacity = opacity * (sharp / det).clamp(min=constants.COMPENSATION_MIN).sqrt()
+        xc, yc = _project(c, in_front, K)
+        dx, dy = x[:, None] - xc, y[:, None] - yc
+        power = (blurred[:, 1, 1] * dx * dx - 2 * blurred[:, 0, 1] * dx * dy + blurred[:, 0, 0] * dy * dy) / det
+        alpha = opacity * torch.exp(-0.5 * power)
+        drawn = in_front.expand_as(alpha)
+        if inputs.depth == "center":
+            return alpha, depth.expand_as(alpha), drawn
+        precision = self.axes / self.scales[:, None, :] ** 2 @ self.axes.transpose(1, 2)
+        along = torch.einsum("pi,nij,nj->pn", rays, precision, c)
+        across = torch.einsum("pi,nij,pj->pn", rays, precision, rays)
+        lo, hi = self._extent(sigma[:, 2, 2])
+        return alpha, torch.minimum(torch.maximum(along / across, lo), hi), drawn
+
+
+def _before(values: Tensor) -> Tensor:
+    """Sum over the splats in front, exclusive."""
+    return torch.cumsum(values, dim=1) - values
+
+
+def _unproject(x: Tensor, y: Tensor, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    dy = (y - K[1, 2]) / K[1, 1]
+    dx = (x - K[0, 2] - K[0, 1] * dy) / K[0, 0]
+    return dx, dy, torch.ones_like(dx)
+
+
+def _project(c: Tensor, in_front: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
+    z = torch.where(in_front, c[:, 2], 1.0)
+    return (K[0, 0] * c[:, 0] + K[0, 1] * c[:, 1]) / z + K[0, 2], K[1, 1] * c[:, 1] / z + K[1, 2]
