@@ -1,0 +1,66 @@
+"""Where derived files live, and how they are written so that two processes can share the folder."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def cache_dir() -> Path:
+    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else ``~/.cache/attnwarp``.
+
+    Everything in it can be recomputed and may be deleted at any time.
+    """
+    named = os.environ.get("ATTNWARP_CACHE")
+    if named:
+        return Path(named).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "attnwarp"
+
+
+def content_key(*parts: Any) -> str:
+    """SHA-256 (hex) of the canonical JSON of ``parts``: sorted keys, no spaces, NaN refused."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
+    """The arrays stored under ``kind``/``key``, or None when there are none or the file is damaged."""
+    path = cache_dir() / kind / f"{key}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        return None
+
+
+def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
+    """Store ``arrays`` under ``kind``/``key``.
+
+    The file appears under its name only when it is whole (written beside it, then renamed), so a reader never sees
+    half of one and the last of several writers wins. A folder that cannot be written is no error: the value is
+    simply computed again next time.
+    """
+    folder = cache_dir() / kind
+    temporary: Path | None = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{key[:16]}-", suffix=".tmp", dir=folder)
+        temporary = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **arrays)
+        temporary.replace(folder / f"{key}.npz")
+    except OSError:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()

@@ -1,0 +1,418 @@
+"""What a scene is made of: spheres, rectangles and boxes in closed form, triangle meshes, signed-distance bodies.
+
+Everything is float64 and in world coordinates. Meshes are what bodies become; a body's mesh, not its distance
+function, is the truth that everything is measured against.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+MESHING_PROTOCOL = 1
+"""Raised whenever the same description of a body would give other vertices; part of every cache key."""
+
+DEGENERATE_AREA = 1e-12
+"""Triangles whose area is below this times their longest edge squared have no usable plane and are dropped."""
+
+
+class MeshNotice(UserWarning):
+    """Something in a mesh was repaired or left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sphere:
+    """A sphere: ``center`` (3,), ``radius`` > 0."""
+
+    center: Array
+    radius: float
+    object_id: int = 0
+
+    def moved(self, scale: float, offset: npt.ArrayLike) -> Sphere:
+        """The shape in a world whose points p became ``scale`` * p + ``offset``."""
+        return replace(self, center=self.center * scale + np.asarray(offset, float), radius=self.radius * scale)
+
+    def bounds(self) -> Array:
+        """(2, 3) lower and upper corner of the axis-aligned bounding box."""
+        return np.stack([self.center - self.radius, self.center + self.radius])
+
+    def contains(self, point: Array) -> bool:
+        """Whether the (3,) ``point`` lies inside."""
+        return bool(np.linalg.norm(point - self.center) < self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Rectangle:
+    """A two-sided flat rectangle: ``center`` (3,) and the half edges ``u``, ``v`` (3,), perpendicular."""
+
+    center: Array
+    u: Array
+    v: Array
+    object_id: int = 0
+
+    @property
+    def normal(self) -> Array:
+        """(3,) unit normal u x v."""
+        n = np.cross(self.u, self.v)
+        return n / np.linalg.norm(n)
+
+    def moved(self, scale: float, offset: npt.ArrayLike) -> Rectangle:
+        """The shape in a world whose points p became ``scale`` * p + ``offset``."""
+        return replace(self, center=self.center * scale + np.asarray(offset, float), u=self.u * scale, v=self.v * scale)
+
+    def bounds(self) -> Array:
+        """(2, 3) lower and upper corner of the axis-aligned bounding box."""
+        reach = np.abs(self.u) + np.abs(self.v)
+        return np.stack([self.center - reach, self.center + reach])
+
+    def contains(self, point: Array) -> bool:
+        """A rectangle has no inside."""
+        return False
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A box: ``center`` (3,), ``half`` (3,) half sizes along the columns of ``axes`` (3, 3)."""
+
+    center: Array
+    half: Array
+    axes: Array = field(default_factory=lambda: np.eye(3))
+    object_id: int = 0
+
+    def moved(self, scale: float, offset: npt.ArrayLike) -> Box:
+        """The shape in a world whose points p became ``scale`` * p + ``offset``."""
+        return replace(self, center=self.center * scale + np.asarray(offset, float), half=self.half * scale)
+
+    def bounds(self) -> Array:
+        """(2, 3) lower and upper corner of the axis-aligned bounding box."""
+        reach = np.abs(self.axes) @ self.half
+        return np.stack([self.center - reach, self.center + reach])
+
+    def contains(self, point: Array) -> bool:
+        """Whether the (3,) ``point`` lies inside."""
+        return bool((np.abs((point - self.center) @ self.axes) < self.half).all())
+
+    def rectangles(self) -> list[Rectangle]:
+        """The six faces, their normals (u x v) outward, in the order -x, +x, -y, +y, -z, +z of the box's axes."""
+        faces = []
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                a, b = (axis + 1) % 3, (axis + 2) % 3
+                u, v = self.axes[:, a] * self.half[a], self.axes[:, b] * self.half[b] * sign
+                center = self.center + self.axes[:, axis] * self.half[axis] * sign
+                faces.append(Rectangle(center, u, v, self.object_id))
+        return faces
+
+    def mesh(self) -> Mesh:
+        """The same surface as 12 triangles, facing outward."""
+        vertices: list[list[Array]] = []
+        faces: list[list[int]] = []
+        for side in self.rectangles():
+            k = 4 * len(vertices)
+            c, u, v = side.center, side.u, side.v
+            vertices.append([c - u - v, c + u - v, c + u + v, c - u + v])
+            faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
+        return Mesh(np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int64), object_id=self.object_id)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3) indices into ``vertices``.
+        normals: (V, 3) unit vertex normals for smooth shading, or None for flat shading. Geometry never uses them.
+        tint: (V, 3) linear RGB that multiplies the object's texture, or None.
+    """
+
+    vertices: Array
+    faces: Indices
+    normals: Array | None = None
+    tint: Array | None = None
+    object_id: int = 0
+
+    def moved(self, scale: float, offset: npt.ArrayLike) -> Mesh:
+        """The shape in a world whose points p became ``scale`` * p + ``offset``."""
+        return replace(self, vertices=self.vertices * scale + np.asarray(offset, float))
+
+    def turned(self, R: Array) -> Mesh:
+        """The mesh with every vertex p moved to R p (``R`` a (3, 3) rotation)."""
+        return replace(
+            self,
+            vertices=self.vertices @ R.T,
+            normals=None if self.normals is None else self.normals @ R.T,
+        )
+
+    def bounds(self) -> Array:
+        """(2, 3) lower and upper corner of the axis-aligned bounding box."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(0), used.max(0)])
+
+    def contains(self, point: Array) -> bool:
+        """Whether the (3,) ``point`` lies inside, by the generalised winding number.
+
+        A solid angle of more than half the sphere counts as inside, so small holes and a few duplicated faces do
+        not change the answer (Jacobson et al. 2013; triangle angles after Van Oosterom and Strackee 1983).
+        """
+        a, b, c = (self.vertices[self.faces[:, k]] - point for k in range(3))
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
+        dot = np.einsum
+        denominator = (
+            la * lb * lc + dot("ij,ij->i", a, b) * lc + dot("ij,ij->i", b, c) * la + dot("ij,ij->i", c, a) * lb
+        )
+        winding = np.arctan2(numerator, denominator).sum() / (2 * np.pi)
+        return bool(abs(winding) > 0.5)
+
+    def cleaned(self, name: str) -> Mesh:
+        """The mesh without degenerate triangles; a :class:`MeshNotice` says how many were dropped.
+
+        Duplicated faces and holes stay: ray casting and rendering take them as they are.
+
+        Raises:
+            ValueError: no triangle is left, a vertex is not finite, or a face names a vertex that does not exist.
+        """
+        if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
+            raise ValueError(f"{name}: a face names vertex {int(self.faces.max())}, but there are {len(self.vertices)}")
+        used = np.unique(self.faces)
+        bad = used[~np.isfinite(self.vertices[used]).all(axis=1)] if self.faces.size else used
+        if bad.size:
+            raise ValueError(f"{name}: vertex {int(bad[0])} is not finite; repair the file")
+        corners = self.vertices[self.faces]
+        edges = corners - np.roll(corners, 1, axis=1)
+        longest = (edges**2).sum(-1).max(-1)
+        area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+        keep = area > DEGENERATE_AREA * longest
+        if not keep.any():
+            raise ValueError(f"{name}: holds no triangle with an area (of {len(self.faces)})")
+        if keep.all():
+            return self
+        dropped = np.flatnonzero(~keep)
+        warnings.warn(
+            f"{name}: dropped {dropped.size} of {len(keep)} triangles without area (first: face {int(dropped[0])})",
+            MeshNotice,
+            stacklevel=2,
+        )
+        return replace(self, faces=self.faces[keep])
+
+
+Shape = Sphere | Rectangle | Box | Mesh
+
+
+# Signed-distance bodies ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """Part of a body: an ellipsoid with its ``radii`` along x, y, z, pitched about the y axis by ``pitch`` degrees."""
+
+    center: tuple[float, float, float]
+    radii: tuple[float, float, float]
+    pitch: float = 0.0
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    blend: bool = True
+
+    def distance(self, points: Array) -> Array:
+        """(N,) signed distance bound of (N, 3) ``points``: |q|(|q| - 1)/|q/r| with q = p/r (Quilez)."""
+        a = np.radians(self.pitch)
+        R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        r = np.asarray(self.radii)
+        q = (points - np.asarray(self.center)) @ R / r
+        k0 = np.linalg.norm(q, axis=-1)
+        k1 = np.linalg.norm(q / r, axis=-1)
+        return np.where(k1 > 0, k0 * (k0 - 1) / np.where(k1 > 0, k1, 1), -r.min())
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), max(self.radii)
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """Part of a body: a rod from ``start`` to ``end`` whose radius goes from ``radii[0]`` to ``radii[1]``."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radii: tuple[float, float]
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    blend: bool = True
+
+    def distance(self, points: Array) -> Array:
+        """(N,) distance of (N, 3) ``points`` from the segment, less the radius there."""
+        a, b = np.asarray(self.start), np.asarray(self.end)
+        along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0, 1)
+        gap = np.linalg.norm(points - a - along[:, None] * (b - a), axis=-1)
+        return gap - (self.radii[0] + along * (self.radii[1] - self.radii[0]))
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        ends, r = np.array([self.start, self.end]), max(self.radii)
+        return np.stack([ends.min(0) - r, ends.max(0) + r])
+
+
+Part = Ellipsoid | Capsule
+
+
+def body_distance(parts: list[Part], blend: float, points: npt.ArrayLike) -> Array:
+    """Signed distance bound of a body, negative inside.
+
+    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend``; the others (eyes, a
+    nose) are joined sharply.
+
+    Args:
+        parts: at least one.
+        blend: width of the joints in scene units, 0 for sharp ones.
+        points: (N, 3).
+
+    Returns:
+        (N,) float64.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    soft: Array | None = None
+    hard: Array | None = None
+    for part in parts:
+        d = part.distance(points)
+        if not part.blend:
+            hard = d if hard is None else np.minimum(hard, d)
+        elif soft is None:
+            soft = d
+        elif blend > 0:
+            h = np.clip(0.5 + 0.5 * (soft - d) / blend, 0, 1)
+            soft = soft + h * (d - soft) - blend * h * (1 - h)
+        else:
+            soft = np.minimum(soft, d)
+    if soft is None or hard is None:
+        chosen = soft if soft is not None else hard
+        if chosen is None:
+            raise ValueError("parts: got an empty list, expected at least one part")
+        return chosen
+    return np.minimum(soft, hard)
+
+
+def _part_colors(parts: list[Part], width: float, points: Array) -> Array:
+    distances = np.stack([part.distance(points) for part in parts])
+    # A sharp part owns its whole surface; blended parts share their colours across the joint.
+    weights = np.exp(-np.clip(distances - distances.min(0), 0, None) / max(width, 1e-12))
+    for k, part in enumerate(parts):
+        if not part.blend:
+            mine = distances[k] < 1e-3 * width + 1e-9
+            weights[:, mine] = 0
+            weights[k, mine] = 1
+    colors = np.array([part.color for part in parts])
+    return (weights.T @ colors) / weights.sum(0)[:, None]
+
+
+def mesh_body(parts: list[Part], blend: float, resolution: int) -> Mesh:
+    """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the distance.
+
+    Args:
+        parts: see :func:`body_distance`.
+        resolution: cells along the longest side of the bounding box.
+
+    Returns:
+        A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by content.
+    """
+    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key.
+    key = content_key("body", MESHING_PROTOCOL, [repr(part) for part in parts], blend, resolution)
+    stored = read_arrays("meshes", key)
+    if stored is None:
+        stored = _march(parts, blend, resolution)
+        write_arrays("meshes", key, stored)
+    return Mesh(stored["vertices"], stored["faces"], stored["normals"], stored["tint"])
+
+
+def _march(parts: list[Part], blend: float, resolution: int) -> dict[str, npt.NDArray]:
+    from skimage.measure import marching_cubes
+
+    reach = np.stack([part.reach() for part in parts])
+    low, high = reach[:, 0].min(0), reach[:, 1].max(0)
+    step = float((high - low).max() / resolution)
+    low, high = low - 2 * step - blend / 4, high + 2 * step + blend / 4
+    counts = np.ceil((high - low) / step).astype(int) + 1
+    axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
+    volume = np.empty(counts)
+    for i, x in enumerate(axes[0]):  # slab by slab: a whole grid of points would take gigabytes at high resolutions
+        slab = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), -1).reshape(-1, 3)
+        volume[i] = body_distance(parts, blend, slab).reshape(counts[1:])
+    if volume.min() >= 0:
+        raise ValueError(f"body: no part is thick enough to be seen at resolution {resolution}; raise it")
+    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent")
+    vertices = vertices.astype(np.float64) + low
+
+    def gradient(points: Array) -> Array:
+        e = 1e-4 * step
+        shifts = np.eye(3) * e
+        return np.stack(
+            [
+                (body_distance(parts, blend, points + s) - body_distance(parts, blend, points - s)) / (2 * e)
+                for s in shifts
+            ],
+            axis=-1,
+        )
+
+    for _ in range(2):
+        g = gradient(vertices)
+        move = body_distance(parts, blend, vertices) / np.maximum((g**2).sum(-1), 1e-12)
+        # Half a cell at most, so that creases, where the gradient jumps, cannot fold the mesh.
+        vertices = vertices - g * np.clip(move, -0.5 * step, 0.5 * step)[:, None]
+    normals = gradient(vertices)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    mesh = Mesh(vertices, faces[:, ::-1].astype(np.int64))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[mesh.faces[:, 0]])
+    if np.median(outward) < 0:
+        mesh = replace(mesh, faces=mesh.faces[:, ::-1].copy())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MeshNotice)  # marching cubes makes slivers by design
+        mesh = mesh.cleaned("body")
+    return {
+        "vertices": mesh.vertices,
+        "faces": np.ascontiguousarray(mesh.faces),
+        "normals": normals,
+        "tint": _part_colors(parts, max(blend, step) / 3, vertices),
+    }
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+
+
+def read_mesh(path: Path) -> Mesh:
+    """A triangle mesh from a file (.ply, .obj, .glb, .gltf, .stl, .off), all its parts joined.
+
+    Vertex colours, where the file has them, become the tint (taken as sRGB). Degenerate triangles are dropped with
+    a :class:`MeshNotice`.
+
+    Raises:
+        ValueError: the format is not known, or the file holds no triangles.
+    """
+    from attnwarp_eval.truth._open3d import open3d
+
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise ValueError(f"{path}: mesh format {path.suffix!r} is not read; use one of {', '.join(MESH_SUFFIXES)}")
+    o3d = open3d()
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        # Post-processing off: it would merge vertices and reorder faces behind the user's back.
+        mesh = o3d.io.read_triangle_mesh(str(path), enable_post_processing=False)
+    vertices = np.asarray(mesh.vertices, dtype=np.float64).copy()
+    faces = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3).copy()
+    if not len(faces):
+        raise ValueError(f"{path}: holds no triangles (a point cloud, or a damaged file?); export it as a mesh")
+    tint = None
+    if mesh.has_vertex_colors():
+        from attnwarp_eval.colors import srgb_to_linear
+
+        tint = srgb_to_linear(np.asarray(mesh.vertex_colors, dtype=np.float64))
+    return Mesh(vertices, faces, None, tint).cleaned(path.name)
