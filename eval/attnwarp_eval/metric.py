@@ -24,7 +24,7 @@ class Metric:
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
         description: one line for a reader of a report.
-        protocol: raised when the figure's numbers change meaning.
+        version: raised when the figure's numbers change meaning.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Metric:
     atol: float
     rtol: float
     description: str
-    protocol: int = 1
+    version: int = 1
 
 
 class Registry(dict[str, Metric]):
@@ -59,7 +59,7 @@ _SPECS = (
     Metric("warp.visible", "pixels", "none", 0, 0, "pixels that the source truly shows"),
     Metric("warp.feature_accepted", "ratio", "lower", 1e-4, 1e-3, "relative feature error, accepted visible pixels"),
     Metric("warp.feature_visible", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all visible pixels"),
-    Metric("warp.feature_injected", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all accepted surface"),
+    Metric("warp.feature_all_accepted", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all accepted"),
     Metric("warp.feature_pixels", "pixels", "none", 0, 0, "accepted visible feature pixels"),
     Metric("occlusion.precision", "share", "higher", 1e-4, 0, "of what the mask accepts, truly visible"),
     Metric("occlusion.recall", "share", "higher", 1e-4, 0, "of what is truly visible, accepted"),
@@ -95,3 +95,8 @@ _SPECS = (
 
 METRICS = Registry({metric.name: metric for metric in _SPECS})
 """Every figure the checks give."""
+
+
+def metric(key: str) -> Metric:
+    """The specification behind a result's key. KeyError: no such metric."""
+    return METRICS[key]

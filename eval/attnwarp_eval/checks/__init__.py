@@ -11,9 +11,11 @@ from collections.abc import Mapping
 from attnwarp_eval.checks.depth import depth_error
 from attnwarp_eval.checks.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.checks.warp import endpoint_error, feature_error
+from attnwarp_eval.metric import METRICS, metric
 
 __all__ = [
     "COUNTS",
+    "METRICS",
     "YawBin",
     "at_size",
     "by_yaw",
@@ -22,6 +24,7 @@ __all__ = [
     "endpoint_error",
     "feature_error",
     "mask_error",
+    "metric",
     "scores",
 ]
 

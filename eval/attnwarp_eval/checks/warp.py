@@ -69,7 +69,7 @@ def feature_error(warped: Any, exact: Any, accepted: Any, visible: Any, edge: An
 
     Returns:
         ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible ones,
-        ``feature_injected`` over accepted ones with a surface, visible or not: what is injected. NaN where there is
+        ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is injected. NaN where there is
         nothing to measure.
     """
     truth = floats(exact, ("C", "H", "W"), "exact")
@@ -82,7 +82,7 @@ def feature_error(warped: Any, exact: Any, accepted: Any, visible: Any, edge: An
     power = (truth**2).sum(axis=0)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        groups = {"accepted": kept & seen, "visible": seen, "injected": kept & surface}
+        groups = {"accepted": kept & seen, "visible": seen, "all_accepted": kept & surface}
         for name, group in groups.items():
             among = group & region
             total = float(power[among].sum())
