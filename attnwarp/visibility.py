@@ -7,7 +7,7 @@ whose answer is undefined does not pass.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import get_args
 
 import torch
@@ -279,12 +279,14 @@ class Surface:
         normal: (H, W, 3) world normals of either sign and any length, NaN or zero where undefined.
         alpha: (H, W) in [0, 1].
         image: (H, W, C) sRGB in [0, 1], before any edit.
+        counters: how much work it was to render, see :class:`attnwarp.render.Render`.
     """
 
     depth: Array
     normal: Array | None = None
     alpha: Array | None = None
     image: Array | None = None
+    counters: dict[str, int] = field(default_factory=dict, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -450,12 +452,13 @@ def warp_view(
     if settings.photometric is not None:
         if target_image is None and filtered is not gaussians:
             target_image = render_surface(gaussians, target, settings, backend=backend).image
-        seen = Surface(seen.depth, seen.normal, seen.alpha, seen.image if target_image is None else target_image)
+        if target_image is not None:
+            seen = replace(seen, image=target_image)
     needs_source = settings.depth_agreement or settings.photometric is not None or settings.opaque is not None
     if source_surface is None and needs_source:
         source_surface = render_surface(gaussians, source, settings, backend=backend)
     if source_surface is not None and source_image is not None:
-        source_surface = Surface(source_surface.depth, source_surface.normal, source_surface.alpha, source_image)
+        source_surface = replace(source_surface, image=source_image)
     return warp_surfaces(source, target, seen, source_surface, settings, target_segment=target_segment)
 
 
@@ -470,7 +473,7 @@ def render_surface(
     with torch.no_grad():
         seen = render(gaussians, camera, backend=backend, depth=how)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
-    return Surface(z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu())
+    return Surface(z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters))
 
 
 def _normal_rule(correspondence: Correspondence, normal: Array, rule: NormalTest, angle: float) -> Tensor:

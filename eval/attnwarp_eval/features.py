@@ -32,7 +32,7 @@ class SolidField:
         seed: of the frequencies (uniform in the ball) and phases.
     """
 
-    center: Sequence[float]
+    center: Sequence[float] | Array
     extent: float
     channels: int = 8
     cycles: float = 4.0
@@ -41,6 +41,7 @@ class SolidField:
 
     def __post_init__(self) -> None:
         _check.shape(np.asarray(self.center), (3,), "center")
+        object.__setattr__(self, "center", tuple(float(c) for c in self.center))
         for name in ("extent", "channels", "cycles", "terms"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: got {getattr(self, name)}, expected a positive number")
