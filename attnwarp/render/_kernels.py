@@ -14,7 +14,8 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 from attnwarp.render import constants as K
@@ -22,9 +23,13 @@ from attnwarp.render import constants as K
 # NaN and infinity are left to IEEE rules: the selects below rely on comparisons with them.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
-inlined = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, forceinline=True)
+# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions, and two threads that count
+# the same array up and down for every splat spend a third of their time on it. Such kernels allocate nothing.
+bare = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, _nrt=False)
+inlined = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 
 f32 = np.float32
+u64 = np.uint64
 TILE = K.TILE
 PIXELS = TILE * TILE
 
@@ -39,8 +44,8 @@ FILTER, WMAX, CUT, BOUNDED, PEAK = 15, 16, 17, 18, 19
 COLUMNS = 20
 
 # Slots of a tile's buffer, each 64 floats.
-XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, WW = range(15)
-SLOTS = 15
+XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, WW, NX, NY, NZ, C_0, C_1, C_2 = range(21)
+SLOTS = 21  # and one more for each channel from the fourth on
 
 HUGE = 1e30
 LOG2E_HALF = f32(0.5 * math.log2(math.e))
@@ -68,6 +73,22 @@ def _float_of_bits(typing: Any, bits: Any) -> Any:
         return builder.bitcast(args[0], ir.FloatType())
 
     return nb.float32(nb.int32), codegen
+
+
+@intrinsic
+def _prefetch(typing: Any, array: Any, item: Any) -> Any:
+    """Ask for the cache line of ``array``'s item (counted flat) before it is needed."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = cgutils.create_struct_proxy(signature.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+        word = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
+        call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(call, [pointer, word(0), word(3), word(1)])
+        return context.get_dummy_value()
+
+    return nb.void(array, nb.int64), codegen
 
 
 @inlined
@@ -154,13 +175,13 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
                 axis = 1
             if s[i, 2] < s[i, axis]:
                 axis = 2
-        row = table[i]
-        row[:] = 0.0
+        for k in range(COLUMNS):
+            table[i, k] = 0.0
         if ahead:
-            row[X0], row[Y0] = (fx * c0 + skew * c1) / c2 + cx, fy * c1 / c2 + cy
+            table[i, X0], table[i, Y0] = (fx * c0 + skew * c1) / c2 + cx, fy * c1 / c2 + cy
         else:
-            row[X0], row[Y0] = cx, cy
-        row[Z0] = c2
+            table[i, X0], table[i, Y0] = cx, cy
+        table[i, Z0] = c2
         if flat:
             n0, n1, n2 = a[0, 2], a[1, 2], a[2, 2]
             length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
@@ -168,20 +189,20 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
             if abs(nc) < K.EDGE_ON * length:
                 nc = -K.EDGE_ON * length if nc < 0 else K.EDGE_ON * length
             depth = c2 if ahead else length
-            row[Z0] = depth
+            table[i, Z0] = depth
             for k in range(2):
                 tc = (a[0, k] * c0 + a[1, k] * c1 + a[2, k] * c2) / nc
                 scale = depth / s[i, k]
                 gx, gy = scale * (a[0, k] - tc * n0), scale * (a[1, k] - tc * n1)
-                row[UX + 3 * k] = gx * kx
-                row[UY + 3 * k] = gy * ky + gx * kxy
-                row[U0 + 3 * k] = 0.0 if ahead else scale * (a[2, k] - tc * n2)
+                table[i, UX + 3 * k] = gx * kx
+                table[i, UY + 3 * k] = gy * ky + gx * kxy
+                table[i, U0 + 3 * k] = 0.0 if ahead else scale * (a[2, k] - tc * n2)
             scale = depth / nc
-            row[WX] = scale * n0 * kx
-            row[WY] = scale * (n1 * ky + n0 * kxy)
-            row[W0] = 1.0 if ahead else scale * n2
-            row[FILTER] = 1.0 if ahead else 0.0
-            row[WMAX] = depth / near
+            table[i, WX] = scale * n0 * kx
+            table[i, WY] = scale * (n1 * ky + n0 * kxy)
+            table[i, W0] = 1.0 if ahead else scale * n2
+            table[i, FILTER] = 1.0 if ahead else 0.0
+            table[i, WMAX] = depth / near
         else:
             limit = K.JACOBIAN_MARGIN * view[WIDTH] / 2 / fx
             px = min(max(c0 / c2, -cx / fx - limit), (view[WIDTH] - cx) / fx + limit)
@@ -198,13 +219,13 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
             sxx += K.BLUR_3D
             syy += K.BLUR_3D
             det = sxx * syy - sxy * sxy
-            row[CA], row[CB], row[CC] = syy / det, -sxy / det, sxx / det
+            table[i, CA], table[i, CB], table[i, CC] = syy / det, -sxy / det, sxx / det
             if view[ANTIALIASED] > 0:
                 opacity *= math.sqrt(max(sharp / det, K.COMPENSATION_MIN))
                 if opacity < K.ALPHA_MIN:
                     continue
             if not center:
-                row[PEAK] = 1.0
+                table[i, PEAK] = 1.0
                 q0 = 0.0
                 for r in range(3):
                     for k in range(3):
@@ -224,25 +245,25 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
                     c2 * c2 * S[0, 1] / q0 - lx * ly,
                     c2 * c2 * S[1, 1] / q0 - ly * ly,
                 )
-                row[LX], row[LY] = lx * kx, ly * ky + lx * kxy
-                row[RXX] = rxx * kx * kx
-                row[RXY] = kx * (rxx * kxy + rxy * ky)
-                row[RYY] = rxx * kxy * kxy + 2 * rxy * kxy * ky + ryy * ky * ky
+                table[i, LX], table[i, LY] = lx * kx, ly * ky + lx * kxy
+                table[i, RXX] = rxx * kx * kx
+                table[i, RXY] = kx * (rxx * kxy + rxy * ky)
+                table[i, RYY] = rxx * kxy * kxy + 2 * rxy * kxy * ky + ryy * ky * ky
         if center:
-            row[ZLO] = max(c2, near)
-            row[ZHI] = row[ZLO]
+            table[i, ZLO] = max(c2, near)
+            table[i, ZHI] = table[i, ZLO]
         else:
-            row[ZLO] = max(c2 - K.EXTENT_SIGMAS * spread, near)
-            row[ZHI] = max(c2 + K.EXTENT_SIGMAS * spread, near)
-        row[OPACITY] = opacity
+            table[i, ZLO] = max(c2 - K.EXTENT_SIGMAS * spread, near)
+            table[i, ZHI] = max(c2 + K.EXTENT_SIGMAS * spread, near)
+        table[i, OPACITY] = opacity
         cut = 2 * math.log(opacity / K.ALPHA_MIN)
-        row[CUT] = cut
+        table[i, CUT] = cut
         # The outline is an ellipse only if the whole disc lies in front of the camera plane.
-        row[BOUNDED] = 1.0 if not flat or (ahead and c2 - math.sqrt(cut) * spread > 1e-3 * c2) else 0.0
+        table[i, BOUNDED] = 1.0 if not flat or (ahead and c2 - math.sqrt(cut) * spread > 1e-3 * c2) else 0.0
         facing = a[0, axis] * c0 + a[1, axis] * c1 + a[2, axis] * c2
         flip = -1.0 if facing > 0 else 1.0
         for k in range(3):
-            features[i, channels + k] = flip * Q[k, axis]
+            features[i, k] = flip * Q[k, axis]
         if view[HARMONIC] > 0:
             length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
             x = (R[0, 0] * c0 + R[1, 0] * c1 + R[2, 0] * c2) / length
@@ -253,10 +274,12 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
                 total = 0.5
                 for j in range((degree + 1) ** 2):
                     total += Y[j] * values[i, 3 * j + k]
-                features[i, k] = max(total, 0.0)
+                features[i, 3 + k] = max(total, 0.0)
         else:
             for k in range(channels):
-                features[i, k] = values[i, k]
+                features[i, 3 + k] = values[i, k]
+            for k in range(channels, 3):
+                features[i, 3 + k] = 0.0
         key[i] = c2
 
 
@@ -319,23 +342,29 @@ def _strip(A, B, C, h, y1, y2):
 
 
 @inlined
-def _overlaps(row, x1, x2, y1, y2):
+def _overlaps(table, i, x1, x2, y1, y2):
     """Whether a 2D splat of any outline may show in a rectangle (relative to its reference point), by intervals."""
     hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
-    w = row[W0] + row[WX] * mx + row[WY] * my + abs(row[WX]) * hx + abs(row[WY]) * hy
+    w = table[i, W0] + table[i, WX] * mx + table[i, WY] * my + abs(table[i, WX]) * hx + abs(table[i, WY]) * hy
     if w > 0:
-        w = min(w, row[WMAX])
-        u = max(abs(row[U0] + row[UX] * mx + row[UY] * my) - abs(row[UX]) * hx - abs(row[UY]) * hy, 0.0)
-        v = max(abs(row[V0] + row[VX] * mx + row[VY] * my) - abs(row[VX]) * hx - abs(row[VY]) * hy, 0.0)
-        if u * u + v * v <= row[CUT] * w * w * (1 + 1e-9):
+        w = min(w, table[i, WMAX])
+        u = max(
+            abs(table[i, U0] + table[i, UX] * mx + table[i, UY] * my) - abs(table[i, UX]) * hx - abs(table[i, UY]) * hy,
+            0.0,
+        )
+        v = max(
+            abs(table[i, V0] + table[i, VX] * mx + table[i, VY] * my) - abs(table[i, VX]) * hx - abs(table[i, VY]) * hy,
+            0.0,
+        )
+        if u * u + v * v <= table[i, CUT] * w * w * (1 + 1e-9):
             return True
-    if row[FILTER] > 0:
+    if table[i, FILTER] > 0:
         dx, dy = max(abs(mx) - hx, 0.0), max(abs(my) - hy, 0.0)
-        return 2 * (dx * dx + dy * dy) <= row[CUT] * (1 + 1e-9)
+        return 2 * (dx * dx + dy * dy) <= table[i, CUT] * (1 + 1e-9)
     return False
 
 
-@jit
+@bare
 def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, entries):
     """Count (fill = False) or write (True) the tiles that splats order[first:last] may show in.
 
@@ -347,12 +376,11 @@ def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, e
     slack = 1e-4  # pixels; covers the rounding of the outline, adds nothing that can be measured
     for place in range(first, last):
         i = order[place]
-        row = table[i]
-        x0, y0, cut = row[X0], row[Y0], row[CUT]
-        ellipse = row[BOUNDED] > 0
-        A, B, C, h, ex, ey = row[CA], row[CB], row[CC], cut, 0.0, 0.0
+        x0, y0, cut = table[i, X0], table[i, Y0], table[i, CUT]
+        ellipse = table[i, BOUNDED] > 0
+        A, B, C, h, ex, ey = table[i, CA], table[i, CB], table[i, CC], cut, 0.0, 0.0
         if flat and ellipse:
-            ux, uy, vx, vy, wx, wy = row[UX], row[UY], row[VX], row[VY], row[WX], row[WY]
+            ux, uy, vx, vy, wx, wy = table[i, UX], table[i, UY], table[i, VX], table[i, VY], table[i, WX], table[i, WY]
             A = ux * ux + vx * vx - cut * wx * wx
             B = ux * uy + vx * vy - cut * wx * wy
             C = uy * uy + vy * vy - cut * wy * wy
@@ -406,14 +434,14 @@ def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, e
                 for tx in range(tiles_x):
                     x1 = tx * TILE + 0.5 - x0
                     x2 = min(tx * TILE + TILE, width) - 0.5 - x0
-                    if _overlaps(row, x1, x2, y1, y2):
+                    if _overlaps(table, i, x1, x2, y1, y2):
                         t = ty * tiles_x + tx
                         if fill:
                             entries[cursor[t]] = i
                         cursor[t] += 1
 
 
-@jit
+@bare
 def place_cursors(counts, starts):
     """Turn counts (chunk, tile) into the place of each chunk's first entry in each tile; fill ``starts`` (tiles +
     1)."""
@@ -428,24 +456,24 @@ def place_cursors(counts, starts):
 
 
 @inlined
-def _shade_flat(buf, row, ox, oy):
+def _shade_flat(buf, table, i, ox, oy):
     """alpha, z and 1 / z of a 2D splat at the 64 pixels of the tile at (ox, oy)."""
-    sx, sy = ox - row[X0], oy - row[Y0]
-    ux, uy, u0 = f32(row[UX]), f32(row[UY]), f32(row[U0] + row[UX] * sx + row[UY] * sy)
-    vx, vy, v0 = f32(row[VX]), f32(row[VY]), f32(row[V0] + row[VX] * sx + row[VY] * sy)
-    wx, wy, w0 = f32(row[WX]), f32(row[WY]), f32(row[W0] + row[WX] * sx + row[WY] * sy)
+    sx, sy = ox - table[i, X0], oy - table[i, Y0]
+    ux, uy, u0 = f32(table[i, UX]), f32(table[i, UY]), f32(table[i, U0] + table[i, UX] * sx + table[i, UY] * sy)
+    vx, vy, v0 = f32(table[i, VX]), f32(table[i, VY]), f32(table[i, V0] + table[i, VX] * sx + table[i, VY] * sy)
+    wx, wy, w0 = f32(table[i, WX]), f32(table[i, WY]), f32(table[i, W0] + table[i, WX] * sx + table[i, WY] * sy)
     dx, dy = f32(sx), f32(sy)
     z0, iz0, zlo, zhi, ilo, ihi = (
-        f32(row[Z0]),
-        f32(1 / row[Z0]),
-        f32(row[ZLO]),
-        f32(row[ZHI]),
-        f32(1 / row[ZHI]),
-        f32(1 / row[ZLO]),
+        f32(table[i, Z0]),
+        f32(1 / table[i, Z0]),
+        f32(table[i, ZLO]),
+        f32(table[i, ZHI]),
+        f32(1 / table[i, ZHI]),
+        f32(1 / table[i, ZLO]),
     )
-    opacity, wmax = f32(row[OPACITY]), f32(row[WMAX])
-    filtered = f32(2.0) if row[FILTER] > 0 else f32(0.0)
-    unfiltered = f32(0.0) if row[FILTER] > 0 else f32(HUGE)
+    opacity, wmax = f32(table[i, OPACITY]), f32(table[i, WMAX])
+    filtered = f32(2.0) if table[i, FILTER] > 0 else f32(0.0)
+    unfiltered = f32(0.0) if table[i, FILTER] > 0 else f32(HUGE)
     for p in range(PIXELS):
         x = buf[XS * 64 + p]
         y = buf[YS * 64 + p]
@@ -467,11 +495,11 @@ def _shade_flat(buf, row, ox, oy):
 
 
 @inlined
-def _shade_round(buf, row, ox, oy):
+def _shade_round(buf, table, i, ox, oy):
     """alpha, z and 1 / z of a 3D splat at the 64 pixels of the tile at (ox, oy)."""
-    dx, dy = f32(ox - row[X0]), f32(oy - row[Y0])
-    ca, cb, cc = f32(row[CA]), f32(2 * row[CB]), f32(row[CC])
-    opacity = f32(row[OPACITY])
+    dx, dy = f32(ox - table[i, X0]), f32(oy - table[i, Y0])
+    ca, cb, cc = f32(table[i, CA]), f32(2 * table[i, CB]), f32(table[i, CC])
+    opacity = f32(table[i, OPACITY])
     for p in range(PIXELS):
         x = buf[XS * 64 + p] + dx
         y = buf[YS * 64 + p] + dy
@@ -479,9 +507,15 @@ def _shade_round(buf, row, ox, oy):
         a = opacity * _gauss(rho)
         a = a if a >= f32(K.ALPHA_MIN) else f32(0.0)
         buf[AL * 64 + p] = min(a, f32(K.ALPHA_MAX))
-    if row[PEAK] > 0:
-        lx, ly, rxx, rxy, ryy = f32(row[LX]), f32(row[LY]), f32(row[RXX]), f32(2 * row[RXY]), f32(row[RYY])
-        z0, zlo, zhi = f32(row[Z0]), f32(row[ZLO]), f32(row[ZHI])
+    if table[i, PEAK] > 0:
+        lx, ly, rxx, rxy, ryy = (
+            f32(table[i, LX]),
+            f32(table[i, LY]),
+            f32(table[i, RXX]),
+            f32(2 * table[i, RXY]),
+            f32(table[i, RYY]),
+        )
+        z0, zlo, zhi = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI])
         for p in range(PIXELS):
             x = buf[XS * 64 + p] + dx
             y = buf[YS * 64 + p] + dy
@@ -491,15 +525,15 @@ def _shade_round(buf, row, ox, oy):
             buf[ZZ * 64 + p] = z
             buf[IZ * 64 + p] = f32(1.0) / z
     else:
-        z, iz = f32(row[ZLO]), f32(1 / row[ZLO])
+        z, iz = f32(table[i, ZLO]), f32(1 / table[i, ZLO])
         for p in range(PIXELS):
             buf[ZZ * 64 + p] = z
             buf[IZ * 64 + p] = iz
 
 
-@jit
+@bare
 def forward(first, last, view, tiles_x, starts, entries, table, features, background, ndc_scale, color, alpha, depth,
-            median, normal, l1, l2, state, done, seen, counts):  # fmt: skip
+            median, normal, l1, l2, state, done, seen, counts, buf):  # fmt: skip
     """Composite the tiles first..last.
 
     ``state`` (6, H, W) keeps what the backward pass needs, ``done`` the entries worked off in
@@ -508,8 +542,6 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     channels = background.shape[0]
-    n = channels + 3
-    buf = np.empty((SLOTS + n) * 64, np.float32)
     for p in range(PIXELS):
         buf[XS * 64 + p] = f32(p % TILE) + f32(0.5)
         buf[YS * 64 + p] = f32(p // TILE) + f32(0.5)
@@ -523,26 +555,42 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
         for p in range(PIXELS):
             # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
             buf[TT * 64 + p] = f32(1.0) if (p % TILE < cols) & (p // TILE < rows) else f32(0.0)
-        buf[AA * 64 : WW * 64] = f32(0.0)
-        buf[SLOTS * 64 :] = f32(0.0)
+        for p in range(AA * 64, buf.shape[0]):
+            buf[p] = f32(0.0)
         # Depths are summed relative to one of the tile's own, which keeps the digits of thin layers far away.
         zref = f32(0.0)
         if begin < end:
             zref = f32(min(max(table[entries[begin], Z0], table[entries[begin], ZLO]), table[entries[begin], ZHI]))
         izref = f32(1.0) / zref if begin < end else f32(0.0)
         e = begin
+        left = f32(1.0)
         while e < end:
             i = entries[e]
+            # The next rows are anywhere in a table larger than the cache.
+            ahead = entries[min(e + 2, end - 1)]
+            _prefetch(table, ahead * COLUMNS)
+            _prefetch(table, ahead * COLUMNS + 8)
+            _prefetch(table, ahead * COLUMNS + 16)
+            _prefetch(features, ahead * features.shape[1])
             if flat:
-                _shade_flat(buf, table[i], ox, oy)
+                _shade_flat(buf, table, i, ox, oy)
             else:
-                _shade_round(buf, table[i], ox, oy)
+                _shade_round(buf, table, i, ox, oy)
             step = f32(e - begin + 1)
+            if left > half:
+                for p in range(PIXELS):
+                    # Blends with a factor of 0 or 1, exact: a select becomes a masked store, which stalls the next load.
+                    opens = f32(1.0) if (half < buf[TT * 64 + p]) & (buf[AL * 64 + p] > f32(0.0)) else f32(0.0)
+                    buf[MED * 64 + p] = buf[MED * 64 + p] * (f32(1.0) - opens) + buf[ZZ * 64 + p] * opens
+                    buf[MEDK * 64 + p] = buf[MEDK * 64 + p] * (f32(1.0) - opens) + step * opens
+            f0, f1, f2, f3, f4, f5 = (
+                features[i, 0], features[i, 1], features[i, 2], features[i, 3], features[i, 4], features[i, 5],
+            )  # fmt: skip
             total = f32(0.0)
             drawn = f32(0.0)
             for p in range(PIXELS):
                 T = buf[TT * 64 + p]
-                a = buf[AL * 64 + p] if stop < T else f32(0.0)
+                a = buf[AL * 64 + p] * (f32(1.0) if stop < T else f32(0.0))
                 z = buf[ZZ * 64 + p] - zref
                 m = buf[IZ * 64 + p] - izref
                 w = a * T
@@ -555,22 +603,26 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                 buf[DD * 64 + p] = D + wz
                 buf[M1 * 64 + p] += wm
                 buf[M2 * 64 + p] += wm * m
-                hit = a > f32(0.0)
-                opens = hit & (half < T)
-                buf[MED * 64 + p] = z if opens else buf[MED * 64 + p]
-                buf[MEDK * 64 + p] = step if opens else buf[MEDK * 64 + p]
-                buf[LAST * 64 + p] = step if hit else buf[LAST * 64 + p]
+                buf[NX * 64 + p] += w * f0
+                buf[NY * 64 + p] += w * f1
+                buf[NZ * 64 + p] += w * f2
+                buf[C_0 * 64 + p] += w * f3
+                buf[C_1 * 64 + p] += w * f4
+                buf[C_2 * 64 + p] += w * f5
+                hit = f32(1.0) if a > f32(0.0) else f32(0.0)
+                buf[LAST * 64 + p] = buf[LAST * 64 + p] * (f32(1.0) - hit) + step * hit
                 buf[TT * 64 + p] = T - w
                 buf[WW * 64 + p] = w
                 total += w
-                drawn += f32(1.0) if hit else f32(0.0)
+                drawn += hit
             seen[e] = total
             contributing += int(drawn)
-            if drawn > f32(0.0):
-                for c in range(n):
-                    f = features[i, c]
-                    for p in range(PIXELS):
-                        buf[(SLOTS + c) * 64 + p] += buf[WW * 64 + p] * f
+            for c in range(3, channels):
+                f = features[i, 3 + c]
+                # Unsigned, so that no index can be meant from the end: that test alone stops vectorisation.
+                row = u64((C_0 + c) * 64)
+                for p in range(PIXELS):
+                    buf[row + u64(p)] += buf[WW * 64 + p] * f
             e += 1
             if (e - begin) % 4 == 0:
                 left = f32(0.0)
@@ -588,13 +640,13 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                 covered = buf[LAST * 64 + p] > 0
                 alpha[y, x] = A
                 depth[y, x] = zref + D / A if covered else f32(np.nan)
-                median[y, x] = zref + buf[MED * 64 + p] if covered else f32(np.nan)
+                median[y, x] = buf[MED * 64 + p] if covered else f32(np.nan)
                 l1[y, x] = f32(2.0) * buf[L1 * 64 + p]
                 l2[y, x] = f32(ndc_scale) * max(A * a2 - a1 * a1, f32(0.0))
                 for c in range(channels):
-                    color[y, x, c] = buf[(SLOTS + c) * 64 + p] + (f32(1.0) - A) * background[c]
+                    color[y, x, c] = buf[(C_0 + c) * 64 + p] + (f32(1.0) - A) * background[c]
                 for c in range(3):
-                    normal[y, x, c] = buf[(SLOTS + channels + c) * 64 + p]
+                    normal[y, x, c] = buf[(NX + c) * 64 + p]
                 state[0, y, x] = buf[TT * 64 + p]
                 state[1, y, x] = D
                 state[2, y, x] = a1
@@ -605,7 +657,7 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
     counts[1] = contributing
 
 
-@jit
+@bare
 def gather_weights(starts, done, entries, seen, weight):
     """Add the entries' weights to their splats', tile by tile."""
     for t in range(done.shape[0]):

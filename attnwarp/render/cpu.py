@@ -27,6 +27,13 @@ def _array(tensor: torch.Tensor, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy(), dtype=dtype)
 
 
+def _aligned(size: int) -> np.ndarray:
+    """Floats on a 64-byte boundary: a vector that straddles two cache lines costs twice."""
+    raw = np.empty(size + 16, np.float32)
+    skip = (-raw.ctypes.data & 63) // 4
+    return raw[skip : skip + size]
+
+
 class _Scene:
     """One view's splats, projected, ordered and binned: what the forward pass leaves to the backward pass."""
 
@@ -47,7 +54,7 @@ class _Scene:
         )  # fmt: skip
         self.view = view
         self.table = np.empty((n, kernels.COLUMNS))
-        self.features = np.empty((n, self.channels + 3), np.float32)
+        self.features = np.empty((n, 3 + max(3, self.channels)), np.float32)
         key = np.empty(n, np.float32)
         _threads.run(
             kernels.project,
@@ -110,7 +117,8 @@ def render(inputs: Inputs) -> Outputs:
         kernels.forward,
         [
             (*job, scene.view, scene.tiles_x, scene.starts, scene.entries, scene.table, scene.features,
-             scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, seen, counts[k])
+             scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, seen, counts[k],
+             _aligned((kernels.SLOTS + max(0, scene.channels - 3)) * kernels.PIXELS))
             for k, job in enumerate(jobs)
         ],
     )  # fmt: skip

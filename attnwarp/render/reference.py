@@ -141,7 +141,9 @@ def render(inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int =
     color, normal = merged[0].reshape(*shape, -1), merged[4].reshape(*shape, 3)
     alpha, depth, median, l1, l2 = (merged[k].reshape(shape) for k in (1, 2, 3, 5, 6))
     color = color + (1 - alpha)[..., None] * background
-    weight = torch.zeros(len(means), dtype=torch.float64).index_add(0, index, sum(part[7] for part in parts))
+    weight = torch.zeros(len(means), dtype=torch.float64).index_add(
+        0, index, torch.stack([part[7] for part in parts]).sum(dim=0)
+    )
     counters = {
         "splats": len(means),
         "pairs": len(means) * inputs.width * inputs.height,
