@@ -78,7 +78,7 @@ class WarpSettings:
     gaussian_filter: GaussianFilter = "none"
     normal_angle: float = 60.0
     depth: SplatDepth = "intersection"
-    depth_statistic: DepthStatistic = "expected"
+    depth_statistic: DepthStatistic = "median"
     depth_interpolation: DepthInterpolation = "inverse"
     depth_spread: float | None = TAP_SPREAD
     mask_resize: MaskResize = "area"
@@ -125,6 +125,7 @@ PRESETS: dict[str, WarpSettings] = {
         depth_agreement=False,
         normal_test="none",
         gaussian_filter="printed",
+        depth_statistic="expected",
     ),
     "released": WarpSettings(
         pixel_centers="integer",
@@ -137,6 +138,7 @@ PRESETS: dict[str, WarpSettings] = {
         normal_test="none",
         gaussian_filter="camera_frame",
         depth="center",
+        depth_statistic="expected",
         depth_interpolation="bilinear",
         depth_spread=None,
         mask_resize="bilinear",

@@ -36,7 +36,7 @@ def depth_error(
     if normal is not None:
         ours = floats(normal, (*truth.shape, 3), "normal")
         exact = floats(true_normal, (*truth.shape, 3), "true_normal")
-        angle = angle_between(torch.from_numpy(ours), torch.from_numpy(exact)).numpy()
+        angle = angle_between(torch.tensor(ours), torch.tensor(exact)).numpy()
     surface = np.isfinite(truth)
     defined = np.isfinite(estimate) & (np.nan_to_num(estimate) > 0)
     figures: dict[str, float] = {}
