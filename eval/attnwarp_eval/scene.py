@@ -23,6 +23,7 @@ from pydantic import BaseModel, Field, ValidationError
 from attnwarp.camera import Camera
 from attnwarp_eval import shapes
 from attnwarp_eval.cache import content_key
+from attnwarp_eval.errors import InputError
 from attnwarp_eval.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.textures import Color, Spec, Texture, linear_rgb
 
@@ -34,7 +35,7 @@ SCENE_PROTOCOL = 1
 """Raised whenever the same file would mean another world (shapes, textures, lights); part of every content hash."""
 
 
-class SceneError(ValueError):
+class SceneError(InputError):
     """A scene file that cannot be used: names the file, the line where it can, what came, and the remedy."""
 
     def __init__(self, message: str, path: Path | str | None = None, line: int | None = None) -> None:

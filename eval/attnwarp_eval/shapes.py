@@ -412,7 +412,7 @@ def read_mesh(path: Path) -> Mesh:
         raise ValueError(f"{path}: holds no triangles (a point cloud, or a damaged file?); export it as a mesh")
     tint = None
     if mesh.has_vertex_colors():
-        from attnwarp_eval.colors import srgb_to_linear
+        from attnwarp_eval.colors import to_linear
 
-        tint = srgb_to_linear(np.asarray(mesh.vertex_colors, dtype=np.float64))
+        tint = to_linear(np.asarray(mesh.vertex_colors, dtype=np.float64))
     return Mesh(vertices, faces, None, tint).cleaned(path.name)

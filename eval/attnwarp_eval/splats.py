@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.colors import linear_to_srgb
+from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.raycast import Geometry
 from attnwarp_eval.truth.shading import frames, irradiance, object_albedo
 
@@ -121,7 +121,7 @@ def surface_splats(
         quats=single(quaternions_from_normals(normal)),
         scales=single(scales),
         opacities=torch.full((count,), float(opacity)),
-        sh=Gaussians.sh_from_rgb(single(linear_to_srgb(color))),
+        sh=Gaussians.sh_from_rgb(single(to_srgb(color))),
         origin=scene.center,
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
-from attnwarp_eval.colors import srgb_to_linear
+from attnwarp_eval.colors import to_linear
 
 Array = npt.NDArray[np.float64]
 
@@ -32,7 +32,7 @@ Color = Annotated[str, BeforeValidator(_hex)]
 
 def linear_rgb(color: str) -> tuple[float, float, float]:
     """Linear RGB of an sRGB colour written '#rrggbb'."""
-    r, g, b = srgb_to_linear(np.array([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]))
+    r, g, b = to_linear(np.array([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]))
     return float(r), float(g), float(b)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.truth.mitsuba import Plan, appearance, plan_rendering
 from attnwarp_eval.truth.pairs import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView, edge_band, two_view
 from attnwarp_eval.truth.raycast import Geometry, Hits, RayHits
 
@@ -12,8 +14,12 @@ __all__ = [
     "VISIBLE",
     "Geometry",
     "Hits",
+    "Plan",
     "RayHits",
     "TwoView",
+    "appearance",
     "edge_band",
+    "plan_rendering",
+    "to_srgb",
     "two_view",
 ]

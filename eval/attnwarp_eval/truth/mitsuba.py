@@ -329,10 +329,10 @@ def _sensor(camera: Camera, center: Array, sampler: dict[str, Any], world: Any) 
     fx, fy, skew = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
     if abs(fx / fy - 1) > 1e-6 or skew != 0:
         raise ValueError(
-            f"camera: got fx={fx:.6g}, fy={fy:.6g}, skew={skew:.6g}; Mitsuba's perspective camera has square pixels and "
+            f"camera: got fx={fx:.6g}, fy={fy:.6g}, skew={skew:.6g}; Mitsuba has square pixels and "
             "no skew, so use fx = fy and skew = 0"
         )
-    moved = camera.moved(-center)
+    moved = camera.moved((-center).tolist())
     pose = np.linalg.inv(moved.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     box = world.bbox()
     size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
