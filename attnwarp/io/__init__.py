@@ -1,0 +1,24 @@
+"""Files: splats as PLY and .splat, cameras as transforms.json and COLMAP models."""
+
+from attnwarp.io._file import FileFormatError
+from attnwarp.io.colmap import read_colmap
+from attnwarp.io.dataset import Dataset
+from attnwarp.io.folder import read_dataset
+from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
+from attnwarp.io.splat import write_splat
+from attnwarp.io.transforms import read_transforms, write_transforms
+
+__all__ = [
+    "THIRD_SCALE",
+    "Dataset",
+    "FileFormatError",
+    "read_colmap",
+    "read_dataset",
+    "read_ply",
+    "read_points",
+    "read_transforms",
+    "write_ply",
+    "write_points",
+    "write_splat",
+    "write_transforms",
+]

@@ -1,0 +1,172 @@
+"""A set of posed images: what transforms.json and COLMAP folders are read into."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import _check
+from attnwarp.camera import Camera
+from attnwarp.io._file import FileFormatError
+
+Array = npt.NDArray[np.float64]
+
+EXACT_ROTATION = 1e-12
+"""Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
+
+ROTATION_TOLERANCE = 1e-4
+"""Largest |R R^T - I| that is taken for float32 or printing noise and repaired; Camera itself allows 1e-5."""
+
+Missing = Literal["error", "none"]
+
+
+@dataclass(eq=False)
+class Dataset:
+    """Posed images of one scene, and perhaps a first point cloud of it.
+
+    Args:
+        cameras: one for each image, OpenCV axes, pixel centres at +0.5; ``name`` is the image's name in the file.
+        image_paths: one for each camera; None where there is no image.
+        points: (P, 3) float64 world coordinates, or None.
+        colors: (P, 3) uint8 sRGB of the points, or None.
+        splits: one for each camera: "train", "val", "test", or None where the file names no split.
+        applied_transform: (3, 4) transform that the program which wrote a transforms.json applied to the original
+            world before it wrote; cameras and points are in the world after it. Information only.
+
+    Raises:
+        ValueError: lists of different lengths, a wrong shape or dtype.
+    """
+
+    cameras: list[Camera]
+    image_paths: list[Path | None]
+    points: Array | None = None
+    colors: npt.NDArray[np.uint8] | None = None
+    splits: list[str | None] = field(default_factory=list)
+    applied_transform: Array | None = None
+
+    def __post_init__(self) -> None:
+        self.splits = self.splits or [None] * len(self.cameras)
+        for name in ("image_paths", "splits"):
+            if len(getattr(self, name)) != len(self.cameras):
+                raise ValueError(f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as cameras")
+        if self.points is not None:
+            self.points = np.asarray(self.points, dtype=np.float64)
+            _check.shape(self.points, ("P", 3), "points")
+            _check.finite(self.points, "points")
+        if self.colors is not None:
+            if self.points is None:
+                raise ValueError("colors: given without points")
+            _check.shape(self.colors, (len(self.points), 3), "colors")
+            if self.colors.dtype != np.uint8:
+                raise ValueError(f"colors: got {self.colors.dtype}, expected uint8")
+        if self.applied_transform is not None:
+            self.applied_transform = np.asarray(self.applied_transform, dtype=np.float64)
+            _check.shape(self.applied_transform, (3, 4), "applied_transform")
+            _check.finite(self.applied_transform, "applied_transform")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def select(self, indices: Sequence[int]) -> Dataset:
+        """The images at ``indices``, in that order, with the same points."""
+        return Dataset(
+            [self.cameras[i] for i in indices],
+            [self.image_paths[i] for i in indices],
+            self.points,
+            self.colors,
+            [self.splits[i] for i in indices],
+            self.applied_transform,
+        )
+
+    def split(self, name: str) -> Dataset:
+        """The images of one split.
+
+        Raises:
+            ValueError: no image belongs to it; the message lists the splits there are.
+        """
+        indices = [i for i, split in enumerate(self.splits) if split == name]
+        if not indices:
+            there = sorted({split for split in self.splits if split is not None})
+            raise ValueError(f"name: got {name!r}, expected one of {', '.join(map(repr, there)) or '(no splits)'}")
+        return self.select(indices)
+
+
+def nearest_rotation(path: Path, where: str, R: Array) -> Array:
+    """``R`` if it is a rotation to 1e-12; the nearest one (by SVD) if it is to 1e-4; an error that says by how much."""
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE:
+        size = np.linalg.norm(R, axis=0)
+        hint = "its axes are not at right angles, or it was rounded too coarsely; export the poses again"
+        if np.ptp(size) <= ROTATION_TOLERANCE * size.max():
+            hint = f"its columns have length {size.mean():.6g}: remove the scale from the pose"
+        raise FileFormatError(
+            path,
+            f"rotation is not orthonormal, max |R R^T - I| = {error:.3g}, and only up to {ROTATION_TOLERANCE:g} is "
+            f"repaired; {hint}",
+            field=where,
+        )
+    if np.linalg.det(R) < 0:
+        raise FileFormatError(path, "rotation has determinant -1 (it mirrors); flip one axis of the pose", field=where)
+    if error <= EXACT_ROTATION:
+        return R
+    U, _, Vt = np.linalg.svd(R)
+    rotation: Array = U @ Vt
+    return rotation
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) from an image's header, without decoding it and without turning it by its EXIF tag."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except UnidentifiedImageError as error:
+        raise FileFormatError(path, "not an image that can be read; replace it or leave it out") from error
+
+
+def with_images(
+    source: Path,
+    cameras: list[Camera],
+    paths: list[Path],
+    *,
+    missing_images: Missing,
+    resize_cameras: bool,
+) -> tuple[list[Camera], list[Path | None]]:
+    """Check that each camera's image exists and has the camera's size.
+
+    Returns:
+        the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None where missing.
+    """
+    _check.one_of(missing_images, ("error", "none"), "missing_images")
+    absent = [path for path in paths if not path.is_file()]
+    if absent and missing_images == "error":
+        first = ", ".join(str(path) for path in absent[:3])
+        more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
+        raise FileFormatError(
+            source,
+            f"{len(absent)} of {len(paths)} images are missing: {first}{more}; "
+            "put them there, or pass missing_images='none' for the cameras alone",
+        )
+    gone = set(absent)
+    found: list[Path | None] = [None if path in gone else path for path in paths]
+    cameras = list(cameras)
+    for i, path in enumerate(found):
+        if path is None:
+            continue
+        camera, (width, height) = cameras[i], image_size(path)
+        if (width, height) == (camera.width, camera.height):
+            continue
+        if not resize_cameras:
+            raise FileFormatError(
+                source,
+                f"{path} is {width} x {height}, but its camera is {camera.width} x {camera.height}; use the images the "
+                "cameras were made for, or pass resize_cameras=True if they are the same pictures at another size",
+            )
+        cameras[i] = camera.resize(width, height)
+    return cameras, found

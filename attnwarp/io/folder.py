@@ -1,0 +1,67 @@
+"""One door for a folder of posed images, whatever wrote it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal
+
+from attnwarp import _check
+from attnwarp.io._file import FileFormatError
+from attnwarp.io.colmap import find_model, read_colmap
+from attnwarp.io.dataset import Dataset, Missing
+from attnwarp.io.transforms import SPLITS, read_transforms
+
+Format = Literal["transforms", "colmap"]
+
+
+def read_dataset(
+    path: str | os.PathLike[str],
+    *,
+    format: Format | None = None,
+    images: str | os.PathLike[str] | None = None,
+    missing_images: Missing = "error",
+    resize_cameras: bool = False,
+) -> Dataset:
+    """Read a transforms.json or a COLMAP model.
+
+    A file is a transforms.json. A folder with transforms.json, or transforms_train.json and its like, is that; one
+    with a sparse model (``cameras.bin`` or ``.txt`` in it, in ``sparse/0`` or in ``sparse``) is COLMAP's. A folder
+    that is both needs ``format``, except that a model under ``colmap/`` is what nerfstudio made the transforms.json
+    from, and is passed over.
+
+    Args:
+        path: file or folder.
+        format: "transforms" or "colmap", for a folder that is both.
+        images: folder of the images of a COLMAP model; see :func:`read_colmap`.
+        missing_images: "error", or "none" to get None for the path of an image that is not there.
+        resize_cameras: when an image has another size than its camera, resize the camera instead of refusing.
+
+    Raises:
+        FileNotFoundError: nothing there that could be read.
+        FileFormatError: both kinds are there, or what is there is damaged or not usable.
+    """
+    path = Path(path)
+    if format is not None:
+        _check.one_of(format, ("transforms", "colmap"), "format")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder")
+    if format is None:
+        names = ["transforms.json", *(f"transforms_{split}.json" for split in SPLITS)]
+        transforms = path.is_file() or any((path / name).is_file() for name in names)
+        model = None if path.is_file() else find_model(path)
+        if transforms and model is not None and model.relative_to(path).parts[:1] != ("colmap",):
+            raise FileFormatError(
+                path, f"holds both a transforms.json and a COLMAP model ({model}); pass format='transforms' or 'colmap'"
+            )
+        if not transforms and model is None:
+            raise FileNotFoundError(
+                f"{path}: neither a transforms.json nor a COLMAP model (cameras.bin or cameras.txt, here, in sparse/0 "
+                "or in sparse) is there"
+            )
+        format = "transforms" if transforms else "colmap"
+    if format == "colmap":
+        return read_colmap(path, images=images, missing_images=missing_images, resize_cameras=resize_cameras)
+    if images is not None:
+        raise ValueError("images: only COLMAP models take a folder of images; a transforms.json names its own")
+    return read_transforms(path, missing_images=missing_images, resize_cameras=resize_cameras)

@@ -1,0 +1,441 @@
+"""PLY files: splats as the 2DGS and 3DGS trainers and viewers write them, and plain point clouds.
+
+Properties of a splat file, in the order of the original trainers: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
+``f_rest_*`` (all coefficients of red, then green, then blue), ``opacity`` (logit), ``scale_0..1`` for 2DGS or
+``scale_0..2`` for 3DGS (natural logarithm), ``rot_0..3`` (wxyz, any length). Header comments carry what the
+properties cannot; docs/files.md lists them and says who else writes them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import _check
+from attnwarp.gaussians import Gaussians, Kind
+from attnwarp.io._file import FileFormatError, existing_file, write_atomically
+
+Array = npt.NDArray[np.float64]
+Columns = dict[str, npt.NDArray[Any]]
+
+THIRD_SCALE = 1e-6
+"""Third scale, in scene units, that turns a 2D splat into one that viewers of 3D splats show.
+
+The value the authors of 2DGS recommend for that (hbb1/2d-gaussian-splatting, issue 94). A file whose third scales are
+all exactly this is read back as 2D.
+"""
+
+LOGIT_OF_ZERO = -120.0
+LOGIT_OF_ONE = 40.0
+"""Logits written for opacity 0 and 1, whose own are infinite.
+
+Their sigmoids are 0 and 1 exactly in float32 (and 1 in float64), beyond every logit that a float32 opacity strictly
+between 0 and 1 can have (-103.3 to 16.6): nothing else is mapped onto 0 or 1, and nothing in the file is infinite.
+"""
+
+
+def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialiased: bool | None = None) -> Gaussians:
+    """Read splats.
+
+    ASCII and binary PLY of either byte order are read; further properties and elements are ignored. The kind is, in
+    this order: ``kind``; what a comment says (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``); 2D when there is no
+    ``scale_2``; 2D when every ``scale_2`` is exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale
+    that is one constant, a hundredth of both others or less in every row, could be either and is refused without
+    ``kind``. For the 2D kind a third scale is dropped.
+
+    Args:
+        path: the file.
+        kind: "2d" or "3d" to override the rule above.
+        antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased 1|0``; False without
+            any.
+
+    Returns:
+        Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further from zero than
+        twice the extent of the scene become float32 means relative to a rounded ``origin``. Logits of +-inf become
+        opacity 1 and 0; everything else must be finite.
+
+    Raises:
+        FileNotFoundError: no such file.
+        FileFormatError: it is not a splat file, or a value in it is out of range; the message names the property and
+            the first bad row.
+    """
+    path = existing_file(path)
+    if kind is not None:
+        _check.one_of(kind, ("2d", "3d"), "kind")
+    columns, comments = _read_vertices(path)
+    _refuse_other_formats(path, columns)
+    n = len(columns["x"]) if "x" in columns else 0
+    xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
+    opacity = _column(path, columns, "opacity", np.float64, infinities=True)
+    quats = _stack(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"), np.float32)
+    # In float32, as the model normalises: 1e-30 is as good as zero there, and 1e30 as bad as infinite.
+    norm = torch.from_numpy(quats).norm(dim=-1).numpy()
+    _refuse(path, "rot_0..3", norm == 0, "a zero quaternion has no rotation", "remove the row")
+    _refuse(path, "rot_0..3", ~np.isfinite(norm), "the quaternion's length overflows float32", "remove the row")
+    says = _read_comments(path, comments)
+    kind, names = _recognise(path, columns, says, kind)
+    scales = np.empty((n, len(names)), np.float32)
+    for i, name in enumerate(names):
+        log = _column(path, columns, name, np.float64)
+        with np.errstate(over="ignore", under="ignore"):
+            scales[:, i] = np.exp(log)
+        _refuse(
+            path,
+            name,
+            ~np.isfinite(scales[:, i]) | (scales[:, i] <= 0),
+            "scales are stored as natural logarithms, and e to this power does not fit float32",
+            "check that the writer stored logarithms",
+            log,
+        )
+    if antialiased is None:
+        antialiased = says.antialiased(path)
+    offset, means = _split_origin(xyz)
+    if not np.isfinite(means).all():
+        _refuse(path, "x, y, z", ~np.isfinite(means).all(axis=1), "does not fit float32", "remove the row")
+    with np.errstate(over="ignore"):
+        alpha = 1.0 / (1.0 + np.exp(-opacity))
+    return Gaussians(
+        kind,
+        torch.from_numpy(means),
+        torch.from_numpy(quats),
+        torch.from_numpy(scales),
+        torch.from_numpy(alpha.astype(np.float32)),
+        torch.from_numpy(_read_sh(path, columns, n)),
+        origin=says.origin + offset,
+        antialiased=antialiased,
+    )
+
+
+def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, *, third_scale: float | None = None) -> None:
+    """Write splats as binary little-endian PLY, all properties float32, atomically.
+
+    Read back, means (float32), quaternions, spherical harmonics, origin, kind and the antialias flag are the same
+    bit for bit, and opacities 0 and 1 are exact; other opacities and the scales pass through a float32 logarithm and
+    come back within 4e-6 of their value. float64 means are stored in float32 relative to an origin moved to the
+    scene, when they would otherwise lose digits.
+
+    Args:
+        path: the file; an older one is replaced.
+        gaussians: what to write.
+        third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers that know only 3D
+            splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are written, as 2DGS trainers do.
+
+    Raises:
+        ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion), ``third_scale`` is not
+            positive or is given for the 3D kind.
+    """
+    from plyfile import PlyData, PlyElement
+
+    # The fields may have been assigned, or trained, since the checks ran, and float64 may not fit the file's float32:
+    # replace() runs the checks again.
+    original = gaussians.detach().to(device="cpu")
+    g = replace(original.to(dtype=torch.float32))
+    scales = g.scales.numpy().astype(np.float64)
+    if third_scale is not None:
+        if g.kind != "2d":
+            raise ValueError(f"third_scale: got {third_scale} for splats of kind '3d', expected None")
+        if not (np.isfinite(third_scale) and third_scale > 0):
+            raise ValueError(f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}")
+        scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
+    offset, means = _split_origin(original.means.numpy())
+    origin = g.origin + offset
+    sh = g.sh.numpy()
+    # (N, K, 3) -> (N, 3, K): the trainers flatten channel by channel.
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (sh.shape[1] - 1))
+    parts: list[tuple[Sequence[str], npt.NDArray[Any]]] = [
+        (("x", "y", "z"), means),
+        (("nx", "ny", "nz"), np.zeros((len(g), 3))),
+        (_names("f_dc", 3), sh[:, 0]),
+        (_names("f_rest", rest.shape[1]), rest),
+        (("opacity",), _logit(g.opacities.numpy())[:, None]),
+        (_names("scale", scales.shape[1]), np.log(scales)),
+        (_names("rot", 4), g.quats.numpy()),
+    ]
+    rows = np.empty(len(g), dtype=[(name, "<f4") for names, _ in parts for name in names])
+    for names, block in parts:
+        for i, name in enumerate(names):
+            rows[name] = block[:, i]
+    comments = [f"attnwarp kind {g.kind}", "attnwarp origin " + " ".join(repr(float(v)) for v in origin)]
+    if g.kind == "2d":
+        comments += ["SplatRenderMode: 2dgs", *(["antialiased 1"] if g.antialiased else [])]
+    else:
+        comments += [f"SplatRenderMode: {'mip' if g.antialiased else 'default'}"]
+    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
+    write_atomically(path, data.write)
+
+
+def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
+    """Read a point cloud: the initial points of a dataset.
+
+    Returns:
+        points: (P, 3) float64.
+        colors: (P, 3) uint8 from ``red green blue``, or None when the file has none.
+
+    Raises:
+        FileNotFoundError: no such file.
+        FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours that are not uchar.
+    """
+    path = existing_file(path)
+    columns, _ = _read_vertices(path)
+    points = _stack(path, columns, ("x", "y", "z"), np.float64)
+    names = ("red", "green", "blue")
+    if not any(name in columns for name in names):
+        return points, None
+    for name in names:
+        if name not in columns:
+            raise FileFormatError(path, "missing, though other colours are there; write all three", field=name)
+        if columns[name].dtype.kind not in "iu" or columns[name].dtype.itemsize != 1:
+            raise FileFormatError(path, f"got type {columns[name].dtype.name}, expected uchar (0 to 255)", field=name)
+    return points, np.stack([columns[name] for name in names], axis=1).astype(np.uint8)
+
+
+def write_points(path: str | os.PathLike[str], points: npt.ArrayLike, colors: npt.ArrayLike | None = None) -> None:
+    """Write a point cloud as binary little-endian PLY with double ``x y z``, atomically.
+
+    Args:
+        path: the file; an older one is replaced.
+        points: (P, 3) finite.
+        colors: (P, 3) uint8, optional.
+    """
+    from plyfile import PlyData, PlyElement
+
+    xyz = np.asarray(points, dtype=np.float64)
+    _check.shape(xyz, ("P", 3), "points")
+    _check.finite(xyz, "points")
+    dtype = [(name, "<f8") for name in "xyz"]
+    rgb = None
+    if colors is not None:
+        rgb = np.asarray(colors)
+        _check.shape(rgb, (len(xyz), 3), "colors")
+        if rgb.dtype != np.uint8:
+            raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
+        dtype += [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(xyz), dtype=dtype)
+    for i, name in enumerate("xyz"):
+        rows[name] = xyz[:, i]
+    if rgb is not None:
+        for i, name in enumerate(("red", "green", "blue")):
+            rows[name] = rgb[:, i]
+    write_atomically(path, PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write)
+
+
+# ----------------------------------------------------------------------------------------------------------------
+
+
+def _names(stem: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{stem}_{i}" for i in range(count))
+
+
+def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
+    """The scalar columns of the element ``vertex``, and all comments of the header."""
+    import plyfile
+
+    try:
+        data = plyfile.PlyData.read(str(path))
+    except plyfile.PlyHeaderParseError as error:
+        raise FileFormatError(path, f"not a PLY file, or its header is damaged ({error})") from error
+    except plyfile.PlyElementParseError as error:
+        row = error.row
+        prop = error.prop.name if error.prop is not None else None
+        count = error.element.count if error.element is not None else 0
+        if "early end-of-file" in error.message:
+            text = f"the body ends in row {row} of the {count} that the header announces; get the file again, whole"
+        else:
+            text = f"{error.message} in row {row} of {count}; the row is damaged"
+        raise FileFormatError(path, text, field=prop, row=row) from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(path, "not a PLY file: its header is not ASCII text") from error
+    except (ValueError, OverflowError, MemoryError) as error:
+        raise FileFormatError(path, f"cannot be read as a PLY file: {error}") from error
+    if "vertex" not in data:
+        names = [element.name for element in data.elements]
+        raise FileFormatError(path, f"no element 'vertex' (elements: {', '.join(names) or 'none'})", field="vertex")
+    vertex = data["vertex"]
+    scalar = [p.name for p in vertex.properties if not isinstance(p, plyfile.PlyListProperty)]
+    comments = list(data.comments) + [comment for element in data.elements for comment in element.comments]
+    return {name: np.asarray(vertex.data[name]) for name in scalar}, comments
+
+
+def _refuse_other_formats(path: Path, columns: Columns) -> None:
+    if "packed_position" in columns:
+        raise FileFormatError(
+            path,
+            "is a compressed PLY; convert it to a plain one first (for example with PlayCanvas splat-transform)",
+            field="packed_position",
+        )
+    if "x" in columns and not any(name in columns for name in ("opacity", "scale_0", "rot_0")):
+        raise FileFormatError(
+            path,
+            "missing; this looks like a point cloud and not like splats (read it with attnwarp.io.read_points)",
+            field="opacity",
+        )
+
+
+def _column(
+    path: Path, columns: Columns, name: str, dtype: type[np.floating[Any]], *, infinities: bool = False
+) -> npt.NDArray[Any]:
+    """One property, finite in ``dtype``."""
+    if name not in columns:
+        raise FileFormatError(
+            path, f"missing (the file has: {', '.join(columns)}); export the whole model again", field=name
+        )
+    raw = columns[name]
+    with np.errstate(over="ignore"):
+        values = raw.astype(dtype)
+    bad = np.isnan(values) if infinities else ~np.isfinite(values)
+    _refuse(path, name, bad, "is not finite", "remove the row, or find out why the fit diverged", raw)
+    return values
+
+
+def _stack(path: Path, columns: Columns, names: Sequence[str], dtype: type[np.floating[Any]]) -> npt.NDArray[Any]:
+    return np.stack([_column(path, columns, name, dtype) for name in names], axis=1)
+
+
+def _refuse(path: Path, name: str, bad: Any, what: str, remedy: str, values: npt.NDArray[Any] | None = None) -> None:
+    if bad.any():
+        row = int(np.argmax(bad))
+        value = "" if values is None else f"{values[row]!s} "
+        rows = f"{int(bad.sum())} of {len(bad)} rows, counted from 0"
+        raise FileFormatError(path, f"{value}in row {row} ({rows}): {what}; {remedy}", field=name, row=row)
+
+
+def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
+    dc = _stack(path, columns, _names("f_dc", 3), np.float32)
+    count = sum(name.startswith("f_rest_") for name in columns)
+    if count not in (0, 9, 24, 45):
+        raise FileFormatError(
+            path,
+            f"got {count} coefficients, expected 0, 9, 24 or 45 (spherical harmonics of degree 0 to 3, three "
+            "channels); write the file again with one of these degrees",
+            field="f_rest_*",
+        )
+    sh = np.empty((n, 1 + count // 3, 3), np.float32)
+    sh[:, 0] = dc
+    if count:
+        rest = _stack(path, columns, _names("f_rest", count), np.float32)
+        sh[:, 1:] = rest.reshape(n, 3, count // 3).transpose(0, 2, 1)
+    return sh
+
+
+class _Comments:
+    """What the comments of a header say about the splats; contradictions are kept until someone asks."""
+
+    def __init__(self) -> None:
+        self.kinds: dict[Kind, str] = {}
+        self.flags: dict[bool, str] = {}
+        self.origin: Array = np.zeros(3)
+
+    def antialiased(self, path: Path) -> bool:
+        if len(self.flags) > 1:
+            both = " and ".join(map(repr, self.flags.values()))
+            raise FileFormatError(path, f"comments contradict each other: {both}; pass antialiased=True or False")
+        return next(iter(self.flags), False)
+
+
+def _read_comments(path: Path, comments: list[str]) -> _Comments:
+    says = _Comments()
+    for comment in comments:
+        match comment.lower().split():
+            case ["attnwarp", "kind", "2d"]:
+                says.kinds["2d"] = comment
+            case ["attnwarp", "kind", "3d"]:
+                says.kinds["3d"] = comment
+            case ["attnwarp", "origin", *numbers]:
+                try:
+                    says.origin = np.array([float(v) for v in numbers])
+                except ValueError:
+                    says.origin = np.full(1, np.nan)
+                if says.origin.shape != (3,) or not np.isfinite(says.origin).all():
+                    raise FileFormatError(path, f"got {comment!r}, expected three finite numbers", field="origin")
+            # The tag follows the colon at once in some files.
+            case ["splatrendermode:" | "splatrendermode", mode] if mode in ("mip", "default", "2dgs"):
+                if mode == "2dgs":
+                    says.kinds["2d"] = comment
+                else:
+                    says.flags[mode == "mip"] = comment
+            case ["antialiased", ("0" | "1") as flag]:
+                says.flags[flag == "1"] = comment
+    return says
+
+
+def _recognise(path: Path, columns: Columns, says: _Comments, kind: Kind | None) -> tuple[Kind, tuple[str, ...]]:
+    """The kind of the splats and the names of the scales that it uses."""
+    for name in ("scale_0", "scale_1"):
+        if name not in columns:
+            raise FileFormatError(
+                path, f"missing (the file has: {', '.join(columns)}); export the whole model again", field=name
+            )
+    if kind is None:
+        if len(says.kinds) > 1:
+            both = " and ".join(map(repr, says.kinds.values()))
+            raise FileFormatError(path, f"comments contradict each other: {both}; pass kind='2d' or kind='3d'")
+        kind = next(iter(says.kinds), None)
+    if kind is None:
+        kind = _kind_by_scales(path, columns)
+    if kind == "2d":
+        return "2d", ("scale_0", "scale_1")
+    if "scale_2" not in columns:
+        raise FileFormatError(
+            path,
+            "missing for splats of kind '3d'; a file with two scales holds 2D splats: pass kind='2d'",
+            field="scale_2",
+        )
+    return "3d", ("scale_0", "scale_1", "scale_2")
+
+
+def _kind_by_scales(path: Path, columns: Columns) -> Kind:
+    if "scale_2" not in columns:
+        return "2d"
+    third = columns["scale_2"]
+    if len(third) == 0:
+        return "3d"
+    if (third.astype(np.float32) == np.float32(np.log(THIRD_SCALE))).all():
+        return "2d"
+    flattest = np.minimum(columns["scale_0"], columns["scale_1"])
+    if len(third) > 1 and (third == third[0]).all() and (third <= flattest + np.log(0.01)).all():
+        raise FileFormatError(
+            path,
+            f"{third[0]} in every row, at most a hundredth of the other scales: flat 3D splats, or 2D ones written for "
+            "a 3D viewer; pass kind='2d' or kind='3d'",
+            field="scale_2",
+        )
+    return "3d"
+
+
+def _split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:
+    """float64 (N, 3) points as an origin and float32 means with points = origin + means.
+
+    The origin is zero when float32 holds the points exactly, or when none lies further from zero than twice the
+    longest side of their bounding box, where a move would win at most two bits. Otherwise it is the centre of the box,
+    rounded to a power of ten no larger than half that side so that it reads well in a header; float32 then resolves
+    the scene to 2^-24 of its extent.
+    """
+    xyz = np.asarray(points, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        rounded = xyz.astype(np.float32)
+    if len(xyz) == 0 or np.array_equal(rounded, xyz):
+        return np.zeros(3), rounded
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    half = float((high - low).max()) / 2
+    if np.abs(xyz).max() <= 4 * half:
+        return np.zeros(3), rounded
+    centre = low + (high - low) / 2
+    if half > 0:
+        step = 10.0 ** np.floor(np.log10(half))
+        nearest = np.round(centre / step) * step
+        centre = nearest if np.isfinite(nearest).all() else centre
+    return centre, (xyz - centre).astype(np.float32)
+
+
+def _logit(opacities: npt.NDArray[np.floating[Any]]) -> Array:
+    o = opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        logit = np.log(o) - np.log1p(-o)
+    return np.where(o == 0, LOGIT_OF_ZERO, np.where(o == 1, LOGIT_OF_ONE, logit))

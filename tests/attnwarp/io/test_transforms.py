@@ -1,0 +1,289 @@
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from attnwarp import Camera
+from attnwarp.io import Dataset, FileFormatError, read_dataset, read_points, read_transforms, write_transforms
+
+
+def image(path, size=(8, 6)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size).save(path)
+    return path
+
+
+def pose(seed=0):
+    """A camera-to-world matrix in OpenGL axes."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    matrix[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return matrix
+
+
+LENS = {"w": 8, "h": 6, "fl_x": 10.0, "fl_y": 11.0, "cx": 3.5, "cy": 3.25}
+
+
+def write(folder, frames, name="transforms.json", **top):
+    for frame in frames:
+        if isinstance(frame, dict) and isinstance(frame.get("transform_matrix"), np.ndarray):
+            frame["transform_matrix"] = frame["transform_matrix"].tolist()
+    (folder / name).write_text(json.dumps({**top, "frames": frames}))
+    return folder / name
+
+
+def folder_of(tmp_path, n=3, **top):
+    frames = []
+    for i in range(n):
+        image(tmp_path / f"images/{i:03}.png")
+        frames.append({"file_path": f"images/{i:03}.png", "transform_matrix": pose(i)})
+    return write(tmp_path, frames, **(LENS | top))
+
+
+def test_points_project_by_the_opengl_camera_formula(tmp_path):
+    data = read_transforms(folder_of(tmp_path))
+    points = np.random.default_rng(9).normal(size=(200, 3)) * 3
+    seen = 0
+    for i, camera in enumerate(data.cameras):
+        local = (np.linalg.inv(pose(i)) @ np.c_[points, np.ones(200)].T).T
+        front = local[:, 2] < 0  # OpenGL looks along -z
+        seen += front.sum()
+        u = 3.5 + 10.0 * local[:, 0] / -local[:, 2]
+        v = 3.25 - 11.0 * local[:, 1] / -local[:, 2]  # y is up there, and down in the image
+        xy, z = camera.project(points)
+        np.testing.assert_allclose(z, -local[:, 2], atol=1e-13)
+        np.testing.assert_allclose(xy[front], np.c_[u, v][front], rtol=1e-9, atol=1e-9)
+        assert (camera.width, camera.height, camera.name) == (8, 6, f"images/{i:03}.png")
+    assert seen > 100
+
+
+def test_a_blender_file_gives_focal_length_from_the_angle_and_the_size_from_the_image(tmp_path):
+    image(tmp_path / "train/r_0.png", (800, 600))
+    matrix = np.eye(4)
+    matrix[2, 3] = 5
+    frames = [{"file_path": "./train/r_0", "rotation": 0.01, "transform_matrix": matrix}]
+    data = read_transforms(write(tmp_path, frames, "transforms_train.json", camera_angle_x=math.radians(90)))
+    (camera,) = data.cameras
+    # tan 45 = 1: half of 800 pixels; square pixels; the middle of the image.
+    np.testing.assert_allclose(camera.K, [[400, 0, 400], [0, 400, 300], [0, 0, 1]], rtol=1e-15)
+    assert data.image_paths == [tmp_path / "train/r_0.png"] and data.splits == ["train"]
+    xy, z = camera.project([[0, 0, 0], [0, 1, 0], [1, 0, 0]])
+    np.testing.assert_allclose(xy, [[400, 300], [400, 220], [480, 300]])  # up is up, right is right
+    assert z.tolist() == [5, 5, 5]
+
+
+def test_a_folder_with_three_blender_files_is_read_as_one_with_splits(tmp_path):
+    for split, n in (("train", 3), ("val", 1), ("test", 2)):
+        frames = []
+        for i in range(n):
+            image(tmp_path / split / f"r_{i}.png")
+            frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose(i)})
+        write(tmp_path, frames, f"transforms_{split}.json", camera_angle_x=0.7)
+    data = read_dataset(tmp_path)
+    assert data.splits == ["train"] * 3 + ["val"] + ["test"] * 2
+    assert [camera.name for camera in data.split("test").cameras] == ["test/r_0", "test/r_1"]
+    with pytest.raises(ValueError, match="got 'eval', expected one of 'test', 'train', 'val'"):
+        data.split("eval")
+
+
+def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
+    image(tmp_path / "a.png")
+    image(tmp_path / "b.png", (16, 12))
+    frames = [
+        {"file_path": "a.png", "transform_matrix": pose(0)},
+        {"file_path": "b.png", "transform_matrix": pose(1), "w": 16.0, "h": 12, "camera_angle_x": 1.0, "cx": 8},
+    ]
+    a, b = read_transforms(write(tmp_path, frames, **LENS)).cameras
+    assert a.K.tolist() == [[10, 0, 3.5], [0, 11, 3.25], [0, 0, 1]]
+    f = 8 / math.tan(0.5)
+    np.testing.assert_allclose(b.K, [[f, 0, 8], [0, f, 3.25], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("noise", ["float32", "five digits"])
+def test_a_rotation_with_small_noise_becomes_the_nearest_rotation(tmp_path, noise):
+    matrix = pose(4)
+    image(tmp_path / "a.png")
+    noisy = matrix.astype(np.float32).astype(np.float64) if noise == "float32" else np.round(matrix, 5)
+    path = write(tmp_path, [{"file_path": "a.png", "transform_matrix": noisy}], **LENS)
+    (camera,) = read_transforms(path).cameras
+    R = camera.rotation
+    assert np.abs(R @ R.T - np.eye(3)).max() < 1e-14
+    # No further from the matrix it was rounded from than twice the rounding.
+    assert np.abs(R.T * [1, -1, -1] - matrix[:3, :3]).max() < (1.2e-7 if noise == "float32" else 2e-5)
+    np.testing.assert_allclose(camera.position, noisy[:3, 3], atol=1e-14)
+
+
+def test_a_clean_rotation_is_kept_bit_for_bit(tmp_path):
+    (camera, *_) = read_transforms(folder_of(tmp_path)).cameras
+    assert np.array_equal(camera.rotation.T * [1, -1, -1], pose(0)[:3, :3])
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (lambda m: m @ np.diag([2, 2, 2, 1]), ["max |R R^T - I| = 3", "length 2"]),
+        (lambda m: m + np.eye(4) * [2e-3, 0, 0, 0], ["not orthonormal", "0.00"]),
+        (lambda m: m @ np.diag([1, 1, -1, 1]), ["mirrors"]),
+        (lambda m: m.T, ["last row", "transposed"]),
+        (lambda m: m * np.nan, ["not finite"]),
+        (lambda m: m[:2], ["4 x 4"]),
+    ],
+)
+def test_a_pose_that_is_not_rigid_is_refused_with_frame_and_size_of_the_error(tmp_path, change, parts):
+    image(tmp_path / "a.png")
+    image(tmp_path / "b.png")
+    frames = [
+        {"file_path": "a.png", "transform_matrix": pose(0)},
+        {"file_path": "b.png", "transform_matrix": change(pose(1))},
+    ]
+    path = write(tmp_path, frames, **LENS)
+    with pytest.raises(FileFormatError) as caught:
+        read_transforms(path)
+    for part in [str(path), "frames[1] (b.png): transform_matrix", *parts]:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("top", "parts"),
+    [
+        ({"k1": -0.02}, ["k1", "-0.02", "undistort"]),
+        ({"p2": 1e-4}, ["p2", "undistort"]),
+        ({"camera_model": "OPENCV_FISHEYE"}, ["camera_model", "OPENCV_FISHEYE", "undistort"]),
+        ({"is_fisheye": True}, ["is_fisheye", "undistort"]),
+        ({"fl_x": "ten"}, ["fl_x", "'ten'", "number"]),
+        ({"fl_x": -3}, ["fl_x", "positive"]),
+        ({"w": 8.5}, ["w, h", "whole numbers"]),
+        ({"h": None, "w": 0}, ["w, h"]),
+        ({"cx": math.nan}, ["cx", "finite"]),
+        ({"camera_angle_x": 4.0, "fl_x": None}, ["camera_angle_x", "radians"]),
+        ({"fl_x": None, "fl_y": None}, ["fl_x", "camera_angle_x"]),
+        ({"ply_file_path": "none.ply"}, ["ply_file_path", "none.ply is missing"]),
+        ({"applied_transform": [[1, 0], [0, 1]]}, ["applied_transform", "4 x 4"]),
+        ({"train_filenames": "images/000.png"}, ["train_filenames", "list"]),
+    ],
+)
+def test_what_cannot_be_used_is_refused_naming_the_key(tmp_path, top, parts):
+    path = folder_of(tmp_path, **top)
+    with pytest.raises(FileFormatError) as caught:
+        read_transforms(path)
+    for part in [str(path), *parts]:
+        assert part in str(caught.value), str(caught.value)
+
+
+def test_coefficients_of_zero_are_a_pinhole(tmp_path):
+    data = read_transforms(folder_of(tmp_path, k1=0, k2=0.0, p1=0, p2=0, camera_model="OPENCV"))
+    assert len(data) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [("", "empty"), ("{", "not JSON"), ("[]", "frames"), ("{}", "frames"), ('{"frames": []}', "frames"),
+     ('{"frames": [3]}', "frames[0]"), ('{"frames": [{}]}', "frames[0].file_path"), ("\xff", "not JSON")],
+)  # fmt: skip
+def test_what_is_no_transforms_file_is_refused(tmp_path, text, part):
+    (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(FileFormatError) as caught:
+        read_dataset(tmp_path)
+    assert part in str(caught.value)
+
+
+def test_missing_images_are_listed_and_can_be_waived(tmp_path):
+    path = folder_of(tmp_path, n=7)
+    for i in (1, 2, 4, 5, 6):
+        (tmp_path / f"images/{i:03}.png").unlink()
+    with pytest.raises(FileFormatError) as caught:
+        read_transforms(path)
+    for part in ("5 of 7", "001.png", "002.png", "004.png", "and 2 more"):
+        assert part in str(caught.value)
+    assert "005.png" not in str(caught.value)
+    data = read_transforms(path, missing_images="none")
+    assert [p is None for p in data.image_paths] == [False, True, True, False, True, True, True]
+    assert len(data.cameras) == 7
+
+
+def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
+    path = folder_of(tmp_path)
+    image(tmp_path / "images/001.png", (4, 3))
+    with pytest.raises(FileFormatError, match=r"001.png is 4 x 3, but its camera is 8 x 6.*resize_cameras=True"):
+        read_transforms(path)
+    cameras = read_transforms(path, resize_cameras=True).cameras
+    assert [(c.width, c.height) for c in cameras] == [(8, 6), (4, 3), (8, 6)]
+    assert cameras[1].K.tolist() == [[5, 0, 1.75], [0, 5.5, 1.625], [0, 0, 1]]
+
+
+def test_a_file_that_is_no_image_is_refused(tmp_path):
+    path = folder_of(tmp_path)
+    (tmp_path / "images/001.png").write_text("not a picture")
+    with pytest.raises(FileFormatError, match=r"001.png: not an image"):
+        read_transforms(path)
+
+
+def dataset_of(tmp_path, focal=(9.0, 9.0)):
+    cameras, paths = [], []
+    for i, f in enumerate(focal):
+        camera = Camera.look_at((3 + i, 1e4, 2), (0, 1e4 + 1, 0), width=8, height=6, fov_y=50)
+        K = np.array([[f, 0, 4.125], [0, 1.1 * f, 2.75], [0, 0, 1]])
+        cameras.append(Camera(K, camera.world_to_camera, 8, 6, f"view {i}"))
+        paths.append(image(tmp_path / f"images/view {i}.png"))
+    points = np.random.default_rng(0).normal(size=(11, 3)) * 1e5
+    colors = np.random.default_rng(1).integers(0, 256, (11, 3)).astype(np.uint8)
+    return Dataset(cameras, paths, points, colors)
+
+
+@pytest.mark.parametrize("focal", [(9.0, 9.0), (9.0, 12.5)])
+def test_what_is_written_is_read_back(tmp_path, focal):
+    data = dataset_of(tmp_path, focal)
+    data.splits = ["train", "test"]
+    data.applied_transform = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+    write_transforms(tmp_path, data)
+    back = read_dataset(tmp_path)
+    for a, b in zip(data.cameras, back.cameras, strict=True):
+        assert np.array_equal(a.K, b.K) and np.array_equal(a.rotation, b.rotation)
+        # One rounding on the way to the centre and one back, at 1e4: 2e-12 each.
+        assert np.abs(a.position - b.position).max() < 1e-11
+        assert (a.width, a.height) == (b.width, b.height)
+    assert back.image_paths == data.image_paths and back.splits == data.splits
+    assert np.array_equal(back.points, data.points) and np.array_equal(back.colors, data.colors)
+    assert np.array_equal(back.applied_transform, data.applied_transform)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_the_written_file_says_what_other_readers_look_for(tmp_path):
+    write_transforms(tmp_path / "transforms.json", dataset_of(tmp_path))
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    assert data["frames"][1]["file_path"] == "images/view 1.png"
+    assert data["fl_x"] == 9.0 and data["w"] == 8 and "fl_x" not in data["frames"][0]
+    assert data["camera_angle_x"] == pytest.approx(2 * math.atan(8 / 2 / 9.0), rel=1e-15)
+    matrix = np.array(data["frames"][0]["transform_matrix"])
+    assert matrix[:3, 3].tolist() == pytest.approx([3, 1e4, 2])
+    forward = np.array([-3, 1, -2]) / math.sqrt(14)
+    np.testing.assert_allclose(-matrix[:3, 2], forward, atol=1e-12)  # OpenGL looks along -z
+    assert matrix[2, 1] > 0  # and its y is up, as the world's z is
+    assert len(read_points(tmp_path / data["ply_file_path"])[0]) == 11
+
+
+def test_cameras_without_images_are_written_by_name_and_skew_is_refused(tmp_path):
+    camera = Camera.look_at((3, 1, 2), (0, 0, 0), width=8, height=6, fov_y=50, name="front")
+    write_transforms(tmp_path, Dataset([camera], [None]))
+    back = read_transforms(tmp_path, missing_images="none")
+    assert back.cameras[0].name == "front" and back.image_paths == [None] and back.points is None
+    K = camera.K + np.array([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])
+    skewed = Camera(K, camera.world_to_camera, 8, 6, "front")
+    with pytest.raises(ValueError, match=r"camera 0 has skew 0\.5"):
+        write_transforms(tmp_path, Dataset([skewed], [None]))
+    nameless = Camera(camera.K, camera.world_to_camera, 8, 6)
+    with pytest.raises(ValueError, match="neither an image nor a name"):
+        write_transforms(tmp_path, Dataset([nameless], [None]))
+
+
+def test_a_dataset_checks_its_lists():
+    camera = Camera.look_at((3, 1, 2), (0, 0, 0), width=8, height=6, fov_y=50)
+    with pytest.raises(ValueError, match="image_paths: got 0, expected 1"):
+        Dataset([camera], [])
+    with pytest.raises(ValueError, match="colors: given without points"):
+        Dataset([camera], [None], colors=np.zeros((1, 3), np.uint8))
+    with pytest.raises(ValueError, match="colors: got float64"):
+        Dataset([camera], [None], np.zeros((1, 3)), np.zeros((1, 3)))
