@@ -23,8 +23,9 @@ from attnwarp.render import constants as K
 # NaN and infinity are left to IEEE rules: the selects below rely on comparisons with them.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
-# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions, and two threads that count
-# the same array up and down for every splat spend a third of their time on it. Such kernels allocate nothing.
+# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions, and two threads
+# that count the same array up and down for every splat spend a third of their time on it. Such kernels allocate
+# nothing.
 bare = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, _nrt=False)
 inlined = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 
@@ -32,6 +33,7 @@ f32 = np.float32
 u64 = np.uint64
 TILE = K.TILE
 PIXELS = TILE * TILE
+CHUNK = 2048  # splats set up at once: their rows stay in the second-level cache
 
 # Columns of the table of projected splats, float64. The reference point is the projected centre, or the principal
 # point for a 2D splat whose centre is not in front; coefficients are per pixel of offset from it.
@@ -324,24 +326,6 @@ def radix_order(key):
 
 
 @inlined
-def _strip(A, B, C, h, y1, y2):
-    """x-interval of the part of the ellipse A x^2 + 2 B x y + C y^2 <= h with y1 <= y <= y2; empty as (1, -1)."""
-    det = A * C - B * B
-    top = math.sqrt(h * A / det)
-    y1 = max(y1, -top)
-    y2 = min(y2, top)
-    if y1 > y2:
-        return 1.0, -1.0
-    width = math.sqrt(h * C / det)
-    at = -B * width / C
-    s1 = math.sqrt(max(A * h - det * y1 * y1, 0.0))
-    s2 = math.sqrt(max(A * h - det * y2 * y2, 0.0))
-    right = width if y1 <= at <= y2 else max(-B * y1 + s1, -B * y2 + s2) / A
-    left = -width if y1 <= -at <= y2 else min(-B * y1 - s1, -B * y2 - s2) / A
-    return left, right
-
-
-@inlined
 def _overlaps(table, i, x1, x2, y1, y2):
     """Whether a 2D splat of any outline may show in a rectangle (relative to its reference point), by intervals."""
     hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
@@ -365,22 +349,27 @@ def _overlaps(table, i, x1, x2, y1, y2):
 
 
 @bare
-def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, entries):
-    """Count (fill = False) or write (True) the tiles that splats order[first:last] may show in.
+def outline(first, last, key, table, view, tiles_x, tiles_y, spans, begins, counts):
+    """Write the runs of tiles that splats first..last may show in to ``spans``, as (first tile, number of tiles).
 
     Exact for ellipses: a tile is taken if and only if the outline rho <= cut meets the rectangle of its pixel centres.
-    ``cursor`` counts per tile, or holds the place in ``entries`` of the next one.
+    Splat i has ``counts[i]`` runs from row ``begins[i]`` on. Returns the rows needed; what does not fit is not written.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     slack = 1e-4  # pixels; covers the rounding of the outline, adds nothing that can be measured
-    for place in range(first, last):
-        i = order[place]
+    used = 0
+    for i in range(first, last):
+        begins[i] = used
+        counts[i] = 0
+        if np.isnan(key[i]):
+            continue
         x0, y0, cut = table[i, X0], table[i, Y0], table[i, CUT]
         ellipse = table[i, BOUNDED] > 0
         A, B, C, h, ex, ey = table[i, CA], table[i, CB], table[i, CC], cut, 0.0, 0.0
         if flat and ellipse:
-            ux, uy, vx, vy, wx, wy = table[i, UX], table[i, UY], table[i, VX], table[i, VY], table[i, WX], table[i, WY]
+            ux, uy, vx, vy = table[i, UX], table[i, UY], table[i, VX], table[i, VY]
+            wx, wy = table[i, WX], table[i, WY]
             A = ux * ux + vx * vx - cut * wx * wx
             B = ux * uy + vx * vy - cut * wx * wy
             C = uy * uy + vy * vy - cut * wy * wy
@@ -391,54 +380,79 @@ def bin_tiles(first, last, order, table, view, tiles_x, tiles_y, fill, cursor, e
                 ex = cut * (C * wx - B * wy) / det
                 ey = cut * (A * wy - B * wx) / det
                 h = cut * (1 + wx * ex + wy * ey)
-        ty1, ty2 = 0, tiles_y - 1
-        if ellipse:
-            reach = math.sqrt(h * A / (A * C - B * B))
-            low, high = ey - reach, ey + reach
-            if flat:
-                radius = math.sqrt(cut / 2)
-                low, high = min(low, -radius), max(high, radius)
-            low, high = low + y0 - 0.5 - slack, high + y0 - 0.5 + slack
-            if high < 0 or low > height - 1:
-                continue
-            ty1 = math.ceil(max(low, 0.0)) // TILE
-            ty2 = int(min(high, height - 1.0)) // TILE
+        if not ellipse:
+            for ty in range(tiles_y):
+                y1 = ty * TILE + 0.5 - y0 - slack
+                y2 = min(ty * TILE + TILE, height) - 0.5 - y0 + slack
+                run = 0
+                for tx in range(tiles_x + 1):
+                    x1 = tx * TILE + 0.5 - x0 - slack
+                    x2 = min(tx * TILE + TILE, width) - 0.5 - x0 + slack
+                    if tx < tiles_x and _overlaps(table, i, x1, x2, y1, y2):
+                        run += 1
+                    elif run > 0:
+                        if used < spans.shape[0]:
+                            spans[used, 0] = ty * tiles_x + tx - run
+                            spans[used, 1] = run
+                        used += 1
+                        counts[i] += 1
+                        run = 0
+            continue
+        # The disc of the screen filter is joined to the ellipse.
+        radius = math.sqrt(cut / 2) if flat else 0.0
+        det = A * C - B * B
+        top = math.sqrt(h * A / det)
+        wide = math.sqrt(h * C / det)
+        at = -B * wide / C
+        low, high = y0 - 0.5 - slack + min(ey - top, -radius), y0 - 0.5 + slack + max(ey + top, radius)
+        if high < 0 or low > height - 1:
+            continue
+        ty1 = math.ceil(max(low, 0.0)) // TILE
+        ty2 = int(min(high, height - 1.0)) // TILE
         for ty in range(ty1, ty2 + 1):
             y1 = ty * TILE + 0.5 - y0 - slack
             y2 = min(ty * TILE + TILE, height) - 0.5 - y0 + slack
-            if ellipse:
-                left, right = _strip(A, B, C, h, y1 - ey, y2 - ey)
-                left += ex
-                right += ex
-                if flat:
-                    dl, dr = _strip(2.0, 0.0, 2.0, cut, y1, y2)
-                    if right < left:
-                        left, right = dl, dr
-                    elif dl <= dr:
-                        left, right = min(left, dl), max(right, dr)
-                if right < left:
-                    continue
-                low, high = left + x0 - 0.5 - slack, right + x0 - 0.5 + slack
-                if high < 0 or low > width - 1:
-                    continue
-                p1 = math.ceil(max(low, 0.0))
-                p2 = int(min(high, width - 1.0))
-                if p1 > p2:
-                    continue
-                for tx in range(p1 // TILE, p2 // TILE + 1):
-                    t = ty * tiles_x + tx
-                    if fill:
-                        entries[cursor[t]] = i
-                    cursor[t] += 1
-            else:
-                for tx in range(tiles_x):
-                    x1 = tx * TILE + 0.5 - x0
-                    x2 = min(tx * TILE + TILE, width) - 0.5 - x0
-                    if _overlaps(table, i, x1, x2, y1, y2):
-                        t = ty * tiles_x + tx
-                        if fill:
-                            entries[cursor[t]] = i
-                        cursor[t] += 1
+            left, right = 1e300, -1e300
+            e1, e2 = max(y1 - ey, -top), min(y2 - ey, top)
+            if e1 <= e2:
+                s1 = math.sqrt(max(A * h - det * e1 * e1, 0.0))
+                s2 = math.sqrt(max(A * h - det * e2 * e2, 0.0))
+                right = ex + (wide if e1 <= at <= e2 else max(-B * e1 + s1, -B * e2 + s2) / A)
+                left = ex + (-wide if e1 <= -at <= e2 else min(-B * e1 - s1, -B * e2 - s2) / A)
+            near = max(max(y1, -y2), 0.0)
+            if near < radius:
+                chord = math.sqrt(radius * radius - near * near)
+                left, right = min(left, -chord), max(right, chord)
+            low, high = left + x0 - 0.5 - slack, right + x0 - 0.5 + slack
+            if right < left or high < 0 or low > width - 1:
+                continue
+            p1 = math.ceil(max(low, 0.0))
+            p2 = int(min(high, width - 1.0))
+            if p1 > p2:
+                continue
+            if used < spans.shape[0]:
+                spans[used, 0] = ty * tiles_x + p1 // TILE
+                spans[used, 1] = p2 // TILE - p1 // TILE + 1
+            used += 1
+            counts[i] += 1
+    return used
+
+
+@bare
+def scatter(first, last, order, base, begins, counts, spans, fill, cursor, entries):
+    """Count (fill = False) or write (True) the entries of the splats order[first:last] in each tile.
+
+    ``base`` (chunks) is where the runs of each chunk of splats begin; ``cursor`` counts per tile, or holds the place in
+    ``entries`` of the next one.
+    """
+    for place in range(first, last):
+        i = order[place]
+        begin = base[i // CHUNK] + begins[i]
+        for k in range(begin, begin + counts[i]):
+            for t in range(spans[k, 0], spans[k, 0] + spans[k, 1]):
+                if fill:
+                    entries[cursor[t]] = i
+                cursor[t] += 1
 
 
 @bare
@@ -579,7 +593,8 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
             step = f32(e - begin + 1)
             if left > half:
                 for p in range(PIXELS):
-                    # Blends with a factor of 0 or 1, exact: a select becomes a masked store, which stalls the next load.
+                    # Blends with a factor of 0 or 1, exact: a select becomes a masked store, which stalls the next
+                    # load.
                     opens = f32(1.0) if (half < buf[TT * 64 + p]) & (buf[AL * 64 + p] > f32(0.0)) else f32(0.0)
                     buf[MED * 64 + p] = buf[MED * 64 + p] * (f32(1.0) - opens) + buf[ZZ * 64 + p] * opens
                     buf[MEDK * 64 + p] = buf[MEDK * 64 + p] * (f32(1.0) - opens) + step * opens

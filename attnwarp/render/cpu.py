@@ -19,7 +19,6 @@ from attnwarp.render import _kernels as kernels
 from attnwarp.render import _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
-SPLATS_AT_ONCE = 4096
 BIN_CHUNKS = 8
 
 
@@ -56,38 +55,51 @@ class _Scene:
         self.table = np.empty((n, kernels.COLUMNS))
         self.features = np.empty((n, 3 + max(3, self.channels)), np.float32)
         key = np.empty(n, np.float32)
-        _threads.run(
-            kernels.project,
-            [
-                (*piece, view, self.means, self.quats, self.scales, self.opacities, self.values, self.channels,
-                 self.table, self.features, key)
-                for piece in _threads.ranges(n, SPLATS_AT_ONCE)
-            ],
-        )  # fmt: skip
-        self.order = kernels.radix_order(key)
-        order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values])
         self.tiles_x = -(-inputs.width // kernels.TILE)
         self.tiles_y = -(-inputs.height // kernels.TILE)
         self.tiles = self.tiles_x * self.tiles_y
-        self._bin()
+        pieces = _threads.ranges(n, kernels.CHUNK)
+        begins, counts = np.empty(n, np.int64), np.empty(n, np.int64)
+        spans: list[np.ndarray] = [np.empty((0, 2), np.int32)] * len(pieces)
 
-    def _bin(self) -> None:
+        def set_up(index: int) -> None:
+            first, last = pieces[index]
+            kernels.project(
+                first, last, view, self.means, self.quats, self.scales, self.opacities, self.values, self.channels,
+                self.table, self.features, key,
+            )  # fmt: skip
+            room = 4 * kernels.CHUNK
+            while True:
+                rows = np.empty((room, 2), np.int32)
+                used = kernels.outline(
+                    first, last, key, self.table, view, self.tiles_x, self.tiles_y, rows, begins, counts
+                )
+                if used <= room:
+                    break
+                room = used
+            spans[index] = rows[:used]
+
+        _threads.run(set_up, [(k,) for k in range(len(pieces))])
+        self.order = kernels.radix_order(key)
+        order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values])
+        self._bin(np.concatenate([np.empty((0, 2), np.int32), *spans]), [len(rows) for rows in spans], begins, counts)
+
+    def _bin(self, spans: np.ndarray, lengths: list[int], begins: np.ndarray, counts: np.ndarray) -> None:
+        base = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
         size = max(256, -(-len(self.order) // BIN_CHUNKS))
         pieces = _threads.ranges(len(self.order), size)
         cursors = np.zeros((max(1, len(pieces)), self.tiles), np.int64)
         self.starts = np.zeros(self.tiles + 1, np.int64)
-        nothing = np.empty(0, np.int32)
+        entries = np.empty(0, np.int32)
         for fill in (False, True):
-            entries = np.empty(self.starts[-1], np.int32) if fill else nothing
-            _threads.run(
-                kernels.bin_tiles,
-                [
-                    (*piece, self.order, self.table, self.view, self.tiles_x, self.tiles_y, fill, cursors[k], entries)
-                    for k, piece in enumerate(pieces)
-                ],
-            )
+            jobs = [
+                (*piece, self.order, base, begins, counts, spans, fill, cursors[k], entries)
+                for k, piece in enumerate(pieces)
+            ]
+            _threads.run(kernels.scatter, jobs)
             if not fill:
                 kernels.place_cursors(cursors, self.starts)
+                entries = np.empty(self.starts[-1], np.int32)
         self.entries = entries
 
     def tile_ranges(self) -> list[tuple[int, int]]:
