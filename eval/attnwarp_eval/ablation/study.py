@@ -66,16 +66,25 @@ class Ablation(_Model):
     """A table of the report: variants against a baseline, paired on scene and view."""
 
     title: str
+    probe: Literal["depth", "warp"] = "warp"
     baseline: str
     variants: list[str]
     note: str = ""
 
 
 class Front(_Model):
-    """A figure of the report: error against seconds for these variants."""
+    """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants."""
 
     title: str
+    probe: Literal["depth", "warp"] = "warp"
+    metric: str
     variants: list[str]
+
+
+class Yaw(_Model):
+    """The variants whose masks the report shows by yaw."""
+
+    variants: list[str] = Field(default_factory=list)
 
 
 class Pictures(_Model):
@@ -102,6 +111,7 @@ class Study(_Model):
     variants: Annotated[dict[str, Variant], Field(min_length=1)]
     probes: Annotated[dict[ProbeName, list[str]], Field(min_length=1)]
     ablations: list[Ablation] = Field(default_factory=list)
+    yaw: Yaw = Yaw()
     fronts: list[Front] = Field(default_factory=list)
     pictures: Pictures = Pictures()
 
@@ -110,7 +120,7 @@ class Study(_Model):
         used: list[tuple[str, list[str]]] = [(f"probes.{p}", v) for p, v in self.probes.items()]
         used += [(f"ablations.{i}", [a.baseline, *a.variants]) for i, a in enumerate(self.ablations)]
         used += [(f"fronts.{i}", f.variants) for i, f in enumerate(self.fronts)]
-        used += [("pictures.variants", self.pictures.variants)]
+        used += [("pictures.variants", self.pictures.variants), ("yaw.variants", self.yaw.variants)]
         for where, names in used:
             for name in names:
                 if name not in self.variants:
@@ -193,7 +203,6 @@ class Study(_Model):
             spec["geometry"] = "truth"
         else:
             spec["splats"] = self.splats_of(variant).model_dump()
-            spec["spp"] = self.spp
         if probe == "depth":
             return {**spec, "depth": settings["depth"], "depth_statistic": settings["depth_statistic"]}
         return {

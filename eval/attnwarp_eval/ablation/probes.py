@@ -1,0 +1,196 @@
+"""What one cell computes. A probe is a function of the cell's spec and the world; the record is what it returns."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from attnwarp.settings import PRESETS, WarpSettings
+from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
+from attnwarp_eval import checks
+from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval.ablation.store import write_atomic
+from attnwarp_eval.ablation.study import Splats
+from attnwarp_eval.ablation.world import World, splats, world
+from attnwarp_eval.cost import Meter, environment, peak_memory_mb
+from attnwarp_eval.truth import TwoView
+
+Figures = dict[str, float]
+View = tuple[str, Figures, dict[str, Any]]
+"""A target's name, its figures, and what its pictures are drawn from."""
+
+EXACT = dataclasses.replace(PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE)
+"""The corrected rules with the tolerance for exact depth: what the instrument is calibrated with."""
+
+
+def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
+    """Compute a cell.
+
+    Args:
+        cell: what to compute.
+        scene: name or path of its scene.
+        root: the run's folder; the cell's pictures go below it.
+
+    Returns:
+        The record for :meth:`attnwarp_eval.ablation.store.Store.write`.
+    """
+    # Image-sized tensor operations gain little from threads and lose much when other processes want the cores; the
+    # renderer has its own threads.
+    torch.set_num_threads(1)
+    meter = Meter()
+    spec = cell.spec
+    with meter.stage("setup"):
+        at = world(scene, spec["size"])
+    views, pictures = [], []
+    probe = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe]
+    for name, figures, shown in probe(at, scene, spec, meter):
+        views.append({"view": name, "yaw": at.yaw[name], "metrics": _plain(figures)})
+        if name in cell.pictures:
+            with meter.stage("pictures"):
+                pictures += _save_pictures(cell, name, at, shown, root)
+    return {
+        "id": cell.id,
+        "spec": spec,
+        "views": views,
+        "pictures": pictures,
+        "cost": {
+            "seconds": meter.seconds(),
+            "counters": dict(sorted(meter.counters.items())),
+            "peak_memory_mb": peak_memory_mb(),
+            "threads": torch.get_num_threads(),
+        },
+        "environment": environment(),
+    }
+
+
+def _plain(figures: Mapping[str, float]) -> dict[str, float | int | None]:
+    """Numbers that JSON can hold: what is undefined becomes null."""
+    return {
+        name: value if isinstance(value, int) else (float(value) if math.isfinite(value) else None)
+        for name, value in figures.items()
+    }
+
+
+def _calibration(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator[View]:
+    """The instrument judged by itself: the truth's own depth through the same warp, the exact mask against itself."""
+    size = spec["size"]
+    for name in spec["views"]:
+        with meter.stage("truth"):
+            truth = at.pair(name, size)
+        with meter.view():
+            view = _warp_truth(at, truth, EXACT)
+        figures = _warp_figures(at, spec, name, view, meter)
+        own = checks.occlusion.mask_error(truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge)
+        figures |= {f"{key}.exact": value for key, value in own.items()}
+        meter.count(pixels=size * size)
+        yield name, figures, {"truth": truth, "view": view, "spp": spec["spp"]}
+
+
+def _depth(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator[View]:
+    """Depth and normals of splats against truth."""
+    size = spec["size"]
+    with meter.stage("splats"):
+        model = splats(scene, size, spec["seed"], Splats.model_validate(spec["splats"]))
+    settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
+    for name in spec["views"]:
+        with meter.stage("truth"):
+            truth = at.pair(name, size)
+        with meter.view():
+            surface = render_surface(model, at.targets[name], settings)
+        meter.count(pixels=size * size, **surface.counters)
+        with meter.stage("checks"):
+            figures = checks.depth.depth_error(
+                surface.depth,
+                truth.hits.depth,
+                normal=surface.normal,
+                true_normal=truth.hits.normal,
+                edge=at.edge(name),
+            )
+        yield name, figures, {"truth": truth, "surface": surface}
+
+
+def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator[View]:
+    """Warp and mask of a variant against exact correspondences and visibility."""
+    size, spp = spec["size"], spec["spp"]
+    settings = WarpSettings.from_dict(spec["settings"])
+    model = source_surface = None
+    if "splats" in spec:
+        with meter.stage("splats"):
+            model = splats(scene, size, spec["seed"], Splats.model_validate(spec["splats"]))
+        # One source serves every target, so its render is no part of what a target costs.
+        with meter.stage("source"):
+            source_surface = render_surface(model, at.source, settings)
+        meter.count(**source_surface.counters)
+    for name in spec["views"]:
+        target = at.targets[name]
+        with meter.stage("truth"):
+            truth = at.pair(name, size)
+            images: dict[str, Any] = {}
+            if settings.photometric is not None:
+                images = {"source_image": at.image(at.source.name, spp), "target_image": at.image(name, spp)}
+        with meter.view():
+            if model is None:
+                view = _warp_truth(at, truth, settings, **images)
+            else:
+                view = warp_view(model, at.source, target, settings, source_surface=source_surface, **images)
+            for layer in spec["feature_sizes"]:
+                view.at((layer, layer))
+        meter.count(**view.target.counters)
+        figures = _warp_figures(at, spec, name, view, meter)
+        yield name, figures, {"truth": truth, "view": view, "spp": spp}
+
+
+def _warp_truth(at: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:
+    source = at.geometry.trace(truth.source)
+    return warp_surfaces(
+        truth.source,
+        truth.target,
+        Surface(truth.hits.depth, truth.hits.normal, image=images.get("target_image")),
+        Surface(source.depth, source.normal, image=images.get("source_image")),
+        settings,
+    )
+
+
+def _warp_figures(at: World, spec: dict[str, Any], name: str, view: WarpedView, meter: Meter) -> Figures:
+    """Endpoint error, feature error and mask scores of a warp, at image size and at every feature size."""
+    size = spec["size"]
+    with meter.stage("checks"):
+        truth = at.pair(name, size)
+        figures = checks.warp.endpoint_error(view.correspondence.xy, truth.xy, truth.visible, truth.edge)
+        figures |= checks.occlusion.mask_error(view.mask, truth.label, truth.hits.valid, truth.behind, truth.edge)
+    channels, seed = spec["feature_channels"], spec["seed"]
+    for layer in spec["feature_sizes"]:
+        with meter.stage("truth"):
+            truth = at.pair(name, layer)
+            features = at.features(at.source.name, layer, channels, seed)
+            exact = at.features(name, layer, channels, seed)
+        with meter.stage("sample"):
+            at_layer = view.at((layer, layer))
+            warped = at_layer.warp(torch.from_numpy(features)).numpy()
+        meter.count(taps=4 * features.size)
+        with meter.stage("checks"):
+            found = checks.warp.feature_error(warped, exact, at_layer.mask, truth.visible)
+            if layer != size:
+                xy = at_layer.correspondence.xy
+                found |= checks.warp.endpoint_error(xy, truth.xy, truth.visible, image_px=size / layer)
+                found |= checks.occlusion.mask_error(at_layer.mask, truth.label, truth.hits.valid, truth.behind)
+            figures |= checks.at_size(found, layer)
+    return figures
+
+
+def _save_pictures(cell: Cell, name: str, at: World, shown: dict[str, Any], root: Path) -> list[dict[str, str]]:
+    from attnwarp_eval.report import pictures
+
+    found = pictures.of(at, name, **shown)
+    saved = []
+    for what, png in found.items():
+        path = Path("pictures") / cell.id[:16] / f"{name}-{what}.png"
+        write_atomic(root / path, png)
+        saved.append({"view": name, "what": what, "path": str(path), "sha256": hashlib.sha256(png).hexdigest()})
+    return saved

@@ -1,0 +1,39 @@
+"""A run's report: report.md, report.html (self-contained) and results.jsonl, made from its cells alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from attnwarp_eval.ablation.store import Store
+
+__all__ = ["write_report"]
+
+
+def write_report(store: Store, *, timings: bool = True) -> list[Path]:
+    """Write the report of a run's folder, from whatever cells are done.
+
+    Args:
+        store: the run.
+        timings: False leaves out everything measured in seconds or memory, so that two runs of the same study on the
+            same code give the same bytes.
+
+    Returns:
+        The files written, the one a person opens first at the end.
+    """
+    from attnwarp_eval.ablation.store import write_atomic
+    from attnwarp_eval.report.build import build
+    from attnwarp_eval.report.results import Results
+    from attnwarp_eval.report.write import markdown, page
+
+    results = Results.of(store)
+    report = build(results, store.root, timings=timings)
+    files = {
+        "results.jsonl": "".join(f"{line}\n" for line in results.lines(timings)),
+        "report.md": markdown(report),
+        "report.html": page(report, store.root),
+    }
+    for name, text in files.items():
+        write_atomic(store.root / name, text.encode())
+    return [store.root / name for name in files]

@@ -1,0 +1,122 @@
+"""Figures of the report, as SVG whose bytes depend on the numbers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from attnwarp_eval.statistics import Interval, front
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.axes import Axes
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
+"""Okabe and Ito's colours, which people with any kind of colour vision can tell apart."""
+
+MARKERS = "osD^vP*X"
+
+
+@contextmanager
+def drawing(path: Path, columns: int = 1, height: float = 3.4) -> Iterator[list[Axes]]:
+    """A figure of ``columns`` axes side by side, saved on leaving without a date or random ids."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    style: dict[Any, Any] = {
+        "svg.hashsalt": "attnwarp",
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.alpha": 0.25,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+    }
+    with matplotlib.rc_context(style):
+        figure, axes = plt.subplots(1, columns, figsize=(5.4 * columns, height), squeeze=False, layout="constrained")
+        yield list(axes[0])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, metadata={"Date": None, "Creator": None})
+        plt.close(figure)
+
+
+@dataclass
+class Line:
+    """One line of a chart: y (with an optional interval) over x."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[Interval]
+
+
+def lines(axes: Axes, series: Sequence[Line], *, x: str, y: str, title: str, log: bool = False) -> None:
+    """Means with their intervals as bars; undefined points are left out."""
+    for i, line in enumerate(series):
+        mean = np.array([v.mean for v in line.y])
+        keep = np.isfinite(mean)
+        if not keep.any():
+            continue
+        where = np.asarray(line.x, dtype=float)[keep]
+        low = np.array([v.low if v.known else v.mean for v in line.y])[keep]
+        high = np.array([v.high if v.known else v.mean for v in line.y])[keep]
+        shift = (i - (len(series) - 1) / 2) * 0.8
+        bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
+        axes.errorbar(
+            where + shift, mean[keep], yerr=bars, color=PALETTE[i % len(PALETTE)], marker=MARKERS[i % len(MARKERS)],
+            markersize=4.5, linewidth=1.4, elinewidth=0.8, capsize=2, label=line.name,
+        )  # fmt: skip
+    axes.set(xlabel=x, ylabel=y)
+    axes.set_title(title, loc="left", fontsize=9.5)
+    if log:
+        axes.set_yscale("log")
+    axes.legend()
+
+
+def cost_front(axes: Axes, points: Mapping[str, tuple[Interval, Interval]], *, x: str, y: str, title: str) -> list[str]:
+    """Error against seconds with intervals on both axes; the front as a staircase, dominated points in grey.
+
+    Returns:
+        The names on the front, cheapest first.
+    """
+    names = list(points)
+    cost = [points[n][0].mean for n in names]
+    error = [points[n][1].mean for n in names]
+    kept = front(cost, error)
+    for i, name in enumerate(names):
+        seconds, quality = points[name]
+        if not (np.isfinite(seconds.mean) and np.isfinite(quality.mean)):
+            continue
+        on = i in kept
+        colour = PALETTE[0] if on else "#999999"
+        # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above it.
+        axes.errorbar(
+            seconds.mean, quality.mean, color=colour, marker="o" if on else "x", markersize=5, linewidth=0,
+            elinewidth=0.8, capsize=2, xerr=_bars(seconds), yerr=_bars(quality),
+        )  # fmt: skip
+        axes.annotate(
+            name, (seconds.mean, quality.mean), textcoords="offset points", xytext=(5, 5), fontsize=7.5, color=colour
+        )
+    if kept:
+        axes.step(
+            [cost[i] for i in kept], [error[i] for i in kept], where="post", color=PALETTE[0], linewidth=1, alpha=0.6
+        )
+    axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log")
+    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.margins(0.2)
+    return [names[i] for i in kept]
+
+
+def _bars(value: Interval) -> list[list[float]] | None:
+    if not value.known:
+        return None
+    low = max(value.low, value.mean / 20)
+    return [[max(value.mean - low, 0.0)], [max(value.high - value.mean, 0.0)]]

@@ -1,0 +1,56 @@
+"""A report's content, apart from how it is written: sections of text, tables, figures and pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Table:
+    """A table of ready-made text cells; columns named in ``timed`` hold seconds or memory."""
+
+    columns: list[str]
+    rows: list[list[str]]
+    caption: str = ""
+    timed: tuple[str, ...] = ()
+
+    def without_timings(self) -> Table:
+        """The same table without its columns of seconds and memory."""
+        keep = [i for i, name in enumerate(self.columns) if name not in self.timed]
+        rows = [[row[i] for i in keep] for row in self.rows]
+        return Table([self.columns[i] for i in keep], rows, self.caption)
+
+
+@dataclass
+class Picture:
+    """An image file of the run's folder, with what it shows."""
+
+    path: str
+    caption: str
+
+
+@dataclass
+class Gallery:
+    """Pictures in rows: a line of text, then pictures side by side."""
+
+    rows: list[tuple[str, list[Picture]]]
+
+
+@dataclass
+class Section:
+    """A heading with text, tables, figures and galleries, in this order."""
+
+    title: str
+    text: list[str] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    figures: list[Picture] = field(default_factory=list)
+    gallery: Gallery | None = None
+
+
+@dataclass
+class Report:
+    """The whole report."""
+
+    title: str
+    lead: list[str]
+    sections: list[Section]

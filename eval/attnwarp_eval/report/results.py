@@ -1,0 +1,130 @@
+"""A run's records as tables of numbers: variant x scene x view -> value, and results.jsonl."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from attnwarp_eval.ablation.cell import canonical_json
+from attnwarp_eval.ablation.store import Store
+from attnwarp_eval.checks import metric as metric_of
+from attnwarp_eval.checks.occlusion import COUNTS
+
+
+@dataclass
+class Results:
+    """The finished cells of a run.
+
+    Attributes:
+        study: the resolved study as plain JSON.
+        cells: one entry an expected cell, with its record under "record" (None where it is not done).
+        failures: the table of failed cells.
+    """
+
+    study: dict[str, Any]
+    cells: list[dict[str, Any]]
+    failures: list[dict[str, Any]]
+    titles: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, store: Store) -> Results:
+        """Read a run's folder."""
+        kept = store.read_study()
+        done = store.done()
+        cells = [{**c, "record": store.read(c["id"]) if c["id"] in done else None} for c in kept["cells"]]
+        return cls(kept["study"], cells, store.failures(), {n: s["title"] for n, s in kept["scenes"].items()})
+
+    @property
+    def measured(self) -> int:
+        """How many of the expected cells are done."""
+        return sum(c["record"] is not None for c in self.cells)
+
+    def records(self, probe: str, variant: str) -> list[tuple[str, int, dict[str, Any]]]:
+        """(scene, seed, record) of the finished cells of a variant, in the study's order."""
+        return [
+            (c["scene"], c["seed"], c["record"])
+            for c in self.cells
+            if c["probe"] == probe and variant in c["variants"] and c["record"] is not None
+        ]
+
+    def views(
+        self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None
+    ) -> dict[str, dict[str, float]]:
+        """Scene -> view (and seed) -> value; NaN where undefined.
+
+        Args:
+            yaw: keep the views whose yaw from the source lies in this closed range of degrees.
+        """
+        table: dict[str, dict[str, float]] = {}
+        for scene, seed, record in self.records(probe, variant):
+            for view in record["views"]:
+                if yaw is not None and not yaw[0] <= view["yaw"] <= yaw[1]:
+                    continue
+                value = view["metrics"].get(metric)
+                table.setdefault(scene, {})[f"{view['view']}/{seed}"] = math.nan if value is None else float(value)
+        return table
+
+    def counts(self, probe: str, variant: str) -> list[tuple[float, dict[str, int]]]:
+        """(yaw, confusion counts) of every view of a variant."""
+        return [
+            (float(view["yaw"]), {name: int(view["metrics"][f"occlusion.{name}"]) for name in COUNTS})
+            for _, _, record in self.records(probe, variant)
+            for view in record["views"]
+        ]
+
+    def cost(self, probe: str, variant: str, part: str) -> dict[str, float]:
+        """Scene -> seconds of a stage ("steady", "warm", ...), mean over seeds."""
+        found: dict[str, list[float]] = {}
+        for scene, _, record in self.records(probe, variant):
+            value = record["cost"]["seconds"].get(part)
+            if value is not None:
+                found.setdefault(scene, []).append(float(value))
+        return {scene: sum(v) / len(v) for scene, v in found.items()}
+
+    def counters(self, probe: str, variant: str) -> Counter[str]:
+        """Work counters summed over a variant's cells."""
+        total: Counter[str] = Counter()
+        for _, _, record in self.records(probe, variant):
+            total.update(record["cost"]["counters"])
+        return total
+
+    def lines(self, timings: bool = True) -> Iterable[str]:
+        """results.jsonl: one line a (cell, figure of quality), sorted, so that a diff of two runs can be read."""
+        rows = []
+        for cell in self.cells:
+            record = cell["record"]
+            if record is None:
+                continue
+            names = sorted({name for view in record["views"] for name in view["metrics"]})
+            for name in names:
+                metric = metric_of(name)
+                if metric.unit == "pixels":
+                    continue  # counts that describe; they stay in the cell's own file
+                values = {v["view"]: v["metrics"].get(name) for v in record["views"]}
+                known = [v for v in values.values() if v is not None]
+                row = {
+                    "scene": cell["scene"],
+                    "probe": cell["probe"],
+                    "variant": cell["variants"][0],
+                    "also": cell["variants"][1:],
+                    "seed": cell["seed"],
+                    "cell": cell["id"],
+                    "metric": name,
+                    "unit": metric.unit,
+                    "direction": metric.direction,
+                    "version": metric.version,
+                    "value": sum(known) / len(known) if known else None,
+                    "n": len(known),
+                    "undefined": len(values) - len(known),
+                    "views": values,
+                    "counters": record["cost"]["counters"],
+                }
+                if timings:
+                    row["seconds"] = record["cost"]["seconds"]
+                    row["peak_memory_mb"] = record["cost"]["peak_memory_mb"]
+                key = tuple(str(row[k]) for k in ("scene", "probe", "variant", "seed", "metric"))
+                rows.append((key, canonical_json(row)))
+        return [text for _, text in sorted(rows)]
