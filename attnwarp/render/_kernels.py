@@ -678,3 +678,576 @@ def gather_weights(starts, done, entries, seen, weight):
     for t in range(done.shape[0]):
         for e in range(starts[t], starts[t] + done[t]):
             weight[entries[e]] += seen[e]
+
+
+# Further slots of the backward pass: gradients of the loss in what a pixel sums up, and sums over the splats behind.
+BXS, BYS, BAL, BZZ, BIZ = 0, 1, 2, 3, 4  # as in the forward pass: the same code fills them
+(BT, BLAST, BMEDK, GW, GD, GM1, GM2, GL1, GMED, TOTA, TOTD, BEHA, BEHD, BEHQ, DA, DZ, DI, BW, QF,
+ GNX, GNY, GNZ, GC0, GC1, GC2) = range(5, 30)  # fmt: skip
+BACK_SLOTS = 30
+
+
+@inlined
+def _blame_flat(buf, table, i, ox, oy, rows, row):
+    """Gradients in a 2D splat's table row from those in alpha, z and 1 / z at the 64 pixels."""
+    sx, sy = ox - table[i, X0], oy - table[i, Y0]
+    ux, uy, u0 = f32(table[i, UX]), f32(table[i, UY]), f32(table[i, U0] + table[i, UX] * sx + table[i, UY] * sy)
+    vx, vy, v0 = f32(table[i, VX]), f32(table[i, VY]), f32(table[i, V0] + table[i, VX] * sx + table[i, VY] * sy)
+    wx, wy, w0 = f32(table[i, WX]), f32(table[i, WY]), f32(table[i, W0] + table[i, WX] * sx + table[i, WY] * sy)
+    dx, dy = f32(sx), f32(sy)
+    z0, zlo, zhi, wmax = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI]), f32(table[i, WMAX])
+    filtered = f32(2.0) if table[i, FILTER] > 0 else f32(0.0)
+    unfiltered = f32(0.0) if table[i, FILTER] > 0 else f32(HUGE)
+    o1 = o2 = o3 = o4 = o5 = o6 = f32(0.0)
+    tu = tux = tuy = tv = tvx = tvy = tw = twx = twy = f32(0.0)
+    for p in range(PIXELS):
+        x = buf[BXS * 64 + p]
+        y = buf[BYS * 64 + p]
+        w = w0 + wx * x + wy * y
+        r = f32(1.0) / w
+        u = (u0 + ux * x + uy * y) * r
+        v = (v0 + vx * x + vy * y) * r
+        rho = u * u + v * v
+        ex = x + dx
+        ey = y + dy
+        screen = filtered * (ex * ex + ey * ey) + unfiltered
+        # Selected, not multiplied by 0: r may be infinite.
+        meets = (w > f32(0.0)) & (w <= wmax) & (rho <= screen)
+        rs = r if meets else f32(0.0)
+        u = (u0 + ux * x + uy * y) * rs
+        v = (v0 + vx * x + vy * y) * rs
+        a = buf[BAL * 64 + p]
+        da = buf[DA * 64 + p] * a * (f32(1.0) if a < f32(K.ALPHA_MAX) else f32(0.0))
+        o1 += da
+        gu = -da * u * rs
+        gv = -da * v * rs
+        gw = -(gu * u + gv * v)
+        screened = f32(0.0) if meets else -da * filtered
+        o2 += screened * ex
+        o3 += screened * ey
+        iz = buf[BIZ * 64 + p]
+        gz = buf[DZ * 64 + p] - buf[DI * 64 + p] * iz * iz
+        z = z0 * r
+        over = (w <= f32(0.0)) | (z > zhi)
+        under = (w > f32(0.0)) & (z <= zlo)
+        inside = f32(0.0) if over | under else gz
+        rz = f32(0.0) if over | under else r
+        o4 += inside * rz
+        gw -= inside * z0 * rz * rz
+        o5 += gz if under else f32(0.0)
+        o6 += gz if over else f32(0.0)
+        tu += gu
+        tux += gu * x
+        tuy += gu * y
+        tv += gv
+        tvx += gv * x
+        tvy += gv * y
+        tw += gw
+        twx += gw * x
+        twy += gw * y
+    rows[row, X0] = -(table[i, UX] * tu + table[i, VX] * tv + table[i, WX] * tw) - o2
+    rows[row, Y0] = -(table[i, UY] * tu + table[i, VY] * tv + table[i, WY] * tw) - o3
+    rows[row, UX], rows[row, UY], rows[row, U0] = tux + sx * tu, tuy + sy * tu, tu
+    rows[row, VX], rows[row, VY], rows[row, V0] = tvx + sx * tv, tvy + sy * tv, tv
+    rows[row, WX], rows[row, WY], rows[row, W0] = twx + sx * tw, twy + sy * tw, tw
+    rows[row, Z0], rows[row, ZLO], rows[row, ZHI] = o4, o5, o6
+    rows[row, OPACITY] = o1 / table[i, OPACITY]
+
+
+@inlined
+def _blame_round(buf, table, i, ox, oy, rows, row):
+    """Gradients in a 3D splat's table row from those in alpha, z and 1 / z at the 64 pixels."""
+    dx, dy = f32(ox - table[i, X0]), f32(oy - table[i, Y0])
+    ca, cb, cc = f32(table[i, CA]), f32(table[i, CB]), f32(table[i, CC])
+    o1 = o2 = o3 = o4 = o5 = o6 = f32(0.0)
+    for p in range(PIXELS):
+        x = buf[BXS * 64 + p] + dx
+        y = buf[BYS * 64 + p] + dy
+        a = buf[BAL * 64 + p]
+        da = buf[DA * 64 + p] * a * (f32(1.0) if a < f32(K.ALPHA_MAX) else f32(0.0))
+        o1 += da
+        o2 += da * (ca * x + cb * y)
+        o3 += da * (cb * x + cc * y)
+        o4 += da * x * x
+        o5 += da * x * y
+        o6 += da * y * y
+    gx, gy = o2, o3
+    rows[row, OPACITY] = o1 / table[i, OPACITY]
+    rows[row, CA], rows[row, CB], rows[row, CC] = f32(-0.5) * o4, -o5, f32(-0.5) * o6
+    o1 = o2 = o3 = o4 = o5 = o6 = f32(0.0)
+    s1 = s2 = s3 = f32(0.0)
+    if table[i, PEAK] > 0:
+        lx, ly = f32(table[i, LX]), f32(table[i, LY])
+        rxx, rxy, ryy = f32(table[i, RXX]), f32(table[i, RXY]), f32(table[i, RYY])
+        z0, zlo, zhi = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI])
+        for p in range(PIXELS):
+            x = buf[BXS * 64 + p] + dx
+            y = buf[BYS * 64 + p] + dy
+            iz = buf[BIZ * 64 + p]
+            gz = buf[DZ * 64 + p] - buf[DI * 64 + p] * iz * iz
+            along = f32(1.0) + lx * x + ly * y
+            across = along * along + max(rxx * x * x + f32(2.0) * rxy * x * y + ryy * y * y, f32(0.0))
+            inverse = f32(1.0) / max(across, f32(1e-30))
+            z = z0 * along * inverse
+            s1 += gz if z <= zlo else f32(0.0)
+            s2 += gz if z > zhi else f32(0.0)
+            gz = gz if (z > zlo) & (z <= zhi) else f32(0.0)
+            s3 += gz * along * inverse
+            gl = gz * z0 * inverse * (f32(1.0) - f32(2.0) * along * along * inverse)
+            gr = -gz * z * inverse
+            o1 += gl * x
+            o2 += gl * y
+            o3 += gr * x * x
+            o4 += gr * x * y
+            o5 += gr * y * y
+            gx -= gl * lx + f32(2.0) * gr * (rxx * x + rxy * y)
+            gy -= gl * ly + f32(2.0) * gr * (rxy * x + ryy * y)
+    else:
+        for p in range(PIXELS):
+            iz = buf[BIZ * 64 + p]
+            s1 += buf[DZ * 64 + p] - buf[DI * 64 + p] * iz * iz
+    rows[row, X0], rows[row, Y0] = gx, gy
+    rows[row, LX], rows[row, LY] = o1, o2
+    rows[row, RXX], rows[row, RXY], rows[row, RYY] = o3, f32(2.0) * o4, o5
+    rows[row, 10] = f32(0.0)
+    rows[row, Z0], rows[row, ZLO], rows[row, ZHI] = s3, s1, s2
+
+
+@bare
+def backward(first, last, view, tiles_x, starts, done, entries, table, features, background, ndc_scale, alpha, state,
+             g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows, buf):  # fmt: skip
+    """Gradients of the tiles first..last, one row of ``rows`` for each entry worked off, from place[tile] on.
+
+    A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in its ``features``.
+    Splats are visited back to front: the transmittance before each is recovered by division from what the forward pass
+    left.
+    """
+    flat = view[FLAT] > 0
+    width, height = int(view[WIDTH]), int(view[HEIGHT])
+    channels = background.shape[0]
+    scale = f32(ndc_scale)
+    for p in range(PIXELS):
+        buf[BXS * 64 + p] = f32(p % TILE) + f32(0.5)
+        buf[BYS * 64 + p] = f32(p // TILE) + f32(0.5)
+    for t in range(first, last):
+        begin, count = starts[t], done[t]
+        if count == 0:
+            continue
+        ty, tx = t // tiles_x, t % tiles_x
+        ox, oy = float(tx * TILE), float(ty * TILE)
+        cols, tall = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
+        lead = entries[begin]
+        zref = f32(min(max(table[lead, Z0], table[lead, ZLO]), table[lead, ZHI]))
+        izref = f32(1.0) / zref
+        for p in range(BT * 64, buf.shape[0]):
+            buf[p] = f32(0.0)
+        for r in range(tall):
+            for k in range(cols):
+                p = r * TILE + k
+                y, x = ty * TILE + r, tx * TILE + k
+                A = alpha[y, x]
+                if state[4, y, x] == 0:
+                    continue
+                D, a1, a2 = state[1, y, x], state[2, y, x], state[3, y, x]
+                buf[BT * 64 + p] = state[0, y, x]
+                buf[BLAST * 64 + p] = state[4, y, x]
+                buf[BMEDK * 64 + p] = state[5, y, x]
+                gd = g_depth[y, x] / A
+                g2 = scale * g_l2[y, x]
+                gw = g_alpha[y, x] - gd * D / A + g2 * a2
+                for c in range(channels):
+                    gw -= g_color[y, x, c] * background[c]
+                    buf[(GC0 + c) * 64 + p] = g_color[y, x, c]
+                for c in range(3):
+                    buf[(GNX + c) * 64 + p] = g_normal[y, x, c]
+                buf[GW * 64 + p] = gw
+                buf[GD * 64 + p] = gd
+                buf[GM1 * 64 + p] = f32(-2.0) * g2 * a1
+                buf[GM2 * 64 + p] = g2 * A
+                buf[GL1 * 64 + p] = f32(2.0) * g_l1[y, x]
+                buf[GMED * 64 + p] = g_median[y, x]
+                buf[TOTA * 64 + p] = A
+                buf[TOTD * 64 + p] = D
+        for back in range(count):
+            e = begin + count - 1 - back
+            i = entries[e]
+            ahead = entries[max(e - 2, begin)]
+            _prefetch(table, ahead * COLUMNS)
+            _prefetch(table, ahead * COLUMNS + 8)
+            _prefetch(table, ahead * COLUMNS + 16)
+            _prefetch(features, ahead * features.shape[1])
+            if flat:
+                _shade_flat(buf, table, i, ox, oy)
+            else:
+                _shade_round(buf, table, i, ox, oy)
+            row = place[t] + count - 1 - back
+            step = f32(e - begin + 1)
+            gi = g_weight[i]
+            f0, f1, f2, f3, f4, f5 = (
+                features[i, 0], features[i, 1], features[i, 2], features[i, 3], features[i, 4], features[i, 5],
+            )  # fmt: skip
+            for c in range(3, channels):
+                f = features[i, 3 + c]
+                slot = u64((GC0 + c) * 64)
+                for p in range(PIXELS):
+                    buf[QF * 64 + p] = (buf[QF * 64 + p] if c > 3 else f32(0.0)) + buf[slot + u64(p)] * f
+            s0, s1, s2, s3, s4, s5 = f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0), f32(0.0)
+            for p in range(PIXELS):
+                a = buf[BAL * 64 + p] * (f32(1.0) if step <= buf[BLAST * 64 + p] else f32(0.0))
+                rest = f32(1.0) / (f32(1.0) - a)
+                T = buf[BT * 64 + p] * rest
+                w = a * T
+                z = buf[BZZ * 64 + p] - zref
+                m = buf[BIZ * 64 + p] - izref
+                gn0, gn1, gn2 = buf[GNX * 64 + p], buf[GNY * 64 + p], buf[GNZ * 64 + p]
+                gc0, gc1, gc2 = buf[GC0 * 64 + p], buf[GC1 * 64 + p], buf[GC2 * 64 + p]
+                gd, gm1, gm2, gl1 = buf[GD * 64 + p], buf[GM1 * 64 + p], buf[GM2 * 64 + p], buf[GL1 * 64 + p]
+                behind_a, behind_d = buf[BEHA * 64 + p], buf[BEHD * 64 + p]
+                q = buf[GW * 64 + p] + gi + gd * z + (gm1 + gm2 * m) * m + buf[QF * 64 + p]
+                q += gn0 * f0 + gn1 * f1 + gn2 * f2 + gc0 * f3 + gc1 * f4 + gc2 * f5
+                # In front minus behind, of the weights and of the weighted depths.
+                lean = buf[TOTA * 64 + p] - w - behind_a - behind_a
+                lean_d = buf[TOTD * 64 + p] - w * z - behind_d - behind_d
+                q += gl1 * (z * lean - lean_d)
+                median = f32(1.0) if step == buf[BMEDK * 64 + p] else f32(0.0)
+                buf[DZ * 64 + p] = w * (gd + gl1 * lean) + median * buf[GMED * 64 + p]
+                buf[DI * 64 + p] = w * (gm1 + f32(2.0) * gm2 * m)
+                kept = f32(1.0) if a > f32(0.0) else f32(0.0)
+                behind_q = buf[BEHQ * 64 + p]
+                buf[DA * 64 + p] = kept * (T * q - behind_q * rest)
+                buf[BEHQ * 64 + p] = behind_q + w * q
+                buf[BEHA * 64 + p] = behind_a + w
+                buf[BEHD * 64 + p] = behind_d + w * z
+                buf[BT * 64 + p] = T
+                buf[BW * 64 + p] = w
+                s0 += w * gn0
+                s1 += w * gn1
+                s2 += w * gn2
+                s3 += w * gc0
+                s4 += w * gc1
+                s5 += w * gc2
+            rows[row, GRADIENTS], rows[row, GRADIENTS + 1], rows[row, GRADIENTS + 2] = s0, s1, s2
+            rows[row, GRADIENTS + 3], rows[row, GRADIENTS + 4], rows[row, GRADIENTS + 5] = s3, s4, s5
+            for c in range(3, channels):
+                total = f32(0.0)
+                slot = u64((GC0 + c) * 64)
+                for p in range(PIXELS):
+                    total += buf[BW * 64 + p] * buf[slot + u64(p)]
+                rows[row, GRADIENTS + 3 + c] = total
+            if flat:
+                _blame_flat(buf, table, i, ox, oy, rows, row)
+            else:
+                _blame_round(buf, table, i, ox, oy, rows, row)
+
+
+@jit
+def reduce_rows(low, high, first, last, starts, done, entries, place, rows, total):
+    """Add the rows of the tiles first..last to those of the splats low..high in ``total``, in the order of the
+    tiles."""
+    columns = rows.shape[1]
+    for t in range(first, last):
+        for k in range(done[t]):
+            i = entries[starts[t] + k]
+            if low <= i < high:
+                row = place[t] + k
+                for c in range(columns):
+                    total[i, c] += rows[row, c]
+
+
+@jit
+def project_backward(first, last, view, m, q, s, o, values, channels, visible, table, total,
+                     gm, gq, gs, go, gv, g_view):  # fmt: skip
+    """Gradients in the parameters of splats first..last from those in their projection, ``total``.
+
+    The vector-Jacobian product of :func:`project`, in float64, every step of it in reverse. ``g_view`` (12) receives
+    the sums for R and t.
+    """
+    R = view[:9].copy().reshape(3, 3)
+    fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
+    flat, center = view[FLAT] > 0, view[CENTER] > 0
+    degree = round(math.sqrt(values.shape[1] / 3)) - 1
+    Q = np.empty((3, 3))
+    a = np.empty((3, 3))
+    S = np.empty((3, 3))
+    PC = np.empty(3)
+    Y = np.empty(16)
+    c = np.empty(3)
+    ga = np.empty((3, 3))
+    gQ = np.empty((3, 3))
+    gS = np.empty((3, 3))
+    gPC = np.empty(3)
+    gc = np.empty(3)
+    gY = np.empty(16)
+    h = np.empty(3)
+    gh = np.empty(3)
+    gR = np.zeros((3, 3))
+    gt = np.zeros(3)
+    kx, ky, kxy = 1 / fx, 1 / fy, -skew / (fx * fy)
+    for i in range(first, last):
+        if not visible[i]:
+            continue
+        g = total[i]
+        for r in range(3):
+            c[r] = R[r, 0] * m[i, 0] + R[r, 1] * m[i, 1] + R[r, 2] * m[i, 2] + view[TX + r]
+        size = _axes(q, i, Q)
+        for r in range(3):
+            for k in range(3):
+                a[r, k] = R[r, 0] * Q[0, k] + R[r, 1] * Q[1, k] + R[r, 2] * Q[2, k]
+        ga[:] = 0.0
+        gQ[:] = 0.0
+        gc[:] = 0.0
+        g_length = 0.0
+        length = math.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
+        ahead = c[2] > near
+        if ahead:
+            gc[0] += g[X0] * fx / c[2]
+            gc[1] += (g[X0] * skew + g[Y0] * fy) / c[2]
+            gc[2] -= (g[X0] * (table[i, X0] - cx) + g[Y0] * (table[i, Y0] - cy)) / c[2]
+        g_opacity = g[OPACITY]
+        if flat:
+            depth = c[2] if ahead else length
+            nc = a[0, 2] * c[0] + a[1, 2] * c[1] + a[2, 2] * c[2]
+            floor = K.EDGE_ON * length
+            tilted = abs(nc) < floor
+            sign = -1.0 if nc < 0 else 1.0
+            if tilted:
+                nc = sign * floor
+            g_depth, g_nc = g[Z0], 0.0
+            for k in range(2):
+                tc = (a[0, k] * c[0] + a[1, k] * c[1] + a[2, k] * c[2]) / nc
+                scale = depth / s[i, k]
+                for r in range(3):
+                    h[r] = a[r, k] - tc * a[r, 2]
+                gh[0] = g[UX + 3 * k] * kx + g[UY + 3 * k] * kxy
+                gh[1] = g[UY + 3 * k] * ky
+                gh[2] = 0.0 if ahead else g[U0 + 3 * k]
+                g_scale = gh[0] * h[0] + gh[1] * h[1] + gh[2] * h[2]
+                g_tc = 0.0
+                for r in range(3):
+                    gh[r] *= scale
+                    g_tc -= gh[r] * a[r, 2]
+                for r in range(3):
+                    ga[r, k] += gh[r] + g_tc * c[r] / nc
+                    ga[r, 2] -= tc * gh[r]
+                    gc[r] += g_tc * a[r, k] / nc
+                g_nc -= g_tc * tc / nc
+                g_depth += g_scale / s[i, k]
+                gs[i, k] -= g_scale * scale / s[i, k]
+            scale = depth / nc
+            gh[0] = g[WX] * kx + g[WY] * kxy
+            gh[1] = g[WY] * ky
+            gh[2] = 0.0 if ahead else g[W0]
+            g_scale = 0.0
+            for r in range(3):
+                g_scale += gh[r] * a[r, 2]
+                ga[r, 2] += scale * gh[r]
+            g_depth += g_scale / nc
+            g_nc -= g_scale * scale / nc
+            if tilted:
+                g_length += sign * K.EDGE_ON * g_nc
+            else:
+                for r in range(3):
+                    ga[r, 2] += g_nc * c[r]
+                    gc[r] += g_nc * a[r, 2]
+            if ahead:
+                gc[2] += g_depth
+            else:
+                g_length += g_depth
+        else:
+            gc[2] += g[Z0]
+            limit = K.JACOBIAN_MARGIN * view[WIDTH] / 2 / fx
+            low, high = -cx / fx - limit, (view[WIDTH] - cx) / fx + limit
+            free_x = low <= c[0] / c[2] <= high
+            px = min(max(c[0] / c[2], low), high)
+            limit = K.JACOBIAN_MARGIN * view[HEIGHT] / 2 / fy
+            low, high = -cy / fy - limit, (view[HEIGHT] - cy) / fy + limit
+            free_y = low <= c[1] / c[2] <= high
+            py = min(max(c[1] / c[2], low), high)
+            sxx, sxy, syy = 0.0, 0.0, 0.0
+            for k in range(3):
+                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * s[i, k] / c[2]
+                gy = fy * (a[1, k] - py * a[2, k]) * s[i, k] / c[2]
+                sxx += gx * gx
+                sxy += gx * gy
+                syy += gy * gy
+            sharp = sxx * syy - sxy * sxy
+            bxx, byy = sxx + K.BLUR_3D, syy + K.BLUR_3D
+            det = bxx * byy - sxy * sxy
+            # d conic = -conic d Sigma conic
+            A, B, C = byy / det, -sxy / det, bxx / det
+            p11, p12 = A * g[CA] + B * g[CB] / 2, A * g[CB] / 2 + B * g[CC]
+            p21, p22 = B * g[CA] + C * g[CB] / 2, B * g[CB] / 2 + C * g[CC]
+            g_xx = -(p11 * A + p12 * B)
+            g_xy = -(p11 * B + p12 * C) - (p21 * A + p22 * B)
+            g_yy = -(p21 * B + p22 * C)
+            if view[ANTIALIASED] > 0:
+                ratio = sharp / det
+                factor = math.sqrt(max(ratio, K.COMPENSATION_MIN))
+                if ratio >= K.COMPENSATION_MIN:
+                    g_ratio = g_opacity * o[i] / (2 * factor)
+                    g_sharp, g_det = g_ratio / det, -g_ratio * ratio / det
+                    g_xx += g_sharp * syy + g_det * byy
+                    g_yy += g_sharp * sxx + g_det * bxx
+                    g_xy -= 2 * sxy * (g_sharp + g_det)
+                g_opacity *= factor
+            g_px, g_py = 0.0, 0.0
+            for k in range(3):
+                f = s[i, k] / c[2]
+                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * f
+                gy = fy * (a[1, k] - py * a[2, k]) * f
+                ux = 2 * g_xx * gx + g_xy * gy
+                uy = 2 * g_yy * gy + g_xy * gx
+                ga[0, k] += ux * fx * f
+                ga[1, k] += (ux * skew + uy * fy) * f
+                ga[2, k] -= (ux * (fx * px + skew * py) + uy * fy * py) * f
+                g_px -= ux * fx * a[2, k] * f
+                g_py -= (ux * skew + uy * fy) * a[2, k] * f
+                gs[i, k] += (ux * gx + uy * gy) / s[i, k]
+                gc[2] -= (ux * gx + uy * gy) / c[2]
+            if free_x:
+                gc[0] += g_px / c[2]
+                gc[2] -= g_px * c[0] / (c[2] * c[2])
+            if free_y:
+                gc[1] += g_py / c[2]
+                gc[2] -= g_py * c[1] / (c[2] * c[2])
+            if not center:
+                for r in range(3):
+                    for k in range(3):
+                        S[r, k] = 0.0
+                        for j in range(3):
+                            S[r, k] += a[r, j] * a[k, j] / (s[i, j] * s[i, j])
+                for r in range(3):
+                    PC[r] = S[r, 0] * c[0] + S[r, 1] * c[1] + S[r, 2] * c[2]
+                q0 = PC[0] * c[0] + PC[1] * c[1] + PC[2] * c[2]
+                lx, ly = c[2] * PC[0] / q0, c[2] * PC[1] / q0
+                g_lx = g[LX] * kx + g[LY] * kxy
+                g_ly = g[LY] * ky
+                g_rxx = g[RXX] * kx * kx + g[RXY] * kx * kxy + g[RYY] * kxy * kxy
+                g_rxy = g[RXY] * kx * ky + 2 * g[RYY] * kxy * ky
+                g_ryy = g[RYY] * ky * ky
+                square = c[2] * c[2] / q0
+                gS[:] = 0.0
+                gS[0, 0], gS[0, 1], gS[1, 1] = g_rxx * square, g_rxy * square, g_ryy * square
+                quadratic = g_rxx * S[0, 0] + g_rxy * S[0, 1] + g_ryy * S[1, 1]
+                g_q0 = -quadratic * square / q0
+                gc[2] += 2 * c[2] / q0 * quadratic
+                g_lx -= 2 * lx * g_rxx + ly * g_rxy
+                g_ly -= 2 * ly * g_ryy + lx * g_rxy
+                g_q0 -= (g_lx * lx + g_ly * ly) / q0
+                gc[2] += (g_lx * PC[0] + g_ly * PC[1]) / q0
+                gPC[0], gPC[1], gPC[2] = g_lx * c[2] / q0, g_ly * c[2] / q0, 0.0
+                for r in range(3):
+                    gPC[r] += g_q0 * c[r]
+                    gc[r] += g_q0 * PC[r]
+                for r in range(3):
+                    for k in range(3):
+                        gS[r, k] += gPC[r] * c[k]
+                        gc[r] += S[r, k] * gPC[k]
+                for k in range(3):
+                    inverse = 1 / (s[i, k] * s[i, k])
+                    along = 0.0
+                    for r in range(3):
+                        for j in range(3):
+                            ga[r, k] += (gS[r, j] + gS[j, r]) * a[j, k] * inverse
+                            along += a[r, k] * gS[r, j] * a[j, k]
+                    gs[i, k] -= 2 * along * inverse / s[i, k]
+        spread = (s[i, 0] * a[2, 0]) ** 2 + (s[i, 1] * a[2, 1]) ** 2
+        if not flat:
+            spread += (s[i, 2] * a[2, 2]) ** 2
+        spread = math.sqrt(spread)
+        if center:
+            if c[2] > near:
+                gc[2] += g[ZLO] + g[ZHI]
+        else:
+            g_spread = 0.0
+            if c[2] - K.EXTENT_SIGMAS * spread > near:
+                gc[2] += g[ZLO]
+                g_spread -= K.EXTENT_SIGMAS * g[ZLO]
+            if c[2] + K.EXTENT_SIGMAS * spread > near:
+                gc[2] += g[ZHI]
+                g_spread += K.EXTENT_SIGMAS * g[ZHI]
+            if spread > 0:
+                for k in range(s.shape[1]):
+                    gs[i, k] += g_spread * s[i, k] * a[2, k] ** 2 / spread
+                    ga[2, k] += g_spread * s[i, k] ** 2 * a[2, k] / spread
+        go[i] = g_opacity
+        axis = 2
+        if not flat:
+            axis = 0
+            if s[i, 1] < s[i, axis]:
+                axis = 1
+            if s[i, 2] < s[i, axis]:
+                axis = 2
+        facing = a[0, axis] * c[0] + a[1, axis] * c[1] + a[2, axis] * c[2]
+        flip = -1.0 if facing > 0 else 1.0
+        for k in range(3):
+            gQ[k, axis] += flip * g[GRADIENTS + k]
+        if view[HARMONIC] > 0:
+            x = (R[0, 0] * c[0] + R[1, 0] * c[1] + R[2, 0] * c[2]) / length
+            y = (R[0, 1] * c[0] + R[1, 1] * c[1] + R[2, 1] * c[2]) / length
+            z = (R[0, 2] * c[0] + R[1, 2] * c[1] + R[2, 2] * c[2]) / length
+            _harmonics(degree, x, y, z, Y)
+            bases = (degree + 1) ** 2
+            for j in range(bases):
+                gY[j] = 0.0
+            for k in range(3):
+                shade = 0.5
+                for j in range(bases):
+                    shade += Y[j] * values[i, 3 * j + k]
+                if shade >= 0:
+                    for j in range(bases):
+                        gv[i, 3 * j + k] = g[GRADIENTS + 3 + k] * Y[j]
+                        gY[j] += g[GRADIENTS + 3 + k] * values[i, 3 * j + k]
+            dx, dy, dz = 0.0, 0.0, 0.0
+            if degree > 0:
+                dx -= C1 * gY[3]
+                dy -= C1 * gY[1]
+                dz += C1 * gY[2]
+            if degree > 1:
+                dx += C20 * y * gY[4] - 2 * C22 * x * gY[6] + C23 * z * gY[7] + 2 * C24 * x * gY[8]
+                dy += C20 * x * gY[4] + C21 * z * gY[5] - 2 * C22 * y * gY[6] - 2 * C24 * y * gY[8]
+                dz += C21 * y * gY[5] + 4 * C22 * z * gY[6] + C23 * x * gY[7]
+            if degree > 2:
+                dx += C30 * 6 * x * y * gY[9] + C31 * y * z * gY[10] - C32 * 2 * x * y * gY[11]
+                dx += -C33 * 6 * x * z * gY[12] + C34 * (4 * z * z - 3 * x * x - y * y) * gY[13]
+                dx += C35 * 2 * x * z * gY[14] + C36 * 3 * (x * x - y * y) * gY[15]
+                dy += C30 * 3 * (x * x - y * y) * gY[9] + C31 * x * z * gY[10]
+                dy += C32 * (4 * z * z - x * x - 3 * y * y) * gY[11] - C33 * 6 * y * z * gY[12]
+                dy += -C34 * 2 * x * y * gY[13] - C35 * 2 * y * z * gY[14] - C36 * 6 * x * y * gY[15]
+                dz += C31 * x * y * gY[10] + C32 * 8 * y * z * gY[11]
+                dz += C33 * 3 * (2 * z * z - x * x - y * y) * gY[12] + C34 * 8 * x * z * gY[13]
+                dz += C35 * (x * x - y * y) * gY[14]
+            along = x * dx + y * dy + z * dz
+            h[0], h[1], h[2] = (dx - x * along) / length, (dy - y * along) / length, (dz - z * along) / length
+            for r in range(3):
+                for k in range(3):
+                    gc[r] += R[r, k] * h[k]
+                    gR[r, k] += c[r] * h[k]
+        else:
+            for k in range(channels):
+                gv[i, k] = g[GRADIENTS + 3 + k]
+        for r in range(3):
+            gc[r] += g_length * c[r] / length
+        for r in range(3):
+            for k in range(3):
+                for j in range(3):
+                    gQ[j, k] += R[r, j] * ga[r, k]
+                    gR[r, j] += ga[r, k] * Q[j, k]
+        for r in range(3):
+            gt[r] += gc[r]
+            for k in range(3):
+                gm[i, k] += R[r, k] * gc[r]
+                gR[r, k] += gc[r] * m[i, k]
+        w, x, y, z = q[i, 0] / size, q[i, 1] / size, q[i, 2] / size, q[i, 3] / size
+        gw = 2 * (x * (gQ[2, 1] - gQ[1, 2]) + y * (gQ[0, 2] - gQ[2, 0]) + z * (gQ[1, 0] - gQ[0, 1]))
+        yx, zx, zy = gQ[0, 1] + gQ[1, 0], gQ[0, 2] + gQ[2, 0], gQ[1, 2] + gQ[2, 1]
+        gx = 2 * (-2 * x * (gQ[1, 1] + gQ[2, 2]) + y * yx + z * zx + w * (gQ[2, 1] - gQ[1, 2]))
+        gy = 2 * (x * yx - 2 * y * (gQ[0, 0] + gQ[2, 2]) + z * zy + w * (gQ[0, 2] - gQ[2, 0]))
+        gz = 2 * (x * zx + y * zy - 2 * z * (gQ[0, 0] + gQ[1, 1]) + w * (gQ[1, 0] - gQ[0, 1]))
+        along = w * gw + x * gx + y * gy + z * gz
+        gq[i, 0], gq[i, 1] = (gw - w * along) / size, (gx - x * along) / size
+        gq[i, 2], gq[i, 3] = (gy - y * along) / size, (gz - z * along) / size
+    for r in range(3):
+        g_view[9 + r] = gt[r]
+        for k in range(3):
+            g_view[3 * r + k] = gR[r, k]

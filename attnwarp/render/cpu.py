@@ -4,6 +4,9 @@
 2. ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back.
 3. ``bin_tiles``: the splats of each tile, in that order; exact outlines, no bounding circles.
 4. ``forward``: composite tile by tile until every pixel of it is opaque.
+5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
+rows
+   of each splat, and ``project_backward`` takes them to the parameters and the pose.
 
 Threads follow ``torch.set_num_threads``; the result has the same bits for any number of them.
 """
@@ -11,6 +14,7 @@ Threads follow ``torch.set_num_threads``; the result has the same bits for any n
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +24,7 @@ from attnwarp.render import _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
 BIN_CHUNKS = 8
+ROWS_AT_ONCE = 1 << 17
 
 
 def _array(tensor: torch.Tensor, dtype: type) -> np.ndarray:
@@ -111,40 +116,147 @@ class _Scene:
         return list(itertools.pairwise(edges))
 
 
+class _Composite(torch.autograd.Function):
+    """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs`` out."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Inputs, counters: dict[str, int], *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        scene = _Scene(inputs)
+        h, w = inputs.height, inputs.width
+        near, far = inputs.ndc
+        scale = (far * near / (far - near)) ** 2
+        color = np.empty((h, w, scene.channels), np.float32)
+        normal = np.empty((h, w, 3), np.float32)
+        alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
+        state = np.empty((6, h, w), np.float32)
+        done = np.zeros(scene.tiles, np.int64)
+        seen = np.empty(len(scene.entries), np.float32)
+        jobs = scene.tile_ranges()
+        counts = np.zeros((len(jobs), 2), np.int64)
+        slots = kernels.SLOTS + max(0, scene.channels - 3)
+        _threads.run(
+            kernels.forward,
+            [
+                (*job, scene.view, scene.tiles_x, scene.starts, scene.entries, scene.table, scene.features,
+                 scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, seen, counts[k],
+                 _aligned(slots * kernels.PIXELS))
+                for k, job in enumerate(jobs)
+            ],
+        )  # fmt: skip
+        weight = np.zeros(len(scene.means), np.float32)
+        kernels.gather_weights(scene.starts, done, scene.entries, seen, weight)
+        counters.update(
+            splats=len(scene.means),
+            visible=len(scene.order),
+            tiles=scene.tiles,
+            tile_pairs=int(done.sum()),
+            pairs=int(counts[:, 0].sum()),
+            contributing=int(counts[:, 1].sum()),
+        )
+        ctx.scene, ctx.state, ctx.alpha, ctx.done, ctx.scale = scene, state, alpha, done, scale
+        ctx.origin = _array(inputs.origin, np.float64)
+        ctx.shapes = [(t.shape, t.dtype) for t in tensors]
+        # Kept so that torch notices when one of them is changed in place before the backward pass.
+        ctx.save_for_backward(*tensors)
+        ctx.set_materialize_grads(False)
+        return tuple(torch.from_numpy(a) for a in (color, alpha, depth, median, normal, l1, l2, weight))
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *upstream: torch.Tensor | None) -> tuple[Any, ...]:
+        scene: _Scene = ctx.scene
+        _ = ctx.saved_tensors
+        h, w = ctx.alpha.shape
+        n = len(scene.means)
+        shapes = [(h, w, scene.channels), *[(h, w)] * 3, (h, w, 3), (h, w), (h, w), (n,)]
+        g = [
+            np.zeros(shape, np.float32) if grad is None else _array(grad, np.float32)
+            for grad, shape in zip(upstream, shapes, strict=True)
+        ]
+        g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight = g
+        total = _gather_rows(scene, ctx, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight)
+        gm, gq, gs = np.zeros_like(scene.means), np.zeros_like(scene.quats), np.zeros_like(scene.scales)
+        go, gv = np.zeros(n), np.zeros_like(scene.values)
+        visible = np.zeros(n, np.bool_)
+        visible[scene.order] = True
+        pieces = _threads.ranges(n, kernels.CHUNK)
+        g_view = np.zeros((len(pieces), 12))
+        _threads.run(
+            kernels.project_backward,
+            [
+                (*piece, scene.view, scene.means, scene.quats, scene.scales, scene.opacities, scene.values,
+                 scene.channels, visible, scene.table, total, gm, gq, gs, go, gv, g_view[k])
+                for k, piece in enumerate(pieces)
+            ],
+        )  # fmt: skip
+        moved = g_view.sum(axis=0)
+        g_pose = np.zeros((4, 4))
+        g_pose[:3, :3] = moved[:9].reshape(3, 3) + np.outer(moved[9:], ctx.origin)
+        g_pose[:3, 3] = moved[9:]
+        g_background = np.zeros(scene.channels)
+        if ctx.needs_input_grad[8]:
+            g_background = np.einsum("hwc,hw->c", g_color, 1 - ctx.alpha, dtype=np.float64)
+        grads = (gm, gq, gs, go, gv, g_pose, g_background)
+        return (
+            None,
+            None,
+            *(
+                torch.from_numpy(grad).reshape(shape).to(dtype) if needed else None
+                for grad, (shape, dtype), needed in zip(grads, ctx.shapes, ctx.needs_input_grad[2:], strict=True)
+            ),
+        )
+
+
+def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
+    """(N, columns) gradients in the projected splats, summed over tiles in their order.
+
+    One row for each splat of each tile is more than should be held at once, so groups of tiles take turns.
+    """
+    h, w = ctx.alpha.shape
+    n = len(scene.means)
+    columns = kernels.GRADIENTS + scene.features.shape[1]
+    total = np.zeros((n, columns))
+    done = ctx.done
+    before = np.concatenate([[0], np.cumsum(done)])
+    room = ROWS_AT_ONCE + n + h * w
+    slots = kernels.BACK_SLOTS + max(0, scene.channels - 3)
+    first = 0
+    while first < scene.tiles:
+        last = max(first + 1, int(np.searchsorted(before, before[first] + room, side="right")) - 1)
+        last = min(last, scene.tiles)
+        rows = np.empty((int(before[last] - before[first]), columns), np.float32)
+        place = before[:-1] - before[first]
+        pieces = 8 * _threads.count()
+        cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
+        edges = sorted({first, *(int(c) for c in cuts if first < c < last), last})
+        _threads.run(
+            kernels.backward,
+            [
+                (begin, end, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table, scene.features,
+                 scene.background, ctx.scale, ctx.alpha, ctx.state, *upstream, place, rows,
+                 _aligned(slots * kernels.PIXELS))
+                for begin, end in itertools.pairwise(edges)
+            ],
+        )  # fmt: skip
+        # Each thread takes some of the splats and all of the rows: whoever adds, the order is that of the tiles.
+        share = -(-n // _threads.count())
+        _threads.run(
+            kernels.reduce_rows,
+            [
+                (low, high, first, last, scene.starts, done, scene.entries, place, rows, total)
+                for low, high in _threads.ranges(n, max(1, share))
+            ],
+        )
+        first = last
+    return total
+
+
 def render(inputs: Inputs) -> Outputs:
     """Render on the CPU; see :func:`attnwarp.render.render`."""
-    scene = _Scene(inputs)
-    h, w = inputs.height, inputs.width
-    near, far = inputs.ndc
-    scale = (far * near / (far - near)) ** 2
-    color = np.empty((h, w, scene.channels), np.float32)
-    normal = np.empty((h, w, 3), np.float32)
-    alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
-    state = np.empty((6, h, w), np.float32)
-    done = np.zeros(scene.tiles, np.int64)
-    seen = np.empty(len(scene.entries), np.float32)
-    jobs = scene.tile_ranges()
-    counts = np.zeros((len(jobs), 2), np.int64)
-    _threads.run(
-        kernels.forward,
-        [
-            (*job, scene.view, scene.tiles_x, scene.starts, scene.entries, scene.table, scene.features,
-             scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, seen, counts[k],
-             _aligned((kernels.SLOTS + max(0, scene.channels - 3)) * kernels.PIXELS))
-            for k, job in enumerate(jobs)
-        ],
+    counters: dict[str, int] = {}
+    tensors = _Composite.apply(
+        inputs, counters, inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.values, inputs.pose,
+        inputs.background,
     )  # fmt: skip
-    weight = np.zeros(len(scene.means), np.float32)
-    kernels.gather_weights(scene.starts, done, scene.entries, seen, weight)
-    counters = {
-        "splats": len(scene.means),
-        "visible": len(scene.order),
-        "tiles": scene.tiles,
-        "tile_pairs": int(done.sum()),
-        "pairs": int(counts[:, 0].sum()),
-        "contributing": int(counts[:, 1].sum()),
-    }
     names = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
-    arrays = (color, alpha, depth, median, normal, l1, l2, weight)
-    tensors = {name: torch.from_numpy(array) for name, array in zip(names, arrays, strict=True)}
-    return Outputs(**tensors, counters=counters)
+    return Outputs(**dict(zip(names, tensors, strict=True)), counters=counters)

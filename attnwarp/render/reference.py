@@ -200,7 +200,9 @@ class _Splats:
 
     def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
         near = self.inputs.near
-        reach = constants.EXTENT_SIGMAS * variance_z.sqrt()
+        # Bounded from below: the slope of a square root at zero is infinite, and a disc may lie exactly across the
+        # axis.
+        reach = constants.EXTENT_SIGMAS * variance_z.clamp(min=1e-300).sqrt()
         z = self.centers[:, 2]
         return (z - reach).clamp(min=near), (z + reach).clamp(min=near)
 
