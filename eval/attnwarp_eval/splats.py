@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.raycast import Geometry
-from attnwarp_eval.truth.shading import frames, irradiance, object_albedo
+from attnwarp_eval.truth.shading import buried, frames, irradiance, object_albedo
 
 if TYPE_CHECKING:
     from attnwarp.gaussians import Gaussians
@@ -199,7 +199,12 @@ def sample_surface(geometry: Geometry, count: int, *, center: npt.ArrayLike, foc
     normals = np.concatenate([normal[flat], outward])
     primitive = np.concatenate([flat_id[flat], sphere_id[cell_sphere[ball]]])
 
-    spacing = np.sqrt(total / (count * weight(point)))
+    # Surfaces inside other objects are seen by nobody; splats there would only shine through.
+    free = ~buried(geometry, point, normals, primitive)
+    if free.sum() < count:
+        raise ValueError(f"count: got {count}, but too little of the surface can be seen from anywhere outside")
+    point, normals, primitive = point[free], normals[free], primitive[free]
+    spacing = np.sqrt(total * free.mean() / (count * weight(point)))
     keep = _eliminate(point - center, normals, spacing, count)
     return SurfaceSamples(point[keep], normals[keep], primitive[keep], spacing[keep])
 

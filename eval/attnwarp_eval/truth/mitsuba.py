@@ -212,9 +212,7 @@ def _loaded_shapes(world_hash: str, holder: _Holder) -> tuple[dict[str, Any], Ar
     bounds = np.stack([shape.bounds() for shape in scene.shapes()])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
-        return {
-            name: mi.load_dict(form, optimize=False) for name, form in _shapes(scene, center, Path(folder))
-        }, center
+        return {name: mi.load_dict(form, optimize=False) for name, form in _shapes(scene, center, Path(folder))}, center
 
 
 def _faces(scene: Scene) -> Iterator[Sphere | Rectangle | Mesh]:

@@ -8,6 +8,7 @@ the same in every direction. Mitsuba's pictures of such scenes converge to it, w
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -79,19 +80,51 @@ def irradiance(
 def _sky_irradiance(
     sky: SkySpec, geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int
 ) -> Array:
-    k = np.arange(rays)
-    radical = np.array([int(f"{i:032b}"[::-1], 2) / 2**32 for i in k])
-    tangent, bitangent = frames(normals)
-    # One rotation a point (golden-ratio sequence) turns the shared pattern's bias into noise.
-    turn = (np.arange(len(points)) * 0.6180339887498949) % 1.0
     total = np.zeros((len(points), 3))
-    for i in k:
-        r, phi = math.sqrt((i + 0.5) / rays), 2 * np.pi * (radical[i] + turn)
-        x, y, z = r * np.cos(phi), r * np.sin(phi), math.sqrt(1 - (i + 0.5) / rays)
-        direction = x[:, None] * tangent + y[:, None] * bitangent + z * normals
+    for direction in hemisphere(normals, rays):
         free = geometry.reached(points + 2 * geometry.extent * direction, points, primitive_id)
         total[free] += sky_radiance(sky, direction[free])
     return total * (np.pi / rays)
+
+
+def buried(
+    geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int = 64
+) -> npt.NDArray[np.bool_]:
+    """Which surface points no ray from outside the scene reaches: inside other objects, or where two of them touch.
+
+    Args:
+        points, normals, primitive_id: as in :func:`irradiance`.
+        rays: directions tried a point, at most.
+
+    Returns:
+        (N,) bool.
+    """
+    left = np.arange(len(points))
+    for start in range(0, rays, 8):
+        # Most points are out in the open: eight directions at a time leave few of them for the next eight.
+        asked = left
+        open_ = np.zeros(len(asked), dtype=bool)
+        for direction in hemisphere(normals[asked], 8, start * 0.0477):
+            eyes = points[asked] + 2 * geometry.extent * direction
+            open_ |= geometry.reached(eyes, points[asked], primitive_id[asked])
+        left = asked[~open_]
+    out = np.zeros(len(points), dtype=bool)
+    out[left] = True
+    return out
+
+
+def hemisphere(normals: Array, rays: int, turn: float = 0.0) -> Iterator[Array]:
+    """Cosine-weighted unit directions about each normal: ``rays`` arrays (N, 3) of a Hammersley set.
+
+    The set is turned by another angle for each point (a golden-ratio sequence), which makes its bias noise.
+    """
+    tangent, bitangent = frames(normals)
+    offset = (np.arange(len(normals)) * 0.6180339887498949 + turn) % 1.0
+    for i in range(rays):
+        radical = int(f"{i:032b}"[::-1], 2) / 2**32
+        r, z = math.sqrt((i + 0.5) / rays), math.sqrt(1 - (i + 0.5) / rays)
+        phi = 2 * np.pi * (radical + offset)[:, None]
+        yield r * np.cos(phi) * tangent + r * np.sin(phi) * bitangent + z * normals
 
 
 def frames(normals: Array) -> tuple[Array, Array]:
