@@ -176,6 +176,48 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
 
 
+@scenes_app.command("list")
+def list_() -> None:
+    """The scenes that can be named."""
+    from attnwarp_eval.scene import list_scenes, load_scene
+
+    with clear_errors():
+        for name in list_scenes():
+            typer.echo(f"{name:12} {load_scene(name).title}")
+
+
+@scenes_app.command()
+def show(scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")]) -> None:
+    """What a scene contains, and how its pictures are made."""
+    with clear_errors():
+        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.show import describe
+
+        typer.echo(describe(load_scene(scene)))
+
+
+@scenes_app.command()
+def render(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the PNG files; runs/scenes/<scene> if left out.")] = None,
+    views: Annotated[str | None, typer.Option(help="Only these cameras (comma-separated names).")] = None,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
+    spp: Annotated[int | None, typer.Option(min=1, help="Samples a pixel, not the scene's.")] = None,
+) -> None:
+    """Render a scene's truth from its cameras: pictures, depth, normals, and one sheet of them all."""
+    from rich.console import Console
+
+    with clear_errors():
+        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.show import render_views
+
+        loaded = load_scene(scene).with_size(size, size)
+        folder = out or Path("runs") / "scenes" / loaded.name
+        with Console(stderr=True).status("starting") as status:
+            written = list(render_views(loaded, folder, views=_split(views), spp=spp, progress=status.update))
+    typer.echo(written[-1])
+
+
 @app.command()
 def studies() -> None:
     """List the studies that ship with the package."""
