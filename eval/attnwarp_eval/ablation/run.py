@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -174,12 +175,12 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
         ) as cluster,
         Client(cluster) as client,
     ):
-        waiting = _spread(plan.todo)
+        queue = _Queue(plan.todo)
         running: dict[Any, Cell] = {}
         pool = as_completed()
 
-        def submit() -> None:
-            cell = next(waiting, None)
+        def submit(scene: str | None) -> None:
+            cell = queue.take(scene)
             if cell is not None:
                 tell("start", {"title": cell.title})
                 future = client.submit(compute_and_write, cell, cell.scene, root, pure=False)
@@ -187,19 +188,29 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
                 pool.add(future)
 
         for _ in range(jobs):
-            submit()
+            submit(None)
         for future in pool:
             cell = running.pop(future.key)
             error = describe(future.exception()) if future.status == "error" else future.result()
             yield cell, error
-            submit()
+            submit(cell.scene)
 
 
-def _spread(cells: list[Cell]) -> Iterator[Cell]:
-    """One cell of every scene first, so that workers prepare different scenes' truth; then scene by scene."""
-    first: dict[str, Cell] = {}
-    for cell in cells:
-        first.setdefault(cell.scene, cell)
-    yield from first.values()
-    leading = {cell.id for cell in first.values()}
-    yield from (cell for cell in cells if cell.id not in leading)
+class _Queue:
+    """Cells by scene. A worker stays with the scene whose truth it has made, then helps where most is left."""
+
+    def __init__(self, cells: list[Cell]) -> None:
+        self.scenes: dict[str, deque[Cell]] = {}
+        for cell in cells:
+            self.scenes.setdefault(cell.scene, deque()).append(cell)
+        self.started: set[str] = set()
+
+    def take(self, scene: str | None) -> Cell | None:
+        """The next cell for the worker that last computed one of ``scene``; None when nothing is left."""
+        left = {name: cells for name, cells in self.scenes.items() if cells}
+        if not left:
+            return None
+        if scene not in left:
+            scene = max(left, key=lambda name: (name not in self.started, len(left[name])))
+        self.started.add(scene)
+        return left[scene].popleft()

@@ -117,6 +117,14 @@ class Study(_Model):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Study:
+        for name, variant in self.variants.items():
+            try:
+                variant.settings()
+                self.splats_of(variant)
+            except ValidationError as error:
+                raise ValueError(f"variants.{name}.splats: {explain(error, Splats)}") from None
+            except ValueError as error:
+                raise ValueError(f"variants.{name}: {error}") from None
         used: list[tuple[str, list[str]]] = [(f"probes.{p}", v) for p, v in self.probes.items()]
         used += [(f"ablations.{i}", [a.baseline, *a.variants]) for i, a in enumerate(self.ablations)]
         used += [(f"fronts.{i}", f.variants) for i, f in enumerate(self.fronts)]
@@ -128,12 +136,6 @@ class Study(_Model):
         for name, values in (("scenes", self.scenes), ("seeds", self.seeds), ("views", self.views)):
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: something is named twice in {values}")
-        for name, variant in self.variants.items():
-            try:
-                variant.settings()
-                self.splats_of(variant)
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"variants.{name}: {error}") from None
         return self
 
     def splats_of(self, variant: Variant) -> Splats:
@@ -254,27 +256,27 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         raise StudyError(f"{path}: {explain(error)}") from None
 
 
-def explain(error: ValidationError) -> str:
+def explain(error: ValidationError, model: type[BaseModel] = Study) -> str:
     """Pydantic's findings in one readable text: where, what was wrong, and the nearest known key."""
     lines = []
     for item in error.errors():
-        where = ".".join(str(p) for p in item["loc"]) or "study"
+        where = ".".join(str(p) for p in item["loc"])
         message = str(item["msg"]).removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
-            message = f"unknown key{_did_you_mean(str(item['loc'][-1]), _known_keys(item['loc']))}"
-        lines.append(f"{where}: {message}" if item["loc"] else message)
+            message = f"unknown key{_did_you_mean(str(item['loc'][-1]), _known_keys(model, item['loc']))}"
+        lines.append(f"{where}: {message}" if where else message)
     return "; ".join(lines)
 
 
-def _known_keys(location: tuple[Any, ...]) -> list[str]:
-    model: type[BaseModel] = Study
+def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     inner: dict[str, type[BaseModel]] = {
         "splats": Splats,
         "variants": Variant,
         "ablations": Ablation,
         "fronts": Front,
         "pictures": Pictures,
+        "yaw": Yaw,
     }
-    if len(location) > 1 and location[0] in inner:
-        model = inner[str(location[0])]
+    if len(location) > 1:
+        model = inner.get(str(location[0]), model)
     return list(model.model_fields)
