@@ -338,6 +338,8 @@ class WarpedView:
         source, target = self.correspondence.source, self.correspondence.target
         source_size = layer_size(source, target, size) if source_size is None else source_size
         key = (*size, *source_size)
+        if key == (target.height, target.width, source.height, source.width):
+            return FeatureWarp(self.correspondence, self.mask)
         if key not in self._at:
             settings = self.settings
             layer = correspond_at(
