@@ -26,7 +26,7 @@ jit = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST)
 # Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions, and two threads
 # that count the same array up and down for every splat spend a third of their time on it. Such kernels allocate
 # nothing.
-bare = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, _nrt=False)
+bare = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, _nrt=False)  # type: ignore[call-overload]
 inlined = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, inline="always")
 
 f32 = np.float32
@@ -46,8 +46,9 @@ FILTER, WMAX, CUT, BOUNDED, PEAK = 15, 16, 17, 18, 19
 COLUMNS = 20
 
 # Slots of a tile's buffer, each 64 floats.
-XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, WW, NX, NY, NZ, C_0, C_1, C_2 = range(21)
-SLOTS = 21  # and one more for each channel from the fourth on
+(XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, ZREF, IREF, WW, NX, NY, NZ, C_0, C_1,
+ C_2) = range(23)  # fmt: skip
+SLOTS = 23  # and one more for each channel from the fourth on
 
 HUGE = 1e30
 LOG2E_HALF = f32(0.5 * math.log2(math.e))
@@ -550,32 +551,29 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
             median, normal, l1, l2, state, done, seen, counts, buf):  # fmt: skip
     """Composite the tiles first..last.
 
-    ``state`` (6, H, W) keeps what the backward pass needs, ``done`` the entries worked off in
-    each tile, ``seen`` the sum of weights of each entry, ``counts`` [pairs, contributing].
+    ``state`` (5, H, W) keeps what the backward pass needs (transmittance, last and median entry, mean and spread of 1
+    / z), ``done`` the entries worked off in each tile, ``seen`` the sum of weights of each entry, ``counts`` [pairs,
+    contributing].
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     channels = background.shape[0]
     for p in range(PIXELS):
-        buf[XS * 64 + p] = f32(p % TILE) + f32(0.5)
-        buf[YS * 64 + p] = f32(p // TILE) + f32(0.5)
+        # From the tile's middle: offsets are small, and so is what they round.
+        buf[XS * 64 + p] = f32(p % TILE) - f32(3.5)
+        buf[YS * 64 + p] = f32(p // TILE) - f32(3.5)
     pairs, contributing = 0, 0
     stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
     for t in range(first, last):
         begin, end = starts[t], starts[t + 1]
         ty, tx = t // tiles_x, t % tiles_x
-        ox, oy = float(tx * TILE), float(ty * TILE)
+        ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
         cols, rows = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
         for p in range(PIXELS):
             # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
             buf[TT * 64 + p] = f32(1.0) if (p % TILE < cols) & (p // TILE < rows) else f32(0.0)
         for p in range(AA * 64, buf.shape[0]):
             buf[p] = f32(0.0)
-        # Depths are summed relative to one of the tile's own, which keeps the digits of thin layers far away.
-        zref = f32(0.0)
-        if begin < end:
-            zref = f32(min(max(table[entries[begin], Z0], table[entries[begin], ZLO]), table[entries[begin], ZHI]))
-        izref = f32(1.0) / zref if begin < end else f32(0.0)
         e = begin
         left = f32(1.0)
         while e < end:
@@ -595,9 +593,14 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                 for p in range(PIXELS):
                     # Blends with a factor of 0 or 1, exact: a select becomes a masked store, which stalls the next
                     # load.
-                    opens = f32(1.0) if (half < buf[TT * 64 + p]) & (buf[AL * 64 + p] > f32(0.0)) else f32(0.0)
-                    buf[MED * 64 + p] = buf[MED * 64 + p] * (f32(1.0) - opens) + buf[ZZ * 64 + p] * opens
+                    T, z = buf[TT * 64 + p], buf[ZZ * 64 + p]
+                    opens = f32(1.0) if (half < T) & (buf[AL * 64 + p] > f32(0.0)) else f32(0.0)
+                    first_hit = opens if f32(1.0) <= T else f32(0.0)
+                    buf[MED * 64 + p] = buf[MED * 64 + p] * (f32(1.0) - opens) + z * opens
                     buf[MEDK * 64 + p] = buf[MEDK * 64 + p] * (f32(1.0) - opens) + step * opens
+                    # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far away.
+                    buf[ZREF * 64 + p] = buf[ZREF * 64 + p] * (f32(1.0) - first_hit) + z * first_hit
+                    buf[IREF * 64 + p] = buf[IREF * 64 + p] * (f32(1.0) - first_hit) + buf[IZ * 64 + p] * first_hit
             f0, f1, f2, f3, f4, f5 = (
                 features[i, 0], features[i, 1], features[i, 2], features[i, 3], features[i, 4], features[i, 5],
             )  # fmt: skip
@@ -606,8 +609,8 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
             for p in range(PIXELS):
                 T = buf[TT * 64 + p]
                 a = buf[AL * 64 + p] * (f32(1.0) if stop < T else f32(0.0))
-                z = buf[ZZ * 64 + p] - zref
-                m = buf[IZ * 64 + p] - izref
+                z = buf[ZZ * 64 + p] - buf[ZREF * 64 + p]
+                m = buf[IZ * 64 + p] - buf[IREF * 64 + p]
                 w = a * T
                 A = buf[AA * 64 + p]
                 D = buf[DD * 64 + p]
@@ -654,20 +657,20 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                 A, D, a1, a2 = buf[AA * 64 + p], buf[DD * 64 + p], buf[M1 * 64 + p], buf[M2 * 64 + p]
                 covered = buf[LAST * 64 + p] > 0
                 alpha[y, x] = A
-                depth[y, x] = zref + D / A if covered else f32(np.nan)
+                spread = max(a2 - a1 * a1 / A, f32(0.0)) if covered else f32(0.0)
+                depth[y, x] = buf[ZREF * 64 + p] + D / A if covered else f32(np.nan)
                 median[y, x] = buf[MED * 64 + p] if covered else f32(np.nan)
                 l1[y, x] = f32(2.0) * buf[L1 * 64 + p]
-                l2[y, x] = f32(ndc_scale) * max(A * a2 - a1 * a1, f32(0.0))
+                l2[y, x] = f32(ndc_scale) * A * spread
                 for c in range(channels):
                     color[y, x, c] = buf[(C_0 + c) * 64 + p] + (f32(1.0) - A) * background[c]
                 for c in range(3):
                     normal[y, x, c] = buf[(NX + c) * 64 + p]
                 state[0, y, x] = buf[TT * 64 + p]
-                state[1, y, x] = D
-                state[2, y, x] = a1
-                state[3, y, x] = a2
-                state[4, y, x] = buf[LAST * 64 + p]
-                state[5, y, x] = buf[MEDK * 64 + p]
+                state[1, y, x] = buf[LAST * 64 + p]
+                state[2, y, x] = buf[MEDK * 64 + p]
+                state[3, y, x] = buf[IREF * 64 + p] + a1 / A if covered else f32(0.0)
+                state[4, y, x] = spread
     counts[0] = pairs
     counts[1] = contributing
 
@@ -682,7 +685,7 @@ def gather_weights(starts, done, entries, seen, weight):
 
 # Further slots of the backward pass: gradients of the loss in what a pixel sums up, and sums over the splats behind.
 BXS, BYS, BAL, BZZ, BIZ = 0, 1, 2, 3, 4  # as in the forward pass: the same code fills them
-(BT, BLAST, BMEDK, GW, GD, GM1, GM2, GL1, GMED, TOTA, TOTD, BEHA, BEHD, BEHQ, DA, DZ, DI, BW, QF,
+(BT, BLAST, BMEDK, BZREF, BIREF, GW, GD, GM2, GL1, GMED, TOTA, BEHA, BEHD, BEHQ, DA, DZ, DI, BW, QF,
  GNX, GNY, GNZ, GC0, GC1, GC2) = range(5, 30)  # fmt: skip
 BACK_SLOTS = 30
 
@@ -814,7 +817,8 @@ def _blame_round(buf, table, i, ox, oy, rows, row):
 
 
 @bare
-def backward(first, last, view, tiles_x, starts, done, entries, table, features, background, ndc_scale, alpha, state,
+def backward(first, last, view, tiles_x, starts, done, entries, table, features, background, ndc_scale, alpha, depth,
+state,
              g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows, buf):  # fmt: skip
     """Gradients of the tiles first..last, one row of ``rows`` for each entry worked off, from place[tile] on.
 
@@ -827,18 +831,15 @@ def backward(first, last, view, tiles_x, starts, done, entries, table, features,
     channels = background.shape[0]
     scale = f32(ndc_scale)
     for p in range(PIXELS):
-        buf[BXS * 64 + p] = f32(p % TILE) + f32(0.5)
-        buf[BYS * 64 + p] = f32(p // TILE) + f32(0.5)
+        buf[BXS * 64 + p] = f32(p % TILE) - f32(3.5)
+        buf[BYS * 64 + p] = f32(p // TILE) - f32(3.5)
     for t in range(first, last):
         begin, count = starts[t], done[t]
         if count == 0:
             continue
         ty, tx = t // tiles_x, t % tiles_x
-        ox, oy = float(tx * TILE), float(ty * TILE)
+        ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
         cols, tall = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
-        lead = entries[begin]
-        zref = f32(min(max(table[lead, Z0], table[lead, ZLO]), table[lead, ZHI]))
-        izref = f32(1.0) / zref
         for p in range(BT * 64, buf.shape[0]):
             buf[p] = f32(0.0)
         for r in range(tall):
@@ -846,15 +847,17 @@ def backward(first, last, view, tiles_x, starts, done, entries, table, features,
                 p = r * TILE + k
                 y, x = ty * TILE + r, tx * TILE + k
                 A = alpha[y, x]
-                if state[4, y, x] == 0:
+                if state[1, y, x] == 0:
                     continue
-                D, a1, a2 = state[1, y, x], state[2, y, x], state[3, y, x]
                 buf[BT * 64 + p] = state[0, y, x]
-                buf[BLAST * 64 + p] = state[4, y, x]
-                buf[BMEDK * 64 + p] = state[5, y, x]
+                buf[BLAST * 64 + p] = state[1, y, x]
+                buf[BMEDK * 64 + p] = state[2, y, x]
+                # Relative to the means, the first moments vanish, and with them most terms.
+                buf[BZREF * 64 + p] = depth[y, x]
+                buf[BIREF * 64 + p] = state[3, y, x]
                 gd = g_depth[y, x] / A
                 g2 = scale * g_l2[y, x]
-                gw = g_alpha[y, x] - gd * D / A + g2 * a2
+                gw = g_alpha[y, x] + g2 * state[4, y, x]
                 for c in range(channels):
                     gw -= g_color[y, x, c] * background[c]
                     buf[(GC0 + c) * 64 + p] = g_color[y, x, c]
@@ -862,12 +865,10 @@ def backward(first, last, view, tiles_x, starts, done, entries, table, features,
                     buf[(GNX + c) * 64 + p] = g_normal[y, x, c]
                 buf[GW * 64 + p] = gw
                 buf[GD * 64 + p] = gd
-                buf[GM1 * 64 + p] = f32(-2.0) * g2 * a1
                 buf[GM2 * 64 + p] = g2 * A
                 buf[GL1 * 64 + p] = f32(2.0) * g_l1[y, x]
                 buf[GMED * 64 + p] = g_median[y, x]
                 buf[TOTA * 64 + p] = A
-                buf[TOTD * 64 + p] = D
         for back in range(count):
             e = begin + count - 1 - back
             i = entries[e]
@@ -897,21 +898,21 @@ def backward(first, last, view, tiles_x, starts, done, entries, table, features,
                 rest = f32(1.0) / (f32(1.0) - a)
                 T = buf[BT * 64 + p] * rest
                 w = a * T
-                z = buf[BZZ * 64 + p] - zref
-                m = buf[BIZ * 64 + p] - izref
+                z = buf[BZZ * 64 + p] - buf[BZREF * 64 + p]
+                m = buf[BIZ * 64 + p] - buf[BIREF * 64 + p]
                 gn0, gn1, gn2 = buf[GNX * 64 + p], buf[GNY * 64 + p], buf[GNZ * 64 + p]
                 gc0, gc1, gc2 = buf[GC0 * 64 + p], buf[GC1 * 64 + p], buf[GC2 * 64 + p]
-                gd, gm1, gm2, gl1 = buf[GD * 64 + p], buf[GM1 * 64 + p], buf[GM2 * 64 + p], buf[GL1 * 64 + p]
+                gd, gm2, gl1 = buf[GD * 64 + p], buf[GM2 * 64 + p], buf[GL1 * 64 + p]
                 behind_a, behind_d = buf[BEHA * 64 + p], buf[BEHD * 64 + p]
-                q = buf[GW * 64 + p] + gi + gd * z + (gm1 + gm2 * m) * m + buf[QF * 64 + p]
+                q = buf[GW * 64 + p] + gi + gd * z + gm2 * m * m + buf[QF * 64 + p]
                 q += gn0 * f0 + gn1 * f1 + gn2 * f2 + gc0 * f3 + gc1 * f4 + gc2 * f5
                 # In front minus behind, of the weights and of the weighted depths.
                 lean = buf[TOTA * 64 + p] - w - behind_a - behind_a
-                lean_d = buf[TOTD * 64 + p] - w * z - behind_d - behind_d
+                lean_d = -w * z - behind_d - behind_d
                 q += gl1 * (z * lean - lean_d)
                 median = f32(1.0) if step == buf[BMEDK * 64 + p] else f32(0.0)
                 buf[DZ * 64 + p] = w * (gd + gl1 * lean) + median * buf[GMED * 64 + p]
-                buf[DI * 64 + p] = w * (gm1 + f32(2.0) * gm2 * m)
+                buf[DI * 64 + p] = f32(2.0) * w * gm2 * m
                 kept = f32(1.0) if a > f32(0.0) else f32(0.0)
                 behind_q = buf[BEHQ * 64 + p]
                 buf[DA * 64 + p] = kept * (T * q - behind_q * rest)

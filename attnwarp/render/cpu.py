@@ -128,7 +128,7 @@ class _Composite(torch.autograd.Function):
         color = np.empty((h, w, scene.channels), np.float32)
         normal = np.empty((h, w, 3), np.float32)
         alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
-        state = np.empty((6, h, w), np.float32)
+        state = np.empty((5, h, w), np.float32)
         done = np.zeros(scene.tiles, np.int64)
         seen = np.empty(len(scene.entries), np.float32)
         jobs = scene.tile_ranges()
@@ -153,7 +153,7 @@ class _Composite(torch.autograd.Function):
             pairs=int(counts[:, 0].sum()),
             contributing=int(counts[:, 1].sum()),
         )
-        ctx.scene, ctx.state, ctx.alpha, ctx.done, ctx.scale = scene, state, alpha, done, scale
+        ctx.scene, ctx.state, ctx.alpha, ctx.depth, ctx.done, ctx.scale = scene, state, alpha, depth, done, scale
         ctx.origin = _array(inputs.origin, np.float64)
         ctx.shapes = [(t.shape, t.dtype) for t in tensors]
         # Kept so that torch notices when one of them is changed in place before the backward pass.
@@ -233,7 +233,7 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
             kernels.backward,
             [
                 (begin, end, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table, scene.features,
-                 scene.background, ctx.scale, ctx.alpha, ctx.state, *upstream, place, rows,
+                 scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream, place, rows,
                  _aligned(slots * kernels.PIXELS))
                 for begin, end in itertools.pairwise(edges)
             ],

@@ -1,0 +1,222 @@
+"""The numba backend against the float64 definition: values and gradients, every output and every parameter."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Camera, Gaussians
+from attnwarp.render import api, constants, cpu, reference, render
+
+OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
+MODES = [("2d", "intersection", False), ("2d", "center", False), ("3d", "center", False), ("3d", "peak", True)]
+
+
+def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.Inputs:
+    given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
+    given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
+    return api._prepare(splats, camera, **(given | options), on_cpu=True)
+
+
+def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
+    """Smallest and largest value of each output when every threshold is moved by what float32 may round.
+
+    A pixel whose alpha is 1/255 to seven digits is drawn or not by rounding, in any renderer; what must hold is that
+    the float32 answer is one of the two.
+    """
+    t = reference.Thresholds()
+    versions = [reference.render(inputs)]
+    for sign in (-1, 1):
+        versions += [
+            reference.render(inputs, dataclasses.replace(t, alpha_min=t.alpha_min * (1 + sign * 2e-6))),
+            # Transmittance is a product of up to 40 factors, each with its own rounding.
+            reference.render(inputs, dataclasses.replace(t, stop=t.stop * (1 + sign * 2e-5))),
+            reference.render(inputs, dataclasses.replace(t, median=t.median * (1 + sign * 5e-6))),
+            reference.render(dataclasses.replace(inputs, near=inputs.near * (1 + sign * 2e-6))),
+        ]
+    result = {}
+    for name in OUTPUTS:
+        stack = torch.stack([getattr(v, name) for v in versions])
+        absent = stack.isnan()
+        low = torch.where(absent, torch.inf, stack).amin(0)
+        high = torch.where(absent, -torch.inf, stack).amax(0)
+        result[name] = (torch.where(absent.any(0), -torch.inf, low), torch.where(absent.any(0), torch.inf, high))
+        # NaN everywhere is an answer as well.
+        result[name] = tuple(torch.where(absent.all(0), torch.nan, bound) for bound in result[name])
+    return result
+
+
+@pytest.mark.parametrize("block", range(8))
+def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_splats) -> None:
+    """Crossing the camera plane, edge-on, opacity 0 and 1, equal depths are in every scene of 12 splats or more."""
+    worst = dict.fromkeys(OUTPUTS, 0.0)
+    for seed in range(25 * block, 25 * block + 25):
+        rng = np.random.default_rng(seed)
+        kind, mode, antialiased = MODES[seed % 4]
+        camera = make_camera(seed, int(rng.integers(1, 20)), int(rng.integers(1, 20)))
+        count = int(rng.integers(1, 40)) if seed % 5 == 0 else int(rng.integers(12, 40))
+        splats = make_splats(seed, kind, count, camera, degree=seed % 4)
+        options: dict[str, object] = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
+        # With the distortion's near plane at the picture's, m lies in [0, 1]; at 0.2 it reaches -19 for what is nearer.
+        options["ndc"] = (constants.NEAR, constants.NDC_FAR)
+        if seed % 3 == 0:
+            options["features"] = torch.tensor(rng.normal(size=(count, seed % 7 + 1)))
+            options["background"] = torch.tensor(rng.normal(size=seed % 7 + 1))
+        inputs = prepared(splats, camera, **options)
+        expected, actual = bracket(inputs), cpu.render(inputs)
+        for name in OUTPUTS:
+            value, (low, high) = getattr(actual, name).double(), expected[name]
+            assert value.dtype == torch.float64
+            assert torch.equal(value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)), name
+            assert bool(value.isnan()[low.isnan()].all()), (seed, name)
+            # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene units, weight in
+            # pixels, features of any size).
+            excess = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
+            excess = excess[torch.isfinite(excess)]
+            worst[name] = max(worst[name], float(excess.max()) if excess.numel() else 0.0)
+    assert max(worst.values()) < 1e-5, worst
+
+
+@pytest.mark.parametrize(("kind", "mode", "antialiased"), [*MODES, ("3d", "peak", False), ("3d", "center", True)])
+@pytest.mark.parametrize("harmonic", [True, False])
+def test_gradients_of_every_output_agree_with_autograd(
+    kind, mode, antialiased, harmonic, make_camera, make_splats
+) -> None:
+    if not harmonic and (mode == "center" or antialiased):
+        return  # the colour's path is independent of these
+    camera = make_camera(5, 29, 21)
+    start = make_splats(5, kind, 30, camera)
+    generator = torch.Generator().manual_seed(1)
+    features = torch.randn(30, 5, generator=generator, dtype=torch.float64)
+    gradients: dict[str, dict[str, list[torch.Tensor]]] = {}
+    weights: dict[str, torch.Tensor] = {}
+    for backend in ("reference", "cpu"):
+        leaves = [
+            t.clone().requires_grad_() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
+        ]
+        pose = torch.tensor(camera.world_to_camera).requires_grad_()
+        extra = features.clone().requires_grad_()
+        behind = torch.linspace(0.1, 0.9, 3 if harmonic else 5, dtype=torch.float64).requires_grad_()
+        view = render(
+            Gaussians(kind, *leaves, origin=np.array([0.2, -0.1, 0.05])),
+            camera,
+            backend=backend,
+            depth=mode,
+            antialiased=antialiased if kind == "3d" else None,
+            pose=pose,
+            background=behind,
+            features=None if harmonic else extra,
+        )
+        inputs = [*leaves, pose, behind, extra]
+        gradients[backend] = {}
+        for name in OUTPUTS:
+            value = getattr(view, name)
+            value = torch.where(value.isnan(), 0.0, value).double()
+            if name not in weights:
+                weights[name] = torch.randn(value.shape, generator=generator, dtype=torch.float64)
+            found = torch.autograd.grad((value * weights[name]).sum(), inputs, retain_graph=True, allow_unused=True)
+            gradients[backend][name] = [
+                torch.zeros_like(leaf) if grad is None else grad for leaf, grad in zip(inputs, found, strict=True)
+            ]
+    names = ("means", "quats", "scales", "opacities", "sh", "pose", "background", "features")
+    for name in OUTPUTS:
+        for leaf, expected, actual in zip(names, gradients["reference"][name], gradients["cpu"][name], strict=True):
+            assert torch.isfinite(actual).all(), (name, leaf)
+            # Sums over 600 pixels in float32, of the largest entry: the smallest carry its rounding. Edge-on splats
+            # have slopes of 1/cos that cancel between pixels.
+            scale = float(expected.abs().max())
+            assert float((actual - expected).abs().max()) <= 1e-4 * scale + 1e-9, (name, leaf, scale)
+
+
+def test_gradients_reach_float32_parameters_in_their_own_type(make_camera, make_splats) -> None:
+    camera = make_camera(1, 16, 16)
+    splats = make_splats(1, "2d", 20, camera).to(dtype=torch.float32)
+    splats.means.requires_grad_()
+    splats.opacities.requires_grad_()
+    view = render(splats, camera)
+    view.color.sum().backward()
+    assert view.color.dtype == torch.float32
+    assert splats.means.grad is not None and splats.means.grad.dtype == torch.float32
+    assert splats.opacities.grad is not None and splats.sh.grad is None
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_the_bits_do_not_depend_on_the_number_of_threads(kind, make_camera, make_splats) -> None:
+    camera = make_camera(2, 67, 45)
+    start = make_splats(2, kind, 5000, camera)
+    seen = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            leaves = [
+                t.clone().requires_grad_() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
+            ]
+            pose = torch.tensor(camera.world_to_camera).requires_grad_()
+            view = render(Gaussians(kind, *leaves), camera, pose=pose)
+            loss = view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum() + view.normal.sum()
+            loss.backward()
+            seen.append([getattr(view, n).detach() for n in OUTPUTS] + [leaf.grad for leaf in (*leaves, pose)])
+    finally:
+        torch.set_num_threads(threads)
+    for other in seen[1:]:
+        for a, b in zip(seen[0], other, strict=True):
+            assert a is not None and b is not None
+            assert torch.equal(a.nan_to_num(-1), b.nan_to_num(-1))
+
+
+def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(make_camera, make_splats, monkeypatch) -> None:
+    camera = make_camera(3, 50, 40)
+    start = make_splats(3, "2d", 300, camera)
+
+    def gradient() -> torch.Tensor:
+        means = start.means.clone().requires_grad_()
+        view = render(dataclasses.replace(start, means=means), camera)
+        (view.color.sum() + view.depth.nan_to_num().sum()).backward()
+        assert means.grad is not None
+        return means.grad
+
+    whole = gradient()
+    monkeypatch.setattr(cpu, "ROWS_AT_ONCE", -(len(start) + 50 * 40) + 64)
+    assert torch.equal(whole, gradient())
+
+
+def test_it_may_be_called_from_many_threads_at_once(make_camera, make_splats) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    camera = make_camera(4, 40, 40)
+    splats = make_splats(4, "3d", 500, camera)
+    expected = render(splats, camera).color
+    with ThreadPoolExecutor(4) as pool:
+        for result in pool.map(lambda _: render(splats, camera).color, range(12)):
+            assert torch.equal(result, expected)
+
+
+def test_it_works_in_a_forked_child(make_camera, make_splats) -> None:
+    import os
+
+    camera = make_camera(4, 40, 40)
+    splats = make_splats(4, "2d", 9000, camera)
+    expected = render(splats, camera).color
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        same = torch.equal(render(splats, camera).color, expected)
+        os.write(writing, b"1" if same else b"0")
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(reading, 1) == b"1"
+
+
+def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(make_camera, make_splats) -> None:
+    camera = make_camera(4, 16, 16)
+    splats = make_splats(4, "2d", 20, camera)
+    means = splats.means.clone().requires_grad_()
+    loss = render(dataclasses.replace(splats, means=means), camera).color.sum()
+    with torch.no_grad():
+        means += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
