@@ -38,7 +38,8 @@ def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
     """The arrays stored under ``kind``/``key``, or None when there are none or the file is damaged."""
     path = cache_dir() / kind / f"{key}.npz"
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here, since np.load leaves a damaged file open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {name: stored[name] for name in stored.files}
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
         return None

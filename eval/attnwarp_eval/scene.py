@@ -389,9 +389,8 @@ def _orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
 
 
 def scene_folders() -> list[Path]:
-    """Where scenes are looked for by name: ``./scenes``, the checkout's ``scenes``, those inside the package."""
-    here = Path(__file__).resolve().parent
-    folders = [Path.cwd() / "scenes", here.parent.parent / "scenes", here / "scenes"]
+    """Where scenes are looked for by name: ``./scenes``, then those of the package (in a checkout: its ``scenes``)."""
+    folders = [Path.cwd() / "scenes", (Path(__file__).parent / "scenes").resolve()]
     return [f for k, f in enumerate(folders) if f.is_dir() and f not in folders[:k]]
 
 
@@ -454,10 +453,12 @@ def _read(path: Path) -> Scene:
     try:
         spec = SceneSpec.model_validate(data)
     except ValidationError as error:
-        problems = error.errors(include_url=False)
+        # A misspelt key comes first: what is missing then is often only its right spelling.
+        problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
         first = problems[0]
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
-        raise SceneError(_explain(first) + more, path, _line(root, first["loc"])) from error
+        loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
+        raise SceneError(_explain(first) + more, path, _line(root, loc)) from error
     scene = Scene(spec, path)
     _check(scene, root)
     return scene

@@ -6,10 +6,13 @@ function, is the truth that everything is measured against.
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +21,7 @@ from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MESHING_PROTOCOL = 1
+MESHING_PROTOCOL = 2
 """Raised whenever the same description of a body would give other vertices; part of every cache key."""
 
 DEGENERATE_AREA = 1e-12
@@ -222,15 +225,10 @@ class Ellipsoid:
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     blend: bool = True
 
-    def distance(self, points: Array) -> Array:
-        """(N,) signed distance bound of (N, 3) ``points``: |q|(|q| - 1)/|q/r| with q = p/r (Quilez)."""
+    def row(self) -> list[float]:
+        """What the kernels read: kind 0, blend, center, radii, cosine and sine of the pitch."""
         a = np.radians(self.pitch)
-        R = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
-        r = np.asarray(self.radii)
-        q = (points - np.asarray(self.center)) @ R / r
-        k0 = np.linalg.norm(q, axis=-1)
-        k1 = np.linalg.norm(q / r, axis=-1)
-        return np.where(k1 > 0, k0 * (k0 - 1) / np.where(k1 > 0, k1, 1), -r.min())
+        return [0.0, float(self.blend), *self.center, *self.radii, float(np.cos(a)), float(np.sin(a))]
 
     def reach(self) -> Array:
         """(2, 3) box that holds the part."""
@@ -248,12 +246,9 @@ class Capsule:
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     blend: bool = True
 
-    def distance(self, points: Array) -> Array:
-        """(N,) distance of (N, 3) ``points`` from the segment, less the radius there."""
-        a, b = np.asarray(self.start), np.asarray(self.end)
-        along = np.clip((points - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-300), 0, 1)
-        gap = np.linalg.norm(points - a - along[:, None] * (b - a), axis=-1)
-        return gap - (self.radii[0] + along * (self.radii[1] - self.radii[0]))
+    def row(self) -> list[float]:
+        """What the kernels read: kind 1, blend, start, end, radii."""
+        return [1.0, float(self.blend), *self.start, *self.end, *self.radii]
 
     def reach(self) -> Array:
         """(2, 3) box that holds the part."""
@@ -264,7 +259,58 @@ class Capsule:
 Part = Ellipsoid | Capsule
 
 
-def body_distance(parts: list[Part], blend: float, points: npt.ArrayLike) -> Array:
+@numba.njit(cache=True, nogil=True)
+def _part_distance(x: float, y: float, z: float, part: Array) -> float:
+    x, y, z = x - part[2], y - part[3], z - part[4]
+    if part[0] == 0.0:
+        # Ellipsoid: |q|(|q| - 1) / |q / r| with q = p / r, a bound of the distance (Quilez, "ellipsoid - distance").
+        c, s = part[8], part[9]
+        qx, qy, qz = (c * x - s * z) / part[5], y / part[6], (s * x + c * z) / part[7]
+        k0 = math.sqrt(qx * qx + qy * qy + qz * qz)
+        k1 = math.sqrt((qx / part[5]) ** 2 + (qy / part[6]) ** 2 + (qz / part[7]) ** 2)
+        return k0 * (k0 - 1) / k1 if k1 > 0 else -min(part[5], part[6], part[7])
+    # Capsule: distance from the segment, less the radius there.
+    bx, by, bz = part[5] - part[2], part[6] - part[3], part[7] - part[4]
+    length = bx * bx + by * by + bz * bz
+    along = min(max((x * bx + y * by + z * bz) / length, 0.0), 1.0) if length > 0 else 0.0
+    gap = math.sqrt((x - along * bx) ** 2 + (y - along * by) ** 2 + (z - along * bz) ** 2)
+    return gap - (part[8] + along * (part[9] - part[8]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _body_distance(points: Array, parts: Array, blend: float) -> Array:
+    out = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        soft, hard = np.inf, np.inf
+        for k in range(parts.shape[0]):
+            d = _part_distance(points[i, 0], points[i, 1], points[i, 2], parts[k])
+            if parts[k, 1] == 0.0:
+                hard = min(hard, d)
+            elif blend > 0 and soft < np.inf:
+                h = min(max(0.5 + 0.5 * (soft - d) / blend, 0.0), 1.0)
+                soft = soft + h * (d - soft) - blend * h * (1 - h)
+            else:
+                soft = min(soft, d)
+        out[i] = min(soft, hard)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _part_distances(points: Array, parts: Array) -> Array:
+    out = np.empty((parts.shape[0], points.shape[0]))
+    for k in range(parts.shape[0]):
+        for i in range(points.shape[0]):
+            out[k, i] = _part_distance(points[i, 0], points[i, 1], points[i, 2], parts[k])
+    return out
+
+
+def _table(parts: Sequence[Part]) -> Array:
+    if not parts:
+        raise ValueError("parts: got an empty list, expected at least one part")
+    return np.array([part.row() for part in parts], dtype=np.float64)
+
+
+def body_distance(parts: Sequence[Part], blend: float, points: npt.ArrayLike) -> Array:
     """Signed distance bound of a body, negative inside.
 
     Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend``; the others (eyes, a
@@ -278,30 +324,11 @@ def body_distance(parts: list[Part], blend: float, points: npt.ArrayLike) -> Arr
     Returns:
         (N,) float64.
     """
-    points = np.asarray(points, dtype=np.float64)
-    soft: Array | None = None
-    hard: Array | None = None
-    for part in parts:
-        d = part.distance(points)
-        if not part.blend:
-            hard = d if hard is None else np.minimum(hard, d)
-        elif soft is None:
-            soft = d
-        elif blend > 0:
-            h = np.clip(0.5 + 0.5 * (soft - d) / blend, 0, 1)
-            soft = soft + h * (d - soft) - blend * h * (1 - h)
-        else:
-            soft = np.minimum(soft, d)
-    if soft is None or hard is None:
-        chosen = soft if soft is not None else hard
-        if chosen is None:
-            raise ValueError("parts: got an empty list, expected at least one part")
-        return chosen
-    return np.minimum(soft, hard)
+    return _body_distance(np.ascontiguousarray(points, dtype=np.float64), _table(parts), float(blend))
 
 
-def _part_colors(parts: list[Part], width: float, points: Array) -> Array:
-    distances = np.stack([part.distance(points) for part in parts])
+def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
+    distances = _part_distances(points, _table(parts))
     # A sharp part owns its whole surface; blended parts share their colours across the joint.
     weights = np.exp(-np.clip(distances - distances.min(0), 0, None) / max(width, 1e-12))
     for k, part in enumerate(parts):
@@ -313,7 +340,7 @@ def _part_colors(parts: list[Part], width: float, points: Array) -> Array:
     return (weights.T @ colors) / weights.sum(0)[:, None]
 
 
-def mesh_body(parts: list[Part], blend: float, resolution: int) -> Mesh:
+def mesh_body(parts: Sequence[Part], blend: float, resolution: int) -> Mesh:
     """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the distance.
 
     Args:
@@ -332,7 +359,7 @@ def mesh_body(parts: list[Part], blend: float, resolution: int) -> Mesh:
     return Mesh(stored["vertices"], stored["faces"], stored["normals"], stored["tint"])
 
 
-def _march(parts: list[Part], blend: float, resolution: int) -> dict[str, npt.NDArray]:
+def _march(parts: Sequence[Part], blend: float, resolution: int) -> dict[str, npt.NDArray]:
     from skimage.measure import marching_cubes
 
     reach = np.stack([part.reach() for part in parts])

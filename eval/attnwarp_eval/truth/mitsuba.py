@@ -144,13 +144,18 @@ def _render(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
         else:
             options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
         world, center = _world(scene.world_hash, _Holder(scene), step.lights)
-        sampler = {"type": "multijitter", "sample_count": step.spp}
-        sensor = _sensor(camera, center, sampler, world)
+        sensor = _sensor(camera, center, {"type": _sampler(step.spp), "sample_count": step.spp}, world)
         picture = mi.render(
             world, sensor=sensor, integrator=mi.load_dict(options), seed=len(plan.passes) * int(seed) + number
         )
         total += np.array(picture, dtype=np.float32)[..., :3]
     return total
+
+
+def _sampler(spp: int) -> str:
+    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would render more."""
+    rows = math.isqrt(spp)
+    return "multijitter" if rows * math.ceil(spp / rows) == spp else "independent"
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
