@@ -1,0 +1,21 @@
+"""Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images. See docs/fitting.md."""
+
+from attnwarp.fit.loop import Fit, Record, Step, fit
+from attnwarp.fit.settings import FitSettings
+from attnwarp.fit.start import extent_of, from_points, random_points
+from attnwarp.fit.views import Views, hold_out, load_views, read_image
+
+__all__ = [
+    "Fit",
+    "FitSettings",
+    "Record",
+    "Step",
+    "Views",
+    "extent_of",
+    "fit",
+    "from_points",
+    "hold_out",
+    "load_views",
+    "random_points",
+    "read_image",
+]

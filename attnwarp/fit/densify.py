@@ -1,0 +1,149 @@
+"""Where splats are added and removed: the published strategy of 3DGS (adaptive density control), for both kinds.
+
+Splats whose position on screen the loss wants to change strongly are too few or too large there: small ones are
+cloned, large ones split in two. Splats that are nearly transparent or far too large are removed. From time to time
+every opacity is lowered, so that splats that are not needed stay low and go.
+
+Two things differ from the published code. The gradient on screen is computed from the one in space (see
+:func:`screen_gradient`). And sizes are judged against the extent of the scene or the splat's distance from its middle,
+whichever is larger: splats of a sky or of far hills are large without being too large.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.fit.model import NAMES, Model
+from attnwarp.fit.settings import FitSettings
+from attnwarp.gaussians import Gaussians
+
+Tensor = torch.Tensor
+
+
+def screen_gradient(gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float) -> Tensor:
+    """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2 wide and 2 high.
+
+    With c = R m + t the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel, a loss that knows a centre
+    only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z dL/dy. Read backwards, the two components of
+    R dL/dm across the view give the gradient on screen. What the loss knows of a centre beyond its pixel (its depth,
+    the direction it is seen from, how its outline turns with it) enters as well, which the published code leaves out
+    or, for 2DGS, overwrites. A screen 2 wide makes the thresholds of 3DGS independent of the image's size.
+
+    Args:
+        gradient, means: (N, 3) in world axes, ``means`` relative to ``origin``.
+        near: depth in scene units below which a centre has no position on screen; 0 comes out there.
+    """
+    R = torch.from_numpy(camera.rotation.copy())
+    moved = torch.from_numpy(camera.rotation @ origin + camera.translation)
+    z = means.double() @ R[2] + moved[2]
+    across = gradient.double() @ R[:2].T
+    focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]])
+    half = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64)
+    on_screen = across * z[:, None] / focal * half
+    return torch.where(z > near, on_screen.norm(dim=1), 0.0).float()
+
+
+class Density:
+    """Gathers gradients and, every ``densify_every`` iterations, adds and removes splats.
+
+    Attributes:
+        total, seen: (N,) sum of the gradients' lengths since the last refinement, and the number of views that showed
+            the splat.
+    """
+
+    def __init__(self, settings: FitSettings, extent: float, center: np.ndarray, count: int) -> None:
+        self.settings, self.extent = settings, extent
+        self.center = torch.from_numpy(np.asarray(center, dtype=np.float32))
+        self.total, self.seen = torch.zeros(count), torch.zeros(count)
+        self.last = int(settings.densify_until * settings.iterations)
+
+    def watch(self, model: Model, gaussians: Gaussians, camera: Camera, weight: Tensor) -> None:
+        """Note one view's gradients, before the optimiser drops them."""
+        means = model.tensors["means"]
+        if means.grad is None:
+            return
+        shown = weight > 0
+        length = screen_gradient(means.grad, means.detach(), camera, gaussians.origin, self.settings.near * self.extent)
+        self.total += torch.where(shown, length, 0.0)
+        self.seen += shown
+
+    def active(self, iteration: int) -> bool:
+        """Whether splats may still be added after so many iterations."""
+        return self.settings.densify and 0 < iteration < self.last
+
+    def refine(self, model: Model, iteration: int, random: torch.Generator) -> bool:
+        """Add and remove splats if it is time to. Returns whether anything was done."""
+        s = self.settings
+        if not self.active(iteration):
+            return False
+        done = False
+        if iteration >= s.densify_from and iteration % s.densify_every == 0:
+            self._grow_and_prune(model, iteration > s.reset_every, random)
+            done = True
+        if iteration % s.reset_every == 0:
+            model.lower_opacity(s.reset_opacity)
+            done = True
+        return done
+
+    def _room(self, model: Model) -> Tensor:
+        """(N,) what a splat's size is judged against."""
+        away = (model.tensors["means"].detach() - self.center).norm(dim=1)
+        return away.clamp_min(self.extent)
+
+    def _grow_and_prune(self, model: Model, sizes_count: bool, random: torch.Generator) -> None:
+        s = self.settings
+        t = {name: tensor.detach() for name, tensor in model.tensors.items()}
+        gradient = self.total / self.seen.clamp_min(1)
+        room = self._room(model)
+        largest = t["scales"].exp().amax(dim=1)
+        gone = t["opacity"].sigmoid() < s.opacity_floor
+        if sizes_count:
+            gone |= largest > s.prune_scale * room
+        wanted = (gradient > s.grow_gradient) & ~gone
+        if s.max_splats is not None:
+            # Either way of growing adds one splat.
+            spare = max(0, s.max_splats - int((~gone).sum()))
+            if int(wanted.sum()) > spare:
+                # Stable, so that equal gradients do not make the choice depend on the sorting method.
+                order = torch.argsort(torch.where(wanted, gradient, -1.0), descending=True, stable=True)
+                wanted = torch.zeros_like(wanted)
+                wanted[order[:spare]] = True
+        small = largest <= s.grow_scale * room
+        cloned = torch.nonzero(wanted & small)[:, 0]
+        split = torch.nonzero(wanted & ~small)[:, 0]
+        keep = torch.nonzero(~gone & ~(wanted & ~small))[:, 0]
+        halves = [self._half(t, split, random) for _ in range(2)]
+        added = {name: torch.cat([t[name][cloned], *(half[name] for half in halves)]) for name in NAMES}
+        if len(keep) + len(added["means"]) == 0:
+            raise RuntimeError(
+                f"every one of the {len(model)} splats fell below prune_opacity {s.opacity_floor:g} or above "
+                f"prune_scale {s.prune_scale:g}: the views do not show what the first splats describe; check that "
+                "cameras and points are in one coordinate system"
+            )
+        model.replace(keep, added)
+        self.total, self.seen = torch.zeros(len(model)), torch.zeros(len(model))
+
+    def _half(self, t: dict[str, Tensor], index: Tensor, random: torch.Generator) -> dict[str, Tensor]:
+        """One of the two that take a splat's place: a smaller copy at a point drawn from its own Gaussian."""
+        half = {name: tensor[index].clone() for name, tensor in t.items()}
+        scales = half["scales"].exp()
+        offset = torch.randn(scales.shape, generator=random) * scales
+        if scales.shape[1] == 2:
+            offset = torch.nn.functional.pad(offset, (0, 1))
+        kind = self.settings.kind
+        axes = Gaussians(kind, half["means"], half["quats"], scales, half["opacity"].sigmoid(), half["dc"]).rotations()
+        half["means"] += (axes @ offset[:, :, None])[:, :, 0]
+        half["scales"] -= float(np.log(self.settings.split_shrink))
+        return half
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next refinement depends on."""
+        return {"total": self.total.clone(), "seen": self.seen.clone()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from what :meth:`state` gave."""
+        self.total, self.seen = state["total"].clone(), state["seen"].clone()

@@ -1,0 +1,390 @@
+"""The fit itself: one view an iteration, until the iterations, the time or the patience are used up."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from attnwarp import losses
+from attnwarp.fit import checkpoint
+from attnwarp.fit.densify import Density
+from attnwarp.fit.model import Model
+from attnwarp.fit.settings import FitSettings
+from attnwarp.fit.start import extent_of
+from attnwarp.fit.views import Views
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import FileFormatError, write_ply
+from attnwarp.render import Render, render
+
+Tensor = torch.Tensor
+Measure = Callable[[Gaussians], dict[str, float]]
+
+CHECKPOINT = "checkpoint.pt"
+SPLATS = "splats.ply"
+
+SMOOTHING = 0.98
+"""Share of the past in the loss and the PSNR that are shown while a fit runs."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One point on the curve of accuracy against time.
+
+    Attributes:
+        iteration: iterations done.
+        seconds, cpu_seconds: spent on iterations alone: no evaluation, no writing, over all sittings.
+        splats: their number.
+        loss: of the last iterations, smoothed; None before the first.
+        psnr: mean over the held-out views, dB; None without any. Infinite where all are equal to their pictures.
+        psnr_pooled: of their mean squared error.
+        measures: what the caller's own measure gave.
+    """
+
+    iteration: int
+    seconds: float
+    cpu_seconds: float
+    splats: int
+    loss: float | None
+    psnr: float | None
+    psnr_pooled: float | None
+    measures: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Step:
+    """How a fit stands, for whoever watches it.
+
+    Attributes:
+        iteration, iterations: done, and in all.
+        loss, psnr: of the pictures fitted on, smoothed over the last iterations; PSNR in dB.
+        held_out: PSNR at the last evaluation, dB, or None.
+        splats: their number.
+        seconds: spent on iterations.
+    """
+
+    iteration: int
+    iterations: int
+    loss: float
+    psnr: float
+    held_out: float | None
+    splats: int
+    seconds: float
+
+
+@dataclass(eq=False)
+class Fit:
+    """What a fit came to.
+
+    Attributes:
+        gaussians: the splats, float32, outside autograd.
+        settings: those used.
+        history: the evaluations, the first before the first iteration, the last at the end.
+        iteration: iterations done.
+        seconds, cpu_seconds: spent on them.
+        stopped: why it ended: "iterations" (all done), "time", "patience", or "asked".
+        extent: of the scene, by which the settings' shares are measured.
+    """
+
+    gaussians: Gaussians
+    settings: FitSettings
+    history: list[Record]
+    iteration: int
+    seconds: float
+    cpu_seconds: float
+    stopped: str
+    extent: float
+
+
+def fit(
+    start: Gaussians,
+    views: Views,
+    settings: FitSettings | None = None,
+    *,
+    held_out: Views | None = None,
+    folder: str | os.PathLike[str] | None = None,
+    max_seconds: float | None = None,
+    checkpoint_seconds: float = 30.0,
+    backend: str = "auto",
+    measure: Measure | None = None,
+    watch: Callable[[Step], object] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Fit:
+    """Fit splats to posed pictures.
+
+    With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every ``checkpoint_seconds`` and at
+    the end, each atomically; a fit found there is taken up where it was, and then gives the same bits as one that was
+    never interrupted (on the same machine, with the same number of torch threads).
+
+    Args:
+        start: what to begin with, see :func:`attnwarp.fit.from_points`; of the settings' kind.
+        views: the pictures to fit on.
+        settings: the default ones for ``start.kind`` if left out.
+        held_out: pictures to evaluate on, never fitted on.
+        folder: made if need be.
+        max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates follow
+            ``settings.iterations`` all the same.
+        checkpoint_seconds: see above.
+        backend: of :func:`attnwarp.render.render`.
+        measure: called at every evaluation with the splats; its figures go into the history. A view of the truth,
+            such as the error of depth.
+        watch: told how the fit stands after every iteration; see :mod:`attnwarp.fit.progress`.
+        stop: asked before every iteration; True ends the fit in good order.
+
+    Raises:
+        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a fit of other
+            views or settings, or a number is out of range.
+        FileFormatError: the folder's checkpoint is damaged.
+        RuntimeError: the loss is no longer finite, or no splat is left; the message says what to try. The last
+            checkpoint stays.
+    """
+    settings = FitSettings(kind=start.kind, sh_degree=start.sh_degree) if settings is None else settings
+    if start.kind != settings.kind:
+        raise ValueError(f"start: is of kind {start.kind!r}, but settings.kind is {settings.kind!r}")
+    if start.sh_degree != settings.sh_degree:
+        raise ValueError(f"start: has harmonics of degree {start.sh_degree}, but settings.sh_degree is "
+                         f"{settings.sh_degree}")  # fmt: skip
+    if len(start) == 0:
+        raise ValueError("start: holds no splats")
+    for name, value in {"max_seconds": max_seconds, "checkpoint_seconds": checkpoint_seconds}.items():
+        if value is not None and not value >= 0:
+            raise ValueError(f"{name}: got {value}, expected seconds >= 0")
+    run = _Run(start, views, settings, held_out, backend, measure)
+    if folder is not None:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        run.take_up(Path(folder))
+    return run.go(max_seconds, checkpoint_seconds, watch, stop)
+
+
+class _Run:
+    """A fit in progress: everything that the next iteration depends on, and how to write it down."""
+
+    def __init__(
+        self,
+        start: Gaussians,
+        views: Views,
+        settings: FitSettings,
+        held_out: Views | None,
+        backend: str,
+        measure: Measure | None,
+    ) -> None:
+        self.settings, self.views, self.held_out = settings, views, held_out
+        self.backend, self.measure = backend, measure
+        self.extent = extent_of(views.cameras)
+        centers = np.stack([camera.position for camera in views.cameras])
+        self.model = Model(start, settings, self.extent)
+        self.density = Density(settings, self.extent, centers.mean(0) - start.origin, len(start))
+        self.random = torch.Generator().manual_seed(settings.seed)
+        self.queue: list[int] = []
+        self.iteration = 0
+        self.seconds = self.cpu_seconds = 0.0
+        self.loss = self.error = math.nan
+        self.history: list[Record] = []
+        self.folder: Path | None = None
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must have been made from to be taken up."""
+        return {
+            "settings": self.settings.to_dict(),
+            "views": self.views.digest,
+            "held_out": self.held_out.digest if self.held_out else None,
+            "origin": [float(v) for v in self.model.origin],
+        }
+
+    def take_up(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / CHECKPOINT
+        if not path.exists():
+            return
+        state = checkpoint.load(path)
+        for what, ours in self.identity().items():
+            theirs = state.get(what)
+            if theirs == ours:
+                continue
+            if isinstance(ours, dict) and isinstance(theirs, dict):
+                differ = [f"{k}: {theirs.get(k)!r}, now {v!r}" for k, v in ours.items() if theirs.get(k) != v]
+                what = f"settings ({'; '.join(differ)})"
+            raise ValueError(
+                f"folder: {folder} holds a fit of other {what}; go on with the same ones, or name another folder "
+                "or remove its checkpoint.pt to begin again"
+            )
+        try:
+            self.model.restore(state["model"])
+            self.density.restore(state["density"])
+            self.random.set_state(state["random"])
+            self.queue = list(state["queue"])
+            self.iteration = int(state["iteration"])
+            self.seconds, self.cpu_seconds = float(state["seconds"]), float(state["cpu_seconds"])
+            self.loss, self.error = float(state["loss"]), float(state["error"])
+            self.history = [Record(**record) for record in state["history"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(path, f"lacks something or is damaged: {error}; remove it to begin again") from error
+
+    def save(self) -> None:
+        if self.folder is None:
+            return
+        write_ply(self.folder / SPLATS, self.model.gaussians())
+        checkpoint.save(
+            self.folder / CHECKPOINT,
+            {
+                **self.identity(),
+                "model": self.model.state(),
+                "density": self.density.state(),
+                "random": self.random.get_state(),
+                "queue": list(self.queue),
+                "iteration": self.iteration,
+                "seconds": self.seconds,
+                "cpu_seconds": self.cpu_seconds,
+                "loss": self.loss,
+                "error": self.error,
+                "history": [asdict(record) for record in self.history],
+            },
+        )
+
+    def go(
+        self,
+        max_seconds: float | None,
+        checkpoint_seconds: float,
+        watch: Callable[[Step], object] | None,
+        stop: Callable[[], bool] | None,
+    ) -> Fit:
+        s = self.settings
+        written = time.perf_counter()
+        if not self.history:
+            self.evaluate()
+        while True:
+            stopped = self._reason_to_stop(max_seconds, stop)
+            if stopped:
+                break
+            wall, cpu = time.perf_counter(), time.process_time()
+            self.iterate()
+            self.seconds += time.perf_counter() - wall
+            self.cpu_seconds += time.process_time() - cpu
+            if self.iteration % s.evaluate_every == 0:
+                self.evaluate()
+            if watch is not None:
+                watch(self.step())
+            if self.folder is not None and time.perf_counter() - written >= checkpoint_seconds:
+                self.save()
+                written = time.perf_counter()
+        if self.history[-1].iteration != self.iteration:
+            self.evaluate()
+        self.save()
+        return Fit(
+            self.model.gaussians().detach(), s, list(self.history), self.iteration, self.seconds, self.cpu_seconds,
+            stopped, self.extent,
+        )  # fmt: skip
+
+    def _reason_to_stop(self, max_seconds: float | None, stop: Callable[[], bool] | None) -> str:
+        if self.iteration >= self.settings.iterations:
+            return "iterations"
+        if self._out_of_patience():
+            return "patience"
+        if max_seconds is not None and self.seconds >= max_seconds:
+            return "time"
+        return "asked" if stop is not None and stop() else ""
+
+    def _out_of_patience(self) -> bool:
+        patience = self.settings.patience
+        known = [record.psnr for record in self.history if record.psnr is not None]
+        if patience is None or len(known) <= patience:
+            return False
+        return max(known[-patience:]) < max(known[:-patience]) + self.settings.min_gain
+
+    def step(self) -> Step:
+        held = self.history[-1].psnr if self.history else None
+        return Step(
+            self.iteration, self.settings.iterations, self.loss, losses.psnr_of_mse(self.error), held,
+            len(self.model), self.seconds,
+        )  # fmt: skip
+
+    def background(self, *, fitting: bool) -> Tensor:
+        """What is behind everything; for pictures that are looked at or measured, never random."""
+        choice = self.settings.background
+        if choice == "auto":
+            choice = "random" if self.views.transparent else "black"
+        if choice == "random" and fitting:
+            return torch.rand(3, generator=self.random)
+        return torch.full((3,), 1.0 if choice == "white" else 0.0)
+
+    def iterate(self) -> None:
+        s = self.settings
+        # At the beginning of an iteration, so that what is evaluated or written after one is never fresh from a
+        # refinement, which costs some dB at first.
+        self.density.refine(self.model, self.iteration, self.random)
+        if not self.queue:
+            self.queue = torch.randperm(len(self.views), generator=self.random).tolist()
+        index = self.queue.pop()
+        camera = self.views.cameras[index]
+        background = self.background(fitting=True)
+        target = self.views.target(index, background)
+        gaussians = self.model.gaussians()
+        view = self.render(gaussians, camera, background)
+        loss = self.loss_of(view, target)
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise RuntimeError(
+                f"the loss is {value} after {self.iteration} iterations, on view {camera.name!r}; lower the learning "
+                "rates, or look for a camera inside the scene"
+            )
+        loss.backward()
+        self.iteration += 1
+        if self.density.active(self.iteration):
+            self.density.watch(self.model, gaussians, camera, view.weight.detach())
+        self.model.step(self.iteration / s.iterations)
+        error = float((view.color.detach() - target).square().mean())
+        self.loss = value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
+        self.error = error if math.isnan(self.error) else SMOOTHING * self.error + (1 - SMOOTHING) * error
+
+    def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
+        degree = min(self.settings.sh_degree, self.iteration // self.settings.sh_every)
+        return render(
+            gaussians,
+            camera,
+            backend=self.backend,
+            background=background,
+            sh_degree=degree,
+            near=self.settings.near * self.extent,
+        )
+
+    def loss_of(self, view: Render, target: Tensor) -> Tensor:
+        s = self.settings
+        image = view.color.float()
+        loss = (1 - s.ssim) * losses.l1(image, target)
+        if s.ssim:
+            loss = loss + s.ssim * (1 - losses.ssim(image, target))
+        done = self.iteration / s.iterations
+        if s.normal_weight and done >= s.normal_from:
+            loss = loss + s.normal_weight * losses.normal_consistency(view)
+        if s.distortion_weight and done >= s.distortion_from:
+            loss = loss + s.distortion_weight * losses.depth_distortion(view, s.distortion_form, scale=self.extent)
+        return loss
+
+    def evaluate(self) -> None:
+        gaussians = self.model.gaussians().detach()
+        errors = []
+        if self.held_out is not None:
+            background = self.background(fitting=False)
+            for index, camera in enumerate(self.held_out.cameras):
+                image = self.render(gaussians, camera, background).color.clamp(0, 1)
+                errors.append(float((image - self.held_out.target(index, background)).square().mean()))
+        known = bool(errors)
+        self.history.append(
+            Record(
+                iteration=self.iteration,
+                seconds=self.seconds,
+                cpu_seconds=self.cpu_seconds,
+                splats=len(self.model),
+                loss=None if math.isnan(self.loss) else self.loss,
+                psnr=sum(losses.psnr_of_mse(e) for e in errors) / len(errors) if known else None,
+                psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if known else None,
+                measures=dict(self.measure(gaussians)) if self.measure else {},
+            )
+        )

@@ -1,0 +1,82 @@
+"""How a fit stands, for people: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from attnwarp.fit.loop import Step
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+LINE_SECONDS = 10.0
+"""Seconds between two lines where there is no terminal."""
+
+
+def describe(step: Step) -> str:
+    """One line of figures."""
+    held = "" if step.held_out is None else f", held out {_decibels(step.held_out)}"
+    return f"loss {step.loss:.4f}, PSNR {_decibels(step.psnr)}{held}, {step.splats} splats"
+
+
+def _decibels(value: float) -> str:
+    return f"{value:.2f} dB" if math.isfinite(value) else "inf dB"
+
+
+@contextmanager
+def shown(console: Console | None = None, *, title: str = "fit") -> Iterator[Callable[[Step], None]]:
+    """What to pass as ``watch`` to :func:`attnwarp.fit.fit`; writes to stderr unless told where.
+
+    Example:
+        >>> with shown(title="bear") as watch:  # doctest: +SKIP
+        ...     result = fit(start, views, settings, watch=watch)
+    """
+    from rich.console import Console as Terminal
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    where = console or Terminal(stderr=True)
+    if not where.is_terminal:
+        yield _lines(where, title)
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[figures]}", markup=False),
+    )
+    with Progress(*columns, console=where) as bar:
+        task = bar.add_task(title, total=None, figures="")
+
+        def update(step: Step) -> None:
+            bar.update(task, completed=step.iteration, total=step.iterations, figures=describe(step))
+
+        yield update
+
+
+def _lines(console: Console, title: str) -> Callable[[Step], None]:
+    last = time.perf_counter()
+
+    def write(step: Step) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if now - last < LINE_SECONDS and step.iteration != step.iterations:
+            return
+        last = now
+        text = f"{title} [{step.iteration}/{step.iterations}] {step.seconds:.0f} s: {describe(step)}"
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    return write

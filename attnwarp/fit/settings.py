@@ -1,0 +1,193 @@
+"""Everything that decides what a fit computes. The published numbers, and where they had to be changed, why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Literal, get_args
+
+from attnwarp import _check
+from attnwarp.gaussians import Kind
+from attnwarp.losses import Distortion
+
+Background = Literal["auto", "random", "black", "white"]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What a fit optimises and how. Equal settings, views, first splats and threads give equal bits.
+
+    Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take 30,000 iterations
+    on a GPU. What they fix in iterations and what has to scale with a shorter fit is given as a share of
+    ``iterations`` here.
+
+    Args:
+        kind: "2d" (2DGS) or "3d" (3DGS).
+        iterations: optimisation steps, one view each.
+        seed: of the order of views, the random background and the splitting of splats.
+        sh_degree: of the colour's spherical harmonics, 0 to 3.
+        sh_every: iterations after which one more degree is used, from degree 0.
+        lr_means, lr_means_final: learning rates of the centres at the beginning and the end, exponential in between,
+            times the scene's extent.
+        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: of the constant and the other harmonics, the opacity's logit,
+            the scales' logarithm, and the quaternions.
+        ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
+        normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
+        distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
+        distortion_form: "l1" (in units of the scene's extent) or "l2_ndc"; see
+            :func:`attnwarp.losses.depth_distortion`.
+        normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000 and 3,000 of
+            30,000).
+        background: what is behind the splats and behind transparent pixels of the images: "black", "white", "random"
+            (another colour each iteration, so that transparency cannot be faked by colour), or "auto": random for
+            images with transparency and black for others.
+        densify: clone, split and prune splats.
+        densify_from: first iteration at which splats are added.
+        densify_every: iterations between two refinements.
+        densify_until: share of the iterations after which splats are neither added nor removed.
+        grow_gradient: mean norm of the loss's gradient in a splat's position on screen above which it is cloned or
+            split, the screen being 2 wide and high.
+        grow_scale: share of the extent up to which a splat counts as small: small ones are cloned, large ones split.
+        split_shrink: what the scales of the two halves of a split splat are divided by.
+        max_splats: no refinement grows the model beyond this number; those of the largest gradient go first. None:
+            without limit.
+        prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d" (published).
+        prune_scale: splats larger than this share of the extent are removed after the first opacity reset.
+        reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long as splats are
+            added.
+        reset_opacity: see there.
+        antialiased: "3d" only: fit for the opacity-compensated rasteriser.
+        near: nothing nearer to a camera is drawn, as a share of the extent.
+        evaluate_every: iterations between two evaluations on the held-out views, which also the curve of the result
+            is made of.
+        patience: stop when the held-out PSNR has not risen by ``min_gain`` dB in so many evaluations. None: never.
+            The held-out figures of a fit that stopped early are slightly optimistic.
+        min_gain: see ``patience``, dB.
+
+    Raises:
+        ValueError: a number out of range or an unknown choice; the message names the field.
+    """
+
+    kind: Kind = "2d"
+    iterations: int = 7000
+    seed: int = 0
+    sh_degree: int = 3
+    sh_every: int = 1000
+    lr_means: float = 1.6e-4
+    lr_means_final: float = 1.6e-6
+    lr_dc: float = 2.5e-3
+    lr_rest: float = 1.25e-4
+    lr_opacity: float = 5e-2
+    lr_scales: float = 5e-3
+    lr_quats: float = 1e-3
+    ssim: float = 0.2
+    normal: float | None = None
+    distortion: float | None = None
+    distortion_form: Distortion = "l1"
+    normal_from: float = 0.23
+    distortion_from: float = 0.1
+    background: Background = "auto"
+    densify: bool = True
+    densify_from: int = 500
+    densify_every: int = 100
+    densify_until: float = 0.5
+    grow_gradient: float = 2e-4
+    grow_scale: float = 0.01
+    split_shrink: float = 1.6
+    max_splats: int | None = None
+    prune_opacity: float | None = None
+    prune_scale: float = 0.1
+    reset_every: int = 3000
+    reset_opacity: float = 0.01
+    antialiased: bool = False
+    near: float = 0.01
+    evaluate_every: int = 500
+    patience: int | None = None
+    min_gain: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check.one_of(self.kind, ("2d", "3d"), "kind")
+        _check.one_of(self.distortion_form, get_args(Distortion), "distortion_form")
+        _check.one_of(self.background, get_args(Background), "background")
+        for name in ("densify", "antialiased"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
+        if self.antialiased and self.kind == "2d":
+            raise ValueError("antialiased: applies to kind '3d' only; 2D splats have a screen filter instead")
+        for name, (low, high) in _LIMITS.items():
+            value = getattr(self, name)
+            if value is None and name in _OPTIONAL:
+                continue
+            whole = name in _WHOLE
+            right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+            if not right or not math.isfinite(value) or not low <= value <= high:
+                kind = "a whole number" if whole else "a number"
+                bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+                raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
+            if not whole:
+                object.__setattr__(self, name, float(value))
+
+    @property
+    def normal_weight(self) -> float:
+        """``normal``, or its default for the kind."""
+        return (0.05 if self.kind == "2d" else 0.0) if self.normal is None else self.normal
+
+    @property
+    def distortion_weight(self) -> float:
+        """``distortion``, or its default for the kind."""
+        return (0.01 if self.kind == "2d" else 0.0) if self.distortion is None else self.distortion
+
+    @property
+    def opacity_floor(self) -> float:
+        """``prune_opacity``, or its default for the kind."""
+        return (0.05 if self.kind == "2d" else 0.005) if self.prune_opacity is None else self.prune_opacity
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> FitSettings:
+        """The settings :meth:`to_dict` wrote. Fields left out take the default.
+
+        Raises:
+            ValueError: a key that is no field, or a value out of range.
+        """
+        for key in data:
+            _check.one_of(key, [field.name for field in fields(cls)], "fit setting")
+        return cls(**data)
+
+
+_WHOLE = {
+    "iterations", "seed", "sh_degree", "sh_every", "densify_from", "densify_every", "max_splats", "reset_every",
+    "evaluate_every", "patience",
+}  # fmt: skip
+_OPTIONAL = {"normal", "distortion", "prune_opacity", "max_splats", "patience"}
+_LIMITS: dict[str, tuple[float, float]] = {
+    "iterations": (1, math.inf),
+    "seed": (0, 2**63 - 1),
+    "sh_degree": (0, 3),
+    "sh_every": (1, math.inf),
+    **{f"lr_{name}": (0, math.inf) for name in ("means_final", "dc", "rest", "opacity", "scales", "quats")},
+    "lr_means": (0, math.inf),
+    "ssim": (0, 1),
+    "normal": (0, math.inf),
+    "distortion": (0, math.inf),
+    "normal_from": (0, 1),
+    "distortion_from": (0, 1),
+    "densify_from": (0, math.inf),
+    "densify_every": (1, math.inf),
+    "densify_until": (0, 1),
+    "grow_gradient": (0, math.inf),
+    "grow_scale": (0, math.inf),
+    "split_shrink": (1, math.inf),
+    "max_splats": (1, math.inf),
+    "prune_opacity": (0, 1),
+    "prune_scale": (1e-6, math.inf),
+    "reset_every": (1, math.inf),
+    "reset_opacity": (1e-6, 1),
+    "near": (1e-9, math.inf),
+    "evaluate_every": (1, math.inf),
+    "patience": (1, math.inf),
+    "min_gain": (0, math.inf),
+}

@@ -1,0 +1,128 @@
+"""The splats a fit begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import _check
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians, Kind
+
+Array = npt.NDArray[np.float64]
+
+FIRST_OPACITY = 0.1
+"""Opacity of every first splat (3DGS)."""
+
+NEIGHBOURS = 3
+"""A first splat is as large as the root mean square distance to so many neighbours (3DGS)."""
+
+
+def extent_of(cameras: Sequence[Camera]) -> float:
+    """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean (3DGS).
+
+    Cameras that stand at one place say nothing about it; then it is 1.
+    """
+    centers = np.stack([camera.position for camera in cameras])
+    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    return 1.1 * radius if radius > 1e-9 * max(1.0, float(np.abs(centers).max())) else 1.0
+
+
+def from_points(
+    points: npt.ArrayLike,
+    colors: npt.ArrayLike | None = None,
+    *,
+    kind: Kind,
+    sh_degree: int = 3,
+    seed: int = 0,
+) -> Gaussians:
+    """One splat a point: as large as the gaps around it, opacity 0.1, grey where no colour is given.
+
+    3D splats begin round, and unturned. 2D splats begin as discs that are turned at random (2DGS).
+
+    Args:
+        points: (P, 3) world coordinates, at least one; duplicates are dropped.
+        colors: (P, 3) uint8 sRGB.
+        kind: "2d" or "3d".
+        sh_degree: room for harmonics up to this degree; all but the constant are 0.
+        seed: of the random turns.
+
+    Returns:
+        float32 splats relative to an ``origin`` in the middle of the points.
+
+    Raises:
+        ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out of range.
+    """
+    from scipy.spatial import cKDTree
+
+    _check.one_of(kind, ("2d", "3d"), "kind")
+    if not 0 <= sh_degree <= 3:
+        raise ValueError(f"sh_degree: got {sh_degree}, expected 0 to 3")
+    xyz = np.asarray(points, dtype=np.float64)
+    _check.shape(xyz, ("P", 3), "points")
+    _check.finite(xyz, "points")
+    if len(xyz) == 0:
+        raise ValueError("points: got none, expected at least one")
+    rgb = np.full((len(xyz), 3), 128, np.uint8) if colors is None else np.asarray(colors)
+    _check.shape(rgb, (len(xyz), 3), "colors")
+    if rgb.dtype != np.uint8:
+        raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
+    # Two splats at one place have no distance to be sized by, and would stay together for ever.
+    _, first = np.unique(xyz, axis=0, return_index=True)
+    first.sort()
+    xyz, rgb = xyz[first], rgb[first]
+    origin = (xyz.min(0) + xyz.max(0)) / 2
+    local = xyz - origin
+    n = len(local)
+    size = np.full(n, 0.01 * max(1e-6, float(np.abs(local).max())))
+    if n > 1:
+        distance, _ = cKDTree(local).query(local, k=min(NEIGHBOURS + 1, n))
+        size = np.sqrt((distance[:, 1:] ** 2).mean(1))
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    if kind == "2d":
+        # Four independent normals point evenly over the 3-sphere: every rotation is as likely.
+        quats = torch.randn(n, 4, generator=torch.Generator().manual_seed(seed))
+        quats = quats / quats.norm(dim=1, keepdim=True)
+    sh = torch.zeros(n, (sh_degree + 1) ** 2, 3)
+    sh[:, :1] = Gaussians.sh_from_rgb(torch.from_numpy(rgb.astype(np.float32) / 255))
+    return Gaussians(
+        kind,
+        torch.from_numpy(local.astype(np.float32)),
+        quats,
+        torch.from_numpy(size.astype(np.float32))[:, None].repeat(1, 2 if kind == "2d" else 3),
+        torch.full((n,), FIRST_OPACITY),
+        sh,
+        origin=origin,
+    )
+
+
+def random_points(cameras: Sequence[Camera], count: int, *, seed: int = 0) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """Points and colours to begin with where nothing is known of the surfaces.
+
+    They fill a cube about the point that the cameras look at (the nearest to all optical axes), with half an edge of
+    the cameras' mean distance from it; cameras that look along parallel axes get one in front of them.
+
+    Returns:
+        points: (count, 3) world coordinates.
+        colors: (count, 3) uint8, at random.
+    """
+    if count < 1:
+        raise ValueError(f"count: got {count}, expected at least 1")
+    centers = np.stack([camera.position for camera in cameras])
+    forward = np.stack([camera.forward for camera in cameras])
+    # Least squares over the distances to the axes: sum_i (I - f f^T)(p - c) = 0.
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    middle = centers.mean(0)
+    A = across.sum(0)
+    if np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras):
+        focus = middle + np.linalg.solve(A, np.einsum("nij,nj->i", across, centers - middle))
+    else:
+        focus = middle + extent_of(cameras) * forward.mean(0)
+    half = float(np.linalg.norm(centers - focus, axis=1).mean())
+    random = np.random.default_rng(seed)
+    points = focus + half * random.uniform(-1, 1, (count, 3))
+    return points, random.integers(0, 256, (count, 3), dtype=np.uint8)

@@ -1,0 +1,176 @@
+"""Losses of a fit: differences of pictures, and regularisers of the surface that the splats describe.
+
+Pictures are H x W x C, sRGB in [0, 1]. Every loss is a mean over pixels, so that its weight does not depend on the
+image's size.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import _check
+from attnwarp.render import Render
+
+Tensor = torch.Tensor
+Distortion = Literal["l1", "l2_ndc"]
+
+SSIM_WINDOW = 11
+SSIM_SIGMA = 1.5
+"""Window of Wang et al. 2004: 11 x 11 pixels, Gaussian with sigma 1.5."""
+
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+"""Its two stabilising constants, for values in [0, 1]."""
+
+
+def l1(image: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute difference of two (H, W, C) pictures."""
+    _same(image, target)
+    return (image - target).abs().mean()
+
+
+def psnr(image: Tensor, target: Tensor) -> float:
+    """Peak signal-to-noise ratio in dB of two pictures in [0, 1]; infinite when they are equal."""
+    _same(image, target)
+    error = float((image.detach().double() - target.detach().double()).square().mean())
+    return psnr_of_mse(error)
+
+
+def psnr_of_mse(error: float) -> float:
+    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0. To average views, average the error."""
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim(image: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0, 1]; 1 when they are equal.
+
+    A mean over the windows that lie wholly inside the picture and over channels, as in the authors' own code and in
+    scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)``. The code
+    of 3DGS pads with zeros instead and so also scores windows that are partly outside. Differentiable in both.
+
+    Args:
+        image, target: of one shape, at least 11 x 11 pixels, float32 or float64.
+
+    Raises:
+        ValueError: different shapes, or a picture smaller than the window, for which it is undefined.
+    """
+    return ssim_map(image, target).mean()
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`."""
+    _same(image, target)
+    if image.ndim != 3:
+        raise ValueError(f"image: got shape {tuple(image.shape)}, expected (H, W, C)")
+    if min(image.shape[:2]) < SSIM_WINDOW:
+        raise ValueError(
+            f"image: got {image.shape[1]} x {image.shape[0]} px; SSIM is undefined below {SSIM_WINDOW} x {SSIM_WINDOW}"
+        )
+    result: Tensor = _Ssim.apply(image, target)
+    return result
+
+
+class _Ssim(torch.autograd.Function):
+    """With its own backward pass: eight blurs in place of ten, and few passes over memory.
+
+    With mu = blur(x), e = blur(x^2), e12 = blur(x y) the similarity is a function of the five blurred images, and the
+    blur is its own adjoint: dx = blur(dmu) + 2 x blur(de) + y blur(de12).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
+        x, y = image.detach(), target.detach()
+        mu_x, mu_y = _blur(x), _blur(y)
+        var_x = _blur(x * x) - mu_x * mu_x
+        var_y = _blur(y * y) - mu_y * mu_y
+        cov = _blur(x * y) - mu_x * mu_y
+        a1, a2 = 2 * mu_x * mu_y + SSIM_C1, 2 * cov + SSIM_C2
+        b1, b2 = mu_x * mu_x + mu_y * mu_y + SSIM_C1, var_x + var_y + SSIM_C2
+        similarity = a1 * a2 / (b1 * b2)
+        ctx.save_for_backward(image, target, mu_x, mu_y, a1, a2, b1, b2, similarity)
+        return similarity
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        x, y, mu_x, mu_y, a1, a2, b1, b2, similarity = ctx.saved_tensors
+        share = upstream / (b1 * b2)
+        d_cross = _spread(2 * a1 * share)
+        d_square = _spread(-upstream * similarity / b2)
+        common = 2 * (a2 - a1) * share
+        unlike = 2 * upstream * similarity * (1 / b1 - 1 / b2)
+        grads: list[Tensor | None] = [None, None]
+        for k, (own, other, mu_own, mu_other) in enumerate(((x, y, mu_x, mu_y), (y, x, mu_y, mu_x))):
+            if ctx.needs_input_grad[k]:
+                d_mean = _spread(common * mu_other - unlike * mu_own)
+                grads[k] = d_mean + 2 * own * d_square + other * d_cross
+        return grads[0], grads[1]
+
+
+@cache
+def _kernel() -> npt.NDArray[np.float64]:
+    x = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+    weights = np.exp(-(x**2) / (2 * SSIM_SIGMA**2))
+    normalised: npt.NDArray[np.float64] = weights / weights.sum()
+    return normalised
+
+
+def _filter(values: Tensor) -> Tensor:
+    """Gaussian blur of (H, W, C), zeros outside. OpenCV's is 10 times as fast as a torch convolution on a CPU."""
+    import cv2
+
+    array = np.ascontiguousarray(values.cpu().numpy())
+    blurred = cv2.sepFilter2D(array, -1, _kernel(), _kernel(), borderType=cv2.BORDER_CONSTANT)
+    return torch.from_numpy(blurred.reshape(array.shape)).to(values.device)
+
+
+def _blur(values: Tensor) -> Tensor:
+    """(H - 10, W - 10, C): weighted means over the windows inside the picture."""
+    edge = SSIM_WINDOW // 2
+    return _filter(values)[edge:-edge, edge:-edge]
+
+
+def _spread(values: Tensor) -> Tensor:
+    """The adjoint of :func:`_blur`: (H - 10, W - 10, C) to (H, W, C)."""
+    edge = SSIM_WINDOW // 2
+    return _filter(torch.nn.functional.pad(values, (0, 0, edge, edge, edge, edge)))
+
+
+def normal_consistency(view: Render) -> Tensor:
+    """Mean over pixels of sum_i w_i (1 - n_i . N), N the normal of the rendered depth (2DGS).
+
+    That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges of what is drawn)
+    count as 0. Gradients flow through both normals.
+    """
+    N = view.normal_from_depth
+    defined = torch.isfinite(N.detach()).all(-1)
+    agreement = (view.normal * torch.where(defined[..., None], N, 0.0)).sum(-1)
+    return torch.where(defined, view.alpha - agreement, 0.0).mean()
+
+
+def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.0) -> Tensor:
+    """Mean over pixels of the spread of the splats that share a ray.
+
+    Args:
+        view: what was rendered.
+        form: "l1", sum_ij w_i w_j |z_i - z_j| (the 2DGS paper, gsplat), or "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2
+            with depths mapped to [0, 1] (the original 2DGS code).
+        scale: a length in scene units that "l1" is divided by, so that its weight does not depend on the scene's
+            unit.
+
+    Raises:
+        ValueError: another form.
+    """
+    _check.one_of(form, ("l1", "l2_ndc"), "form")
+    return view.distortion_l1.mean() / scale if form == "l1" else view.distortion_l2_ndc.mean()
+
+
+def _same(image: Tensor, target: Tensor) -> None:
+    if image.shape != target.shape:
+        raise ValueError(f"target: got shape {tuple(target.shape)}, expected that of image, {tuple(image.shape)}")
