@@ -9,10 +9,9 @@ along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1, -1, 1
 
 from __future__ import annotations
 
-import functools
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,13 +34,13 @@ Image = npt.NDArray[np.float32]
 APPEARANCE_PROTOCOL = 1
 """Raised whenever the same scene, camera, plan and seed would give another picture."""
 
-TEXELS = 1024
+TEXELS = 2048
 """Most texels along the longer side of a baked texture."""
 
 SKY_ROWS = 256
 """Rows of the map that carries the sky's ramp; the ramp is linear in the sine of the elevation, so few would do."""
 
-TEXEL_SIZE = 0.35
+TEXEL_SIZE = 0.5
 """Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the middle."""
 
 
@@ -124,7 +123,14 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
     plan = plan_rendering(scene, spp)
     pose = {name: value for name, value in camera.to_dict().items() if name != "name"}
     key = content_key(
-        "appearance", APPEARANCE_PROTOCOL, mitsuba.__version__, scene.world_hash, pose, asdict(plan), int(seed)
+        "appearance",
+        APPEARANCE_PROTOCOL,
+        mitsuba.__version__,
+        scene.world_hash,
+        _texel(scene),
+        pose,
+        asdict(plan),
+        int(seed),
     )
     stored = read_arrays("appearance", key)
     if stored is None:
@@ -143,7 +149,7 @@ def _render(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
             options |= {"max_depth": step.max_depth, "rr_depth": step.max_depth + 1}
         else:
             options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
-        world, center = _world(scene.world_hash, _Holder(scene), step.lights)
+        world, center = _world(scene, step.lights)
         sensor = _sensor(camera, center, {"type": _sampler(step.spp), "sample_count": step.spp}, world)
         picture = mi.render(
             world, sensor=sensor, integrator=mi.load_dict(options), seed=len(plan.passes) * int(seed) + number
@@ -166,7 +172,7 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
     mi = _mitsuba()
-    world, center = _world(scene.world_hash, _Holder(scene), ())
+    world, center = _world(scene, ())
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would lie nowhere.
     sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
@@ -187,37 +193,38 @@ def _mitsuba() -> Any:
     return mi
 
 
-class _Holder:
-    """Hands a scene to a cached function without taking part in its key."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Holder)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-@functools.lru_cache(maxsize=4)
-def _world(world_hash: str, holder: _Holder, lights: tuple[int, ...]) -> tuple[Any, Array]:
+def _world(scene: Scene, lights: tuple[int, ...]) -> tuple[Any, Array]:
     """The loaded Mitsuba scene with some of its lights, and the (3,) world position of its origin."""
     mi = _mitsuba()
-    loaded, center = _loaded_shapes(world_hash, holder)
-    graph = {"type": "scene"} | loaded | {f"light_{k}": _light(holder.scene.spec.lights[k]) for k in lights}
+    texel = _texel(scene)
+    shapes, center = _kept((scene.world_hash, texel), lambda: _load_shapes(scene, texel))
+    lamps = {f"light_{k}": _light(scene.spec.lights[k]) for k in lights}
     # optimize=False: the default merges shapes, after which their indices mean something else.
-    return mi.load_dict(graph, optimize=False), center
+    return _kept(
+        (scene.world_hash, texel, lights),
+        lambda: (mi.load_dict({"type": "scene"} | shapes | lamps, optimize=False), center),
+    )
 
 
-@functools.lru_cache(maxsize=2)
-def _loaded_shapes(world_hash: str, holder: _Holder) -> tuple[dict[str, Any], Array]:
+_loaded: dict[Any, Any] = {}
+
+
+def _kept(key: Any, make: Callable[[], Any]) -> Any:
+    """The value of ``make``, kept with the last few others: a scene's views come one after the other."""
+    if key not in _loaded:
+        while len(_loaded) >= 6:
+            _loaded.pop(next(iter(_loaded)))
+        _loaded[key] = make()
+    return _loaded[key]
+
+
+def _load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Any], Array]:
     mi = _mitsuba()
-    scene = holder.scene
     bounds = np.stack([shape.bounds() for shape in scene.shapes()])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
-        return {name: mi.load_dict(form, optimize=False) for name, form in _shapes(scene, center, Path(folder))}, center
+        forms = _shapes(scene, center, texel, Path(folder))
+        return {name: mi.load_dict(form, optimize=False) for name, form in forms}, center
 
 
 def _faces(scene: Scene) -> Iterator[Sphere | Rectangle | Mesh]:
@@ -232,11 +239,8 @@ def _owners(scene: Scene) -> list[int]:
     return [shape.object_id for shape in _faces(scene)]
 
 
-def _shapes(scene: Scene, center: Array, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _shapes(scene: Scene, center: Array, texel: float, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     mi = _mitsuba()
-    orbit = scene.spec.cameras
-    # The world does not depend on the image size, so texels are sized for 512 rows.
-    texel = TEXEL_SIZE * orbit.radius * 2 * math.tan(math.radians(orbit.fov) / 2) / 512
     for index, shape in enumerate(_faces(scene)):
         texture = scene.spec.objects[shape.object_id].texture
 
@@ -278,6 +282,12 @@ def _shapes(scene: Scene, center: Array, folder: Path) -> Iterator[tuple[str, di
             f"shape_{index:06d}",
             form | {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}},
         )
+
+
+def _texel(scene: Scene) -> float:
+    """Size of a baked texel in scene units, for pictures of 512 rows."""
+    orbit = scene.spec.cameras
+    return TEXEL_SIZE * orbit.radius * 2 * math.tan(math.radians(orbit.fov) / 2) / 512
 
 
 def _texels(length: float, texel: float) -> int:
