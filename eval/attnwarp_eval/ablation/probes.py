@@ -189,8 +189,8 @@ def _save_pictures(cell: Cell, name: str, at: World, shown: dict[str, Any], root
 
     found = pictures.of(at, name, **shown)
     saved = []
-    for what, png in found.items():
-        path = Path("pictures") / cell.id[:16] / f"{name}-{what}.png"
-        write_atomic(root / path, png)
-        saved.append({"view": name, "what": what, "path": str(path), "sha256": hashlib.sha256(png).hexdigest()})
+    for what, data in found.items():
+        path = Path("pictures") / cell.id[:16] / f"{name}-{what}.jpg"
+        write_atomic(root / path, data)
+        saved.append({"view": name, "what": what, "path": str(path), "sha256": hashlib.sha256(data).hexdigest()})
     return saved

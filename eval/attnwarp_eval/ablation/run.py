@@ -161,7 +161,13 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
 
     threads = max(1, len(os.sched_getaffinity(0)) // jobs)
     root = str(store.root.resolve())
+    # dask has workers give freed memory back at once; image-sized arrays then cost more page faults than arithmetic.
+    keep_memory = {
+        "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 30,
+        "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 30,
+    }
     settings = {
+        **keep_memory,
         "distributed.scheduler.allowed-failures": 1,
         "distributed.worker.memory.terminate": False,
         "distributed.nanny.pre-spawn-environ.NUMBA_NUM_THREADS": threads,

@@ -63,7 +63,7 @@ def spread(value: Interval) -> str:
     lost = f" ({value.undefined} undefined)" if value.undefined else ""
     if not value.known:
         return number(value.mean) + lost
-    return f"{number(value.mean)} [{number(value.low)}, {number(value.high)}]{lost}"
+    return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{lost}"
 
 
 def build(results: Results, root: Path, *, timings: bool = True) -> Report:
@@ -79,9 +79,9 @@ def build(results: Results, root: Path, *, timings: bool = True) -> Report:
     lead = [
         f"Study `{study['name']}`: {results.measured} of {total} cells measured, {len(results.failures)} failed; "
         f"scenes {', '.join(study['scenes'])}; {study['size']} x {study['size']} px; seeds {study['seeds']}.",
-        "Figures are means over scenes of means over views, with a 95 % interval for the mean over scenes "
-        f"(n = {len(study['scenes'])} scenes; Student's t on a bootstrap over scenes, then views). Differences are "
-        "paired on scene and view; verdicts are adjusted for the number of tests in their table. "
+        f"Figures are means over {len(study['scenes'])} scenes of means over their views, ± half of the 95 % interval "
+        "(Student's t over scenes). Differences are paired on scene and view; verdicts are adjusted for the number of "
+        "tests in their table. "
         '"can\'t tell" is not "equal".',
     ]
     sections = [
@@ -107,18 +107,25 @@ def _mean(results: Results, probe: str, variant: str, metric: str) -> Interval:
 
 def _claims(results: Results) -> Section:
     rows = []
-    findings = [f for f in judge(results, load_claims()) if f.verdict != "not measured"]
-    for finding in findings:
+    for finding in judge(results, load_claims()):
+        if finding.verdict == "not measured":
+            continue
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
-        shown = "against zero" if claim.b is None and claim.compare_yaw is None else spread(finding.contrast)
-        rows.append([claim.text, claim.metric, sides, shown, finding.verdict])
+        shown = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
+        agree, views = finding.agreement
+        rows.append([claim.text, claim.metric, sides, shown, f"{agree} of {views}", finding.here, finding.verdict])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
         return section
-    section.text = ["A claim that does not hold on these scenes is a result, not an error."]
-    section.tables = [Table(["claim", "metric", "measured", "difference", "verdict"], rows)]
+    section.text = [
+        "A claim that does not hold on these scenes is a result, not an error. **Here** speaks of these scenes alone: "
+        "`seen` when the difference has the expected sign in every scene, with the views that agree beside it. **In general** "
+        "speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot settle it.",
+    ]
+    columns = ["claim", "metric", "measured", "difference", "views that agree", "here", "in general"]
+    section.tables = [Table(columns, rows)]
     return section
 
 
@@ -292,18 +299,14 @@ def _galleries(results: Results) -> list[Section]:
             shown.setdefault((cell["scene"], picture["view"]), []).append((cell["probe"], label, picture))
     if not shown:
         return []
-    rows = []
+    rows: list[tuple[str, list[Picture]]] = []
     for (scene, view), found in shown.items():
-        pictures: list[Picture] = []
-        for what in ("source", "target"):
-            first = next((p for _, _, p in found if p["what"] == what), None)
-            if first:
-                pictures.append(Picture(first["path"], what))
-        for what in ("warped", "mask", "endpoint-error", "depth-error"):
-            pictures += [
-                Picture(p["path"], f"{what.replace('-', ' ')}: {label}") for _, label, p in found if p["what"] == what
-            ]
-        rows.append((f"{scene}, {view}", pictures))
+        first = [next((p for _, _, p in found if p["what"] == what), None) for what in ("source", "target")]
+        rows.append((f"**{scene}, {view}**", [Picture(p["path"], p["what"]) for p in first if p]))
+        for label in dict.fromkeys(label for _, label, _ in found):
+            own = {p["what"]: p for _, other, p in found if other == label}
+            wanted = [what for what in ("warped", "mask", "endpoint-error", "depth-error") if what in own]
+            rows.append((label, [Picture(own[what]["path"], what.replace("-", " ")) for what in wanted]))
     legend = "; ".join(f"{colour} {name}" for name, (colour, _) in CLASSES.items())
     text = [
         "Warped: the source's own colours as the warp carries them, squares where the mask rejects. "

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import yaml
 
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics import Interval, benjamini_hochberg, interval, paired
+from attnwarp_eval.statistics import ByView, Interval, agreement, benjamini_hochberg, interval, paired
 
 Verdict = Literal["holds", "does not hold", "can't tell", "not measured"]
 
@@ -29,23 +29,40 @@ class Claim:
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
 
-    def measure(self, results: Results) -> tuple[dict[str, Interval], Interval]:
-        """The sides that are compared, by name, and the interval of the contrast that ``expect`` speaks of."""
+    @property
+    def sign(self) -> int:
+        """The sign that the contrast is expected to have."""
+        return 1 if self.expect == "higher" else -1
+
+    def measure(self, results: Results) -> Measured:
+        """What the claim speaks of."""
         if self.compare_yaw is not None:
-            sides = {}
-            means = []
-            for low, high in self.compare_yaw:
-                table = results.views(self.probe, self.a, self.metric, (low, high))
-                sides[f"yaw {low:g} to {high:g}"] = interval({s: list(v.values()) for s, v in table.items()})
-                # Different views cannot be paired; their means can, scene by scene.
-                means.append({s: {"mean": interval({s: list(v.values())}).mean} for s, v in table.items()})
-            return sides, paired(means[0], means[1])
+            tables = {
+                f"yaw {low:g} to {high:g}": results.views(self.probe, self.a, self.metric, (low, high))
+                for low, high in self.compare_yaw
+            }
+            # Different views cannot be paired; their means can, scene by scene.
+            means = [{s: {"mean": _interval({s: v}).mean} for s, v in table.items()} for table in tables.values()]
+            return Measured({name: _interval(t) for name, t in tables.items()}, means[0], means[1])
         a = results.views(self.probe, self.a, self.metric, self.yaw)
-        first = interval({s: list(v.values()) for s, v in a.items()})
         if self.b is None:
-            return {self.a: first}, first
+            zero = {scene: dict.fromkeys(views, 0.0) for scene, views in a.items()}
+            return Measured({self.a: _interval(a)}, zero, a)
         b = results.views(self.probe, self.b, self.metric, self.yaw)
-        return {self.a: first, self.b: interval({s: list(v.values()) for s, v in b.items()})}, paired(a, b)
+        return Measured({self.a: _interval(a), self.b: _interval(b)}, a, b)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The sides of a claim by name, and the two tables whose difference it speaks of."""
+
+    sides: dict[str, Interval]
+    a: ByView
+    b: ByView
+
+
+def _interval(table: ByView) -> Interval:
+    return interval({scene: list(views.values()) for scene, views in table.items()})
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,8 @@ class Finding:
     claim: Claim
     sides: dict[str, Interval]
     contrast: Interval
+    agreement: tuple[int, int]
+    here: Literal["seen", "mixed", "not seen"]
     verdict: Verdict
 
 
@@ -71,17 +90,34 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 def judge(results: Results, claims: list[Claim]) -> list[Finding]:
     """Every claim with its verdict; p-values are adjusted over the claims (Benjamini-Hochberg)."""
     measured = [claim.measure(results) for claim in claims]
-    adjusted = benjamini_hochberg([contrast.p for _, contrast in measured])
-    found = []
-    for claim, (sides, contrast), p in zip(claims, measured, adjusted, strict=True):
-        found.append(Finding(claim, sides, contrast, _verdict(claim, contrast, p)))
-    return found
+    contrasts = [paired(m.a, m.b) for m in measured]
+    adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
+    return [
+        Finding(
+            claim,
+            m.sides,
+            contrast,
+            agreement(m.a, m.b, claim.sign),
+            _here(claim, m),
+            _in_general(claim, contrast, p),
+        )
+        for claim, m, contrast, p in zip(claims, measured, contrasts, adjusted, strict=True)
+    ]
 
 
-def _verdict(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
+def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not seen"]:
+    """Whether each scene's mean difference has the expected sign."""
+    signs = [
+        paired({scene: measured.a[scene]}, {scene: measured.b[scene]}).mean * claim.sign > 0
+        for scene in measured.a
+        if scene in measured.b
+    ]
+    return "seen" if all(signs) else "mixed" if any(signs) else "not seen"
+
+
+def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
     if contrast.views == 0:
         return "not measured"
     if not contrast.known or not adjusted_p <= 0.05:
         return "can't tell"
-    sign = 1 if claim.expect == "higher" else -1
-    return "holds" if sign * contrast.mean > 0 else "does not hold"
+    return "holds" if claim.sign * contrast.mean > 0 else "does not hold"

@@ -13,7 +13,15 @@ from markupsafe import Markup
 
 from attnwarp_eval.report.model import Report
 
-_CLASSES = {"better": "better", "worse": "worse", "holds": "holds", "does not hold": "fails", "FAILED": "fails"}
+_CLASSES = {
+    "seen": "holds",
+    "not seen": "fails",
+    "better": "better",
+    "worse": "worse",
+    "holds": "holds",
+    "does not hold": "fails",
+    "FAILED": "fails",
+}
 
 
 def inline(text: str) -> Markup:

@@ -1,0 +1,190 @@
+"""The run as a user meets it: the command line in processes of its own, on a small study of real cells.
+
+Oracles: the file system (which cells were there before), byte equality of reports, exit codes.
+"""
+
+import json
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+SMALL = {
+    "name": "small",
+    "size": 64,
+    "scenes": ["spheres"],
+    "views": ["yaw030", "yaw150"],
+    "feature_sizes": [64, 16],
+    "spp": 1,
+    "splats": {"count": 2000},
+    "variants": {
+        "corrected": {"preset": "corrected"},
+        "bounds only": {
+            "set": {"in_front": False, "opaque": None, "depth_agreement": False, "normal_test": "none"},
+        },
+        "released": {"preset": "released"},
+    },
+    "probes": {
+        "calibration": ["corrected"],
+        "depth": ["corrected", "released"],
+        "warp": ["corrected", "bounds only", "released"],
+    },
+    "ablations": [{"title": "Presets", "baseline": "corrected", "variants": ["bounds only", "released"]}],
+    "yaw": {"variants": ["corrected", "bounds only"]},
+    "fronts": [{"title": "Cost", "metric": "warp.epe_median.16", "variants": ["corrected", "released"]}],
+    "pictures": {"variants": ["corrected"], "views": ["yaw030"]},
+}
+CELLS = 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "study.yaml").write_text(yaml.safe_dump(SMALL))
+    return folder
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "attnwarp_eval.cli", *map(str, arguments)]
+
+
+def call(folder, *arguments):
+    return subprocess.run(command(*arguments), cwd=folder, capture_output=True, text=True, timeout=600)
+
+
+def without_timings(run, folder):
+    done = call(folder, "report", run, "--no-timings")
+    assert done.returncode == 0, done.stderr
+    return {name: (run / name).read_bytes() for name in ("report.md", "report.html", "results.jsonl")}
+
+
+@pytest.fixture(scope="module")
+def finished(folder):
+    """A run that was never disturbed."""
+    done = call(folder, "run", "study.yaml", "--out", "undisturbed")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("\n[") == CELLS
+    return folder / "undisturbed"
+
+
+def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finished, folder):
+    assert call(folder, "verify", "undisturbed").returncode == 0
+    page = (finished / "report.html").read_text()
+    assert "data:image/jpeg;base64," in page
+    assert "data:image/svg+xml;base64," in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+    lines = [json.loads(line) for line in (finished / "results.jsonl").read_text().splitlines()]
+    assert all(line["seconds"]["method"] > 0 and line["counters"] for line in lines)
+    assert {line["probe"] for line in lines} == {"calibration", "depth", "warp"}
+
+
+def test_the_instrument_is_calibrated_in_every_run(finished):
+    (cell,) = (json.loads(p.read_text()) for p in (finished / "cells").iterdir() if "calibration" in p.read_text())
+    for view in cell["views"]:
+        median, own = view["metrics"]["warp.epe_median"], view["metrics"]["occlusion.f1.exact"]
+        # A view in which the source shows nothing has neither; here yaw 30 has both.
+        assert median is None or median < 1e-3
+        assert own is None or own == 1
+    assert cell["views"][0]["metrics"]["occlusion.f1.exact"] == 1
+
+
+def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder):
+    run = folder / "killed"
+    process = subprocess.Popen(command("run", "study.yaml", "--out", run), cwd=folder, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 300
+    while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").glob("*.json")}
+    assert 2 <= len(before) < CELLS
+    partial = call(folder, "verify", run)
+    assert partial.returncode == 3
+    assert "missing" in partial.stdout
+    again = call(folder, "run", "study.yaml", "--out", run)
+    assert again.returncode == 0, again.stderr
+    assert f"{len(before)} already done" in again.stderr
+    assert {name: (run / "cells" / name).stat().st_mtime_ns for name in before} == before
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_two_workers_give_the_same_numbers_as_one_process(finished, folder):
+    run = folder / "parallel"
+    done = call(folder, "run", "study.yaml", "--out", run, "--jobs", "2")
+    assert done.returncode == 0, done.stderr
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
+    run = folder / "failing"
+    run.mkdir()
+    # A file where the pictures' folder should be: the two cells that keep pictures fail, as on a full disk.
+    (run / "pictures").write_text("in the way")
+    done = call(folder, "run", "study.yaml", "--out", run)
+    assert done.returncode == 3
+    assert "failed cells" in done.stderr
+    assert len(list((run / "cells").iterdir())) == CELLS - 2
+    assert len(list((run / "failed").iterdir())) == 2
+    assert "Failed cells" in (run / "report.md").read_text()
+    assert call(folder, "verify", run).returncode == 3
+    stopped = call(folder, "run", "study.yaml", "--out", run, "--fail-fast")
+    assert stopped.returncode == 3
+    (run / "pictures").unlink()
+    mended = call(folder, "run", "study.yaml", "--out", run)
+    assert mended.returncode == 0, mended.stderr
+    assert "4 already done" in mended.stderr
+    assert call(folder, "verify", run).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, folder):
+    run = folder / "bereft"
+    arguments = command("run", "study.yaml", "--out", run, "--jobs", "2")
+    process = subprocess.Popen(arguments, cwd=folder, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 300
+    while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    workers = [pid for pid in children(process.pid) if "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()]
+    assert workers
+    os.kill(workers[0], signal.SIGKILL)
+    assert process.wait(300) == 0, process.stderr.read()
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def children(pid):
+    """Processes below ``pid``, nearest first."""
+    found = [int(c) for c in pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return found + [grandchild for child in found for grandchild in children(child)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "quik"), "did you mean 'quick'"),
+        (("run", "study.yaml", "--scenes", "sphere"), "did you mean 'spheres'"),
+        (("run", "study.yaml", "--jobs", "0"), "jobs"),
+        (("verify", "nowhere"), "attnwarp-eval run"),
+        (("report", "nowhere"), "attnwarp-eval run"),
+        (("scenes", "show", "nothing.yaml"), "no such scene file"),
+    ],
+)
+def test_bad_input_gets_a_clear_line_and_exit_code_2(folder, arguments, message):
+    done = call(folder, *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_imports_nothing_heavy():
+    listed = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "attnwarp_eval.cli", "--help"], capture_output=True, text=True
+    )
+    assert listed.returncode == 0
+    loaded = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in listed.stderr.splitlines() if "|" in line}
+    assert "typer" in loaded
+    assert not loaded & {"torch", "numpy", "open3d", "mitsuba", "numba", "scipy", "matplotlib", "pyvista", "cv2"}
