@@ -178,6 +178,31 @@ def test_a_card_just_above_its_ground_hides_what_lies_under_it(gap):
     assert agrees[beside].all()
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_the_scale_of_the_scene_changes_no_rule(scale):
+    # Hard case 10: a sphere before a wall, so that every rule has something to reject.
+    def scaled(camera):
+        pose = camera.world_to_camera.copy()
+        pose[:3, 3] *= scale
+        return Camera(camera.K, pose, camera.width, camera.height)
+
+    def surface(camera, size):
+        depth, normal = sphere(camera)
+        wall = plane_depth(camera, (1, 0, 0), -1.5)
+        on = ~(depth > np.nan_to_num(wall, nan=np.inf)) & np.isfinite(depth)
+        return Surface(size * np.where(on, depth, wall), np.where(on[..., None], normal, [1.0, 0, 0]))
+
+    source, target = orbit(0, height=1), orbit(40, height=1)
+    settings = preset("corrected", depth_relative=1e-4)
+    here = warp_surfaces(source, target, surface(target, 1.0), surface(source, 1.0), settings)
+    there = warp_surfaces(scaled(source), scaled(target), surface(target, scale), surface(source, scale), settings)
+    for name, rule in here.rules.items():
+        # Rounding alone may decide a pixel that lies exactly on a limit.
+        assert (rule != there.rules[name]).sum() <= 1, name
+    assert not here.rules["depth_agrees"].all()
+    assert here.mask.sum() > 1000
+
+
 def test_slope_is_the_planes_own_on_both_sides_of_a_step():
     x = torch.arange(8.0, dtype=torch.float64)
     depth = (2 + 0.1 * x)[None, :] + 0.05 * x[:, None]
