@@ -25,7 +25,7 @@ from attnwarp_eval import shapes
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.errors import InputError
 from attnwarp_eval.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
-from attnwarp_eval.textures import Color, Spec, Texture, linear_rgb
+from attnwarp_eval.textures import Color, Direction, Spec, Texture, linear_rgb
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -62,7 +62,7 @@ class RectangleSpec(Spec):
     type: Literal["rectangle"]
     center: Vector
     size: tuple[Positive, Positive]
-    facing: Vector = (0.0, 0.0, 1.0)
+    facing: Direction = (0.0, 0.0, 1.0)
 
 
 class Repeat(Spec):
@@ -568,8 +568,6 @@ def _check(scene: Scene, root: yaml.Node) -> None:
                 there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
                 refuse(f"objects[{k}].shape.file: there is no file {path}{_suggest(path.name, there)}; "
                        "the path counts from the folder of the scene file", *where)  # fmt: skip
-        if isinstance(item.shape, RectangleSpec) and not any(item.shape.facing):
-            refuse(f"objects[{k}].shape.facing: got [0, 0, 0], expected a direction", "objects", k, "shape", "facing")
     skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
     if len(skies) > 1:
         refuse(f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one", "lights", skies[1])

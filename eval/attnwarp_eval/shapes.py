@@ -413,11 +413,12 @@ def _march(parts: Sequence[Part], blend: float, resolution: int) -> dict[str, np
 
 # Files ---------------------------------------------------------------------------------------------------------------
 
-MESH_SUFFIXES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+# No .gltf: it keeps its vertices in another file, which a hash of its own bytes would not see.
+MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 
 
 def read_mesh(path: Path) -> Mesh:
-    """A triangle mesh from a file (.ply, .obj, .glb, .gltf, .stl, .off), all its parts joined.
+    """A triangle mesh from a file (.ply, .obj, .glb, .stl, .off), all its parts joined.
 
     Vertex colours, where the file has them, become the tint (taken as sRGB). Degenerate triangles are dropped with
     a :class:`MeshNotice`.

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numba
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from attnwarp_eval.colors import to_linear
 
@@ -26,6 +26,15 @@ def _hex(value: Any) -> str:
         raise ValueError(f"got {value!r}, expected an sRGB colour in quotes such as '#c08040'")
     return text.lower()
 
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(value):
+        raise ValueError("got [0, 0, 0], expected a direction")
+    return value
+
+
+Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
+"""A vector of any length but zero."""
 
 Color = Annotated[str, BeforeValidator(_hex)]
 
@@ -68,7 +77,7 @@ class Stripes(_Texture):
     type: Literal["stripes"]
     colors: tuple[Color, ...] = Field(min_length=2)
     size: float = Field(gt=0)
-    direction: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    direction: Direction = (0.0, 0.0, 1.0)
     wobble: float = Field(0.0, ge=0)  # how far noise bends the layers, in layers
 
 
@@ -87,7 +96,7 @@ class Bricks(_Texture):
     type: Literal["bricks"]
     colors: tuple[Color, ...] = Field(min_length=1)
     mortar: Color
-    size: tuple[float, float]
+    size: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
     joint: float = Field(0.02, gt=0)
 
 

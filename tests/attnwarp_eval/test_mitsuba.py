@@ -44,7 +44,23 @@ def test_mitsuba_and_the_exact_geometry_hit_the_same_objects_at_the_same_places(
         assert np.median(error) < 3e-6 and np.percentile(error, 99.5) < 3e-4
 
 
-def test_any_principal_point_and_a_camera_far_from_the_origin_are_the_same_in_both():
+def test_a_scene_far_from_the_origin_is_rendered_as_sharply_as_at_home():
+    ball = {
+        "name": "ball",
+        "shape": {"type": "sphere", "center": [1e6, -1e6, 1.0], "radius": 1.0},
+        "texture": {"type": "plain", "color": "#b08040"},
+    }
+    scene = world([SUN], [ball])
+    camera = Camera.look_at((1e6 + 4, -1e6 + 1, 2), (1e6, -1e6, 1), width=48, height=48, fov_y=40)
+    position, object_id = renderer.position_and_shape(scene, camera)
+    hits = Geometry(scene).trace(camera)
+    assert (object_id == hits.object_id).mean() > 0.999
+    both = hits.valid & (object_id == 0)
+    # float32 at 1e6 would be good to 0.06; recentred it is as good as anywhere.
+    assert np.median(np.linalg.norm(position - hits.point, axis=-1)[both]) < 3e-6
+
+
+def test_any_principal_point_means_the_same_in_both():
     scene = load_scene("spheres").with_size(96, 64)
     source = scene.source
     K = source.K.copy()

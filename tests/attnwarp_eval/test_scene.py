@@ -105,6 +105,9 @@ MISTAKES = [
     ("  - {type: sun", "  - {type: sky, horizon: '#fff0ff', zenith: '#0000ff'}\n  - {type: sky, horizon: '#ffffff', "
      "zenith: '#0000ff'}\n  - {type: sun", 15, r"lights\[1\]: a second sky"),
     ("  radius: 3\n", "\tradius: 3\n", 17, "not valid YAML: .*check indentation and quotes"),
+    ("checker, colors: ['#ffffff', '#202020']", "stripes, direction: [0, 0, 0], colors: ['#ffffff', '#202020']", 6,
+     r"objects\[0\].texture.direction: got \[0, 0, 0\], expected a direction"),
+    (SMALL, "- just\n- a list\n", 1, r"the file: got \['just', 'a list'\], but .*dictionary"),
     ("size: [8, 8]", "size: [8, 8], facing: [0, 0, 0]", 5, r"objects\[0\].shape.facing: got \[0, 0, 0\]"),
 ]  # fmt: skip
 
