@@ -125,7 +125,7 @@ def render(
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
         camera: the view; H x W pixels.
         backend: "cpu" (numba, float32 with float64 set-up), "reference" (brute force in float64, for small scenes),
-            "cuda" (gsplat on a GPU; it refuses what it computes differently, see :mod:`attnwarp.render.cuda`).
+            "cuda" (gsplat on a GPU; what it does differently is refused or left NaN, see :mod:`attnwarp.render.cuda`).
             "auto" is "cuda" where the splats lie on a GPU and "cpu" elsewhere.
         depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or "center". "3d":
             "center" (default) or "peak", where the Gaussian is largest along the ray.
@@ -155,6 +155,10 @@ def render(
         >>> view.color.shape, round(float(view.depth[24, 32]), 4)
         (torch.Size([48, 64, 3]), 3.0)
     """
+    if not isinstance(gaussians, Gaussians):
+        raise TypeError(f"gaussians: got {type(gaussians).__name__}, expected attnwarp.Gaussians")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: got {type(camera).__name__}, expected attnwarp.Camera")
     _check.one_of(backend, BACKENDS, "backend")
     chosen = ("cuda" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(
@@ -198,10 +202,6 @@ def _prepare(
     *,
     on_cpu: bool,
 ) -> Inputs:
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(f"gaussians: got {type(gaussians).__name__}, expected attnwarp.Gaussians")
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: got {type(camera).__name__}, expected attnwarp.Camera")
     kind = gaussians.kind
     device = gaussians.means.device
     if on_cpu and device.type != "cpu":

@@ -1,0 +1,172 @@
+"""gsplat's own torch reference, run whole on a CPU: an independent judge for the tests and a yardstick for the
+benchmark.
+
+gsplat enumerates splat-pixel pairs in CUDA and composites with nerfacc; both are supplied here: the pairs by brute
+force over each splat's box, nerfacc's two functions by a cumulative sum of logarithms and an index_add. Projection,
+opacity, colour and normals are gsplat's, unchanged.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+import time
+import types
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render import constants, harmonics
+
+Tensor = torch.Tensor
+
+
+@dataclass(frozen=True)
+class Judged:
+    """gsplat's picture: (H, W, 3) colour over black, (H, W) alpha, (H, W, 3) normals in world axes (2D only); the
+    pairs it composited, and the seconds that gsplat's own functions took (the enumeration of pairs left out)."""
+
+    color: Tensor
+    alpha: Tensor
+    normal: Tensor | None
+    pairs: int
+    seconds: float
+
+
+def _nerfacc() -> types.ModuleType:
+    module = types.ModuleType("nerfacc")
+
+    def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+        logs = torch.log1p(-alphas.double())
+        before = torch.cumsum(logs, 0) - logs
+        first = torch.searchsorted(ray_indices, ray_indices)
+        trans = torch.exp(before - before[first]).to(alphas.dtype)
+        return alphas * trans, trans
+
+    def accumulate_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+        source = weights[:, None] if values is None else weights[:, None] * values
+        return torch.zeros(n_rays, source.shape[1], dtype=source.dtype).index_add(0, ray_indices, source)
+
+    module.render_weight_from_alpha = render_weight_from_alpha  # type: ignore[attr-defined]
+    module.accumulate_along_rays = accumulate_along_rays  # type: ignore[attr-defined]
+    return module
+
+
+def render(
+    splats: Gaussians,
+    camera: Camera,
+    *,
+    true_center: bool = True,
+    antialiased: bool = False,
+    near: float = constants.NEAR,
+) -> Judged:
+    """Render with gsplat's torch functions, in the splats' own dtype.
+
+    Args:
+        true_center: 2D only: centre the screen filter on the projected centre, as here, in place of the middle of the
+            splat's box, as in gsplat.
+        antialiased: 3D only.
+
+    Raises:
+        ImportError: gsplat is not installed.
+    """
+    # A folder that does not exist: gsplat must not find a compiler to build its CUDA code with.
+    os.environ["CUDA_HOME"] = "/nonexistent/cuda"
+    from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, accumulate
+    from gsplat.cuda._torch_impl_2dgs import _fully_fused_projection_2dgs, accumulate_2dgs
+
+    dtype = splats.means.dtype
+    height, width = camera.height, camera.width
+    view = torch.tensor(camera.world_to_camera, dtype=dtype)[None]
+    K = torch.tensor(camera.K, dtype=dtype)[None]
+    means = splats.means + torch.tensor(splats.origin, dtype=dtype)
+    position = torch.tensor(camera.position, dtype=dtype)
+    colors = harmonics.color(splats.sh, torch.nn.functional.normalize(means - position, dim=-1))
+    opacities = splats.opacities
+    installed = sys.modules.get("nerfacc")
+    sys.modules["nerfacc"] = _nerfacc()
+    try:
+        start = time.perf_counter()
+        if splats.kind == "3d":
+            covariances, _ = _quat_scale_to_covar_preci(splats.quats, splats.scales, compute_preci=False)
+            _, means2d, depths, conics, factors = _fully_fused_projection(
+                means, covariances, view, K, width, height, near_plane=near, calc_compensations=antialiased
+            )
+            if antialiased:
+                opacities = opacities * factors[0]
+            table = conics
+        else:
+            scales = torch.cat([splats.scales, torch.ones_like(splats.scales[:, :1])], dim=1)
+            _, means2d, depths, table, normals = _fully_fused_projection_2dgs(
+                means, splats.quats, scales, view, K, width, height, near_plane=near
+            )
+            if true_center:
+                means2d = table[..., :2, 2] / table[..., 2:, 2]
+        seconds = time.perf_counter() - start
+        ids, pixels = _pairs(splats, camera, means2d[0], depths[0], table[0], opacities, near)
+        images = torch.zeros_like(ids)
+        start = time.perf_counter()
+        if splats.kind == "3d":
+            picture, alpha = accumulate(
+                means2d, table, opacities[None], colors[None], ids, pixels, images, width, height
+            )
+            normal = None
+        else:
+            picture, alpha, in_camera = accumulate_2dgs(
+                means2d, table, opacities[None], colors[None], normals, ids, pixels, images, width, height
+            )
+            normal = in_camera[0] @ view[0, :3, :3]
+        seconds += time.perf_counter() - start
+    finally:
+        if installed is None:
+            del sys.modules["nerfacc"]
+        else:
+            sys.modules["nerfacc"] = installed
+    return Judged(picture[0], alpha[0, ..., 0], normal, len(ids), seconds)
+
+
+def _pairs(
+    splats: Gaussians, camera: Camera, centers: Tensor, depths: Tensor, table: Tensor, opacities: Tensor, near: float
+) -> tuple[Tensor, Tensor]:
+    """Splat and pixel of every pair with alpha >= 1/255, sorted by pixel, then depth; whole splats at a time."""
+    height, width = camera.height, camera.width
+    rank = torch.empty(len(depths), dtype=torch.long)
+    rank[torch.argsort(depths, stable=True)] = torch.arange(len(depths))
+    # A box that surely holds the footprint: the ball of 3.4 sigma around the mean, and the filters' few pixels.
+    reach = 3.4 * splats.scales.amax(dim=-1)
+    z = depths.clamp(min=near)
+    slope = torch.tensor(camera.directions([[0, 0], [width, height]]), dtype=depths.dtype).abs().amax()
+    spread = (reach / (z - reach).clamp(min=near) * (1 + slope) * float(camera.K[0, 0] + camera.K[1, 1]) + 12).numpy()
+    xy = centers.numpy()
+    low = np.clip(np.floor(xy - spread[:, None]), 0, [width, height]).astype(np.int64)
+    high = np.clip(np.ceil(xy + spread[:, None]), 0, [width, height]).astype(np.int64)
+    sides = np.where((depths.numpy() > near)[:, None], np.maximum(high - low, 0), 0)
+    areas = sides.prod(axis=1)
+    found: list[tuple[Tensor, Tensor]] = []
+    cuts = [0, *(np.flatnonzero(np.diff(np.cumsum(areas) // 4_000_000)) + 1), len(areas)]
+    for begin, end in itertools.pairwise(cuts):
+        ids = np.repeat(np.arange(begin, end), areas[begin:end])
+        starts = np.repeat(np.cumsum(areas[begin:end]) - areas[begin:end], areas[begin:end])
+        offset = np.arange(len(ids)) - starts
+        x = low[ids, 0] + offset % np.maximum(sides[ids, 0], 1)
+        y = low[ids, 1] + offset // np.maximum(sides[ids, 0], 1)
+        i, px, py = torch.from_numpy(ids), torch.from_numpy(x + 0.5), torch.from_numpy(y + 0.5)
+        dx, dy = px - centers[i, 0], py - centers[i, 1]
+        if splats.kind == "3d":
+            a, b, d = table[i].unbind(-1)
+            rho = a * dx * dx + 2 * b * dx * dy + d * dy * dy
+        else:
+            M = table[i]
+            cross = torch.linalg.cross(M[:, 2] * px[:, None] - M[:, 0], M[:, 2] * py[:, None] - M[:, 1])
+            uv = cross[:, :2] / cross[:, 2:]
+            rho = torch.minimum((uv * uv).sum(-1), 2 * (dx * dx + dy * dy))
+        keep = opacities[i] * torch.exp(-0.5 * rho) >= constants.ALPHA_MIN
+        found.append((i[keep], torch.from_numpy(y * width + x)[keep]))
+    ids_all = torch.cat([f[0] for f in found])
+    pixels = torch.cat([f[1] for f in found])
+    order = torch.argsort(pixels * len(depths) + rank[ids_all])
+    return ids_all[order], pixels[order]

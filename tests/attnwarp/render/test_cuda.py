@@ -1,0 +1,70 @@
+"""The GPU backend without a GPU: what it refuses, and how it makes the outputs from composited features."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from attnwarp.render import api, constants, cuda, reference, render
+
+
+def prepared(splats, camera, depth: str = "center") -> reference.Inputs:
+    ndc = (constants.NDC_NEAR, constants.NDC_FAR)
+    return api._prepare(splats, camera, depth, None, None, None, constants.NEAR, None, None, ndc, on_cpu=False)
+
+
+def brute_force(inputs: reference.Inputs, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Stands in for gsplat's kernels: the definition, compositing the same features over nothing."""
+    zero = torch.zeros(features.shape[1], dtype=torch.float64)
+    swapped = dataclasses.replace(inputs, values=features.double(), harmonic=False, background=zero)
+    view = reference.render(swapped)
+    return view.color, view.alpha
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_outputs_are_made_from_composited_features(kind, make_camera, make_splats) -> None:
+    camera = make_camera(3, 18, 14)
+    splats = make_splats(3, kind, 30, camera)
+    splats = splats.select(torch.tensor([i for i in range(30) if i not in (0, 1, 7)]))
+    inputs = prepared(splats, camera)
+    made, expected = cuda.composite(inputs, brute_force), reference.render(inputs)
+    for name in ("color", "alpha", "depth", "normal", "distortion_l2_ndc", "weight"):
+        a, b = getattr(made, name).detach(), getattr(expected, name)
+        assert torch.equal(a.isnan(), b.isnan()), name
+        # Features pass through float32, as on the GPU.
+        assert float((a - b).abs().nan_to_num().max()) < 1e-5, name
+    assert bool(made.median_depth.isnan().all()) and bool(made.distortion_l1.isnan().all())
+
+
+def test_what_gsplat_computes_differently_is_refused(make_camera, make_splats, monkeypatch) -> None:
+    camera = make_camera(3, 8, 8)
+    flat, solid = make_splats(3, "2d", 5, camera), make_splats(3, "3d", 5, camera)
+    monkeypatch.delenv(cuda.ACCEPT_2D, raising=False)
+    with pytest.raises(ValueError, match="depth: got 'intersection', but gsplat knows the depth of a splat's centre"):
+        render(flat, camera, backend="cuda")
+    with pytest.raises(ValueError, match="depth: got 'peak'"):
+        render(solid, camera, backend="cuda", depth="peak")
+    with pytest.raises(ValueError, match=f"{cuda.ACCEPT_2D}=1"):
+        render(flat, camera, backend="cuda", depth="center")
+    monkeypatch.setenv(cuda.ACCEPT_2D, "1")
+    cuda.refuse(prepared(flat, camera))
+    cuda.refuse(prepared(solid, camera))
+
+
+def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> None:
+    camera = make_camera(3, 8, 8)
+    solid = make_splats(3, "3d", 5, camera)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; use backend 'cpu'"):
+        render(solid, camera, backend="cuda", depth="center")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(cuda.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(RuntimeError, match="needs gsplat"):
+        render(solid, camera, backend="cuda", depth="center")
+
+
+def test_auto_is_the_cpu_for_splats_in_main_memory(make_camera, make_splats) -> None:
+    camera = make_camera(3, 8, 8)
+    assert render(make_splats(3, "2d", 5, camera), camera).backend == "cpu"
