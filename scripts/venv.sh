@@ -55,7 +55,31 @@ make_venv() {
     exit 2
 }
 
+# Shared libraries that Open3D and Mitsuba link to without carrying them, by the Debian package that has each. Nothing is
+# drawn with the graphics ones here; the libraries only have to load.
+declare -A libraries=(
+    [libEGL.so.1]=libegl1 [libGL.so.1]=libgl1 [libX11.so.6]=libx11-6 [libatomic.so.1]=libatomic1 [libgomp.so.1]=libgomp1
+)
+
+install_libraries() {
+    local missing=()
+    for library in "${!libraries[@]}"; do
+        "$python" -c "import ctypes; ctypes.CDLL('$library')" 2>/dev/null || missing+=("${libraries[$library]}")
+    done
+    [ ${#missing[@]} = 0 ] && return
+    if command -v apt-get >/dev/null 2>&1; then
+        say "attnwarp: installing the shared libraries that Open3D and Mitsuba need: ${missing[*]}"
+        if as_root apt-get update -qq && as_root apt-get install -y -qq --no-install-recommends "${missing[@]}" >&2; then
+            return
+        fi
+    fi
+    say "attnwarp: Open3D and Mitsuba need shared libraries that this machine lacks; install them, then run this again"
+    say "  Debian, Ubuntu: sudo apt-get install ${missing[*]}"
+    exit 2
+}
+
 python=$(find_python)
+install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 say "attnwarp: installing the tested versions into $venv (a few minutes the first time)"
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.

@@ -13,6 +13,7 @@ import torch
 
 from attnwarp.settings import PRESETS, WarpSettings
 from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
+from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval import checks
 from attnwarp_eval.ablation.cell import Cell
 from attnwarp_eval.ablation.store import write_atomic
@@ -25,8 +26,8 @@ Figures = dict[str, float]
 View = tuple[str, Figures, dict[str, Any]]
 """A target's name, its figures, and what its pictures are drawn from."""
 
-EXACT = dataclasses.replace(PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE)
-"""The corrected rules with the tolerance for exact depth: what the instrument is calibrated with."""
+EXACT = dataclasses.replace(PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)
+"""The corrected rules with the tolerances for exact depth: what the instrument is calibrated with."""
 
 
 def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:

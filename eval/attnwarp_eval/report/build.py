@@ -121,8 +121,8 @@ def _claims(results: Results) -> Section:
         return section
     section.text = [
         "A claim that does not hold on these scenes is a result, not an error. **Here** speaks of these scenes alone: "
-        "`seen` when the difference has the expected sign in every scene, with the views that agree beside it. **In general** "
-        "speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot settle it.",
+        "`seen` when the difference has the expected sign in every scene, with the views that agree beside it. **In "
+        "general** speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot settle it.",
     ]
     columns = ["claim", "metric", "measured", "difference", "views that agree", "here", "in general"]
     section.tables = [Table(columns, rows)]
