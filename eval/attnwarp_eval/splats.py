@@ -68,8 +68,8 @@ def surface_splats(
             that of the undisturbed point.
         normal_noise: standard deviation of a tilt about each of the two tangents, in degrees.
         seed: of the sampling and the noise; the noise of one seed does not change the sampling.
-        size: standard deviation of a splat in its plane, in local spacings. 0.6 covers a plane with alpha above 0.98
-            everywhere.
+        size: standard deviation of a splat in its plane, in local spacings. At 0.6 a surface has a median alpha of
+            0.97 to 0.98 and 0.80 at its thinnest percentile, at 0.7 0.99 and 0.92, with wider fringes at outlines.
         thickness: the third standard deviation of "3d" splats, in local spacings.
         opacity: of every splat.
         focus: the radius about the scene's centre, in scene units, within which points are about equally dense;
