@@ -2,12 +2,13 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 RUN ?= runs/demo
+JOBS ?= $(shell nproc)
 
 .PHONY: demo test test-all bench lint venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo: venv
-	$(BIN)/attnwarp-eval run quick --out $(RUN)
+	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
 ## lint, types and the tests that fit in a coffee break
 test: lint

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,12 @@ from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth.shading import sky_radiance
 
 if TYPE_CHECKING:
+    from attnwarp.fit import Fit, FitSettings, Step
+    from attnwarp.gaussians import Gaussians
     from attnwarp.io import Dataset
+    from attnwarp.settings import WarpSettings
+    from attnwarp.visibility import Surface
+    from attnwarp_eval.truth import Hits
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str], object]
@@ -76,7 +81,7 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
         z = low + (high - low) * (2 * k % RINGS) / (RINGS - 1)
         x = spec.look_at[0] + spec.radius * math.cos(yaw)
         y = spec.look_at[1] + spec.radius * math.sin(yaw)
-        name = f"view_{k:03d}"
+        name = orbit_name(k, count)
         camera = Camera.look_at((x, y, z), spec.look_at, width=width, height=height, fov_y=spec.fov, name=name)
         for solid, owner in solids:
             if solid.contains(camera.position):
@@ -86,9 +91,19 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
     return cameras
 
 
+def orbit_name(index: int, count: int) -> str:
+    """Name of a camera of :func:`orbit`."""
+    return f"orbit_{index:03d}_of_{count}"
+
+
 def held_out(count: int) -> list[bool]:
     """Whether each of ``count`` views is held out: the first of every eight."""
     return [k % HELD_OUT_EVERY == 0 for k in range(count)]
+
+
+def held_out_names(count: int) -> list[str]:
+    """Names of the cameras of :func:`orbit` that are held out."""
+    return [orbit_name(k, count) for k, out in enumerate(held_out(count)) if out]
 
 
 def first_points(
@@ -129,6 +144,84 @@ def first_points(
 def picture(scene: Scene, camera: Camera, spp: int) -> npt.NDArray[np.uint8]:
     """(H, W, 3) uint8 sRGB truth of a view, rounded as an 8-bit file would have it."""
     return np.round(255 * to_srgb(appearance(scene, camera, spp=spp))).astype(np.uint8)
+
+
+def fit_scene(
+    scene: Scene,
+    settings: FitSettings,
+    folder: str | os.PathLike[str],
+    *,
+    views: int = 64,
+    spp: int = 16,
+    points: int = 5000,
+    noise: float = 0.5,
+    seed: int = 0,
+    geometry: Geometry | None = None,
+    watch: Callable[[Step], object] | None = None,
+) -> Fit:
+    """Fit splats to a scene's true pictures; the curve of the fit has the errors of depth and normals in it.
+
+    Both kinds begin with the same points. The errors of the curve are means over the held-out views of
+    ``depth.abs_rel`` and ``depth.normal_median`` of the median depth, by intersection for 2D splats and at the
+    ray's peak for 3D ones.
+
+    Args:
+        scene: with the image size that the fit is to have.
+        settings: what is fitted and how.
+        folder: where the fit is kept; one that was stopped there is gone on with.
+        views, spp, points, noise, seed: see :func:`export`.
+        geometry: ``Geometry(scene)``, if there is one already.
+        watch: as in :func:`attnwarp.fit.fit`.
+    """
+    from attnwarp.fit import Views, fit, from_points
+
+    geometry = Geometry(scene) if geometry is None else geometry
+    cloud = first_points(scene, points, noise=noise, seed=seed, geometry=geometry)
+    start = from_points(cloud.points, cloud.colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
+    cameras = orbit(scene, views)
+    images = [picture(scene, camera, spp) for camera in cameras]
+    out = held_out(views)
+    parts = [
+        Views([c for c, o in zip(cameras, out, strict=True) if o == side],
+              [i for i, o in zip(images, out, strict=True) if o == side])
+        for side in (False, True)
+    ]  # fmt: skip
+    truth = [geometry.trace(camera) for camera in parts[1].cameras]
+
+    def errors(splats: Gaussians) -> dict[str, float]:
+        found = [surface_error(splats, camera, hits)[1] for camera, hits in zip(parts[1].cameras, truth, strict=True)]
+        return {
+            name: float(np.mean([each[name] for each in found])) for name in ("depth.abs_rel", "depth.normal_median")
+        }
+
+    return fit(start, parts[0], settings, held_out=parts[1], folder=folder, measure=errors, watch=watch)
+
+
+def surface_error(
+    splats: Gaussians, camera: Camera, truth: Hits, settings: WarpSettings | None = None, edge: Any = None
+) -> tuple[Surface, dict[str, float]]:
+    """What a camera sees of splats, and its errors of depth and normals; median depth if nothing else is asked for."""
+    from attnwarp.settings import WarpSettings as Defaults
+    from attnwarp.visibility import render_surface
+    from attnwarp_eval import checks
+
+    surface = render_surface(splats, camera, settings or Defaults(depth_statistic="median"))
+    figures = checks.depth.depth_error(
+        surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
+    )
+    return surface, figures
+
+
+def picture_error(image: npt.NDArray[Any], true_image: npt.NDArray[np.uint8]) -> dict[str, float]:
+    """``fit.psnr``, ``fit.mse`` and ``fit.ssim`` of a (H, W, 3) sRGB picture in [0, 1] against its 8-bit truth."""
+    import torch
+
+    from attnwarp import losses
+
+    ours = torch.from_numpy(np.clip(np.asarray(image, dtype=np.float64), 0, 1))
+    truth = torch.from_numpy(true_image.astype(np.float64) / 255)
+    error = float((ours - truth).square().mean())
+    return {"fit.psnr": losses.psnr_of_mse(error), "fit.mse": error, "fit.ssim": float(losses.ssim(ours, truth))}
 
 
 def export(

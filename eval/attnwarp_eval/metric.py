@@ -18,8 +18,8 @@ class Metric:
     Attributes:
         name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
-        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "share" (of 1), "ratio" or "pixels" (a
-            count).
+        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "share" (of 1), "ratio" or "pixels"
+            (a count).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -79,6 +79,9 @@ _SPECS = (
     Metric("occlusion.empty_accepted", "pixels", "none", 0, 0, "pixels without a surface accepted"),
     Metric("occlusion.ambiguous_accepted", "pixels", "none", 0, 0, "ambiguous pixels accepted, not scored"),
     Metric("occlusion.ambiguous_rejected", "pixels", "none", 0, 0, "ambiguous pixels rejected, not scored"),
+    Metric("fit.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of a view held out from the fit"),
+    Metric("fit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of a view held out from the fit"),
+    Metric("fit.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of a view held out from the fit (11 x 11, sigma 1.5)"),
     Metric("depth.abs_rel", "ratio", "lower", 1e-5, 1e-2, "mean of |z - z*| / z*"),
     Metric("depth.rmse", "scene", "lower", 1e-5, 1e-2, "root mean square of z - z*"),
     Metric("depth.bias", "scene", "zero", 1e-5, 1e-2, "mean of z - z*; negative is toward the camera"),

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from attnwarp_eval import checks
-from attnwarp_eval.features import SolidField
-from attnwarp_eval.scene import load_scene
-from attnwarp_eval.truth import Geometry, two_view
 
 from attnwarp.settings import PRESETS, preset
 from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, warp_surfaces
 from attnwarp.warp import TAP_SPREAD
+from attnwarp_eval import checks
+from attnwarp_eval.features import SolidField
+from attnwarp_eval.scene import load_scene
+from attnwarp_eval.truth import Geometry, two_view
 
 SIZE = 128
 EXACT = preset("corrected", depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from attnwarp_eval import checks
 
 

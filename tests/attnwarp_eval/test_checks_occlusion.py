@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from attnwarp_eval import checks
 from attnwarp_eval.checks.occlusion import AMBIGUOUS, COUNTS, HIDDEN, NONE, VISIBLE
 

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from attnwarp_eval import checks
-from attnwarp_eval.features import SolidField
-from attnwarp_eval.metric import METRICS, metric
 from scipy import fft
 
 from attnwarp import Camera
 from attnwarp.warp import correspond, correspond_at, sample
+from attnwarp_eval import checks
+from attnwarp_eval.features import SolidField
+from attnwarp_eval.metric import METRICS, metric
 
 
 def test_endpoint_error_of_a_case_by_hand():

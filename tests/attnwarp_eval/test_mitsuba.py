@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+
+from attnwarp.camera import Camera
 from attnwarp_eval.scene import Scene, SceneSpec, load_scene
 from attnwarp_eval.textures import linear_rgb
 from attnwarp_eval.truth import Geometry, appearance, plan_rendering
 from attnwarp_eval.truth import mitsuba as renderer
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
-
-from attnwarp.camera import Camera
 
 
 def world(lights, objects=None, **appearance_):

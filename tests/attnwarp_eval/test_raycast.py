@@ -3,11 +3,11 @@
 import mpmath
 import numpy as np
 import pytest
+
+from attnwarp.camera import Camera
 from attnwarp_eval.shapes import Box, Ellipsoid, Mesh, Rectangle, Sphere, mesh_body
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.analytic import nearest_hit
-
-from attnwarp.camera import Camera
 
 GROUND = Rectangle(np.zeros(3), np.array([8.0, 0, 0]), np.array([0, 8.0, 0]))
 

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from attnwarp_eval.scene import Scene, SceneError, list_scenes, load_scene
 from attnwarp_eval.shapes import MeshNotice
 from attnwarp_eval.truth import Geometry, two_view

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+
 from attnwarp_eval import cache
 from attnwarp_eval.shapes import Box, Capsule, Ellipsoid, Mesh, MeshNotice, Sphere, body_distance, mesh_body, read_mesh
 

@@ -1,13 +1,14 @@
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
+
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene import load_scene
 from attnwarp_eval.shapes import Box, Rectangle, Sphere
 from attnwarp_eval.splats import quaternions_from_normals, sample_surface, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band
 from attnwarp_eval.truth.shading import buried, frames
-from scipy.spatial import cKDTree
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 import pytest
-from attnwarp_eval.statistics import agreement, benjamini_hochberg, front, interval, paired, verdict
 from scipy import stats
+
+from attnwarp_eval.statistics import agreement, benjamini_hochberg, front, interval, paired, verdict
 
 
 def test_mean_is_over_scenes_so_a_scene_with_many_views_does_not_outvote_the_others():

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from skimage import color as skimage_color
+
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.textures import Bricks, Checker, Noise, Plain, Stripes, albedo, fractal_noise, linear_rgb
-from skimage import color as skimage_color
 
 
 def test_the_srgb_curve_is_the_one_of_the_standard():

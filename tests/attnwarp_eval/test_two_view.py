@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+
+from attnwarp.camera import Camera
 from attnwarp_eval.scene import load_scene
 from attnwarp_eval.shapes import Box, Capsule, Ellipsoid, Rectangle, Sphere, mesh_body
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Geometry, edge_band, two_view
-
-from attnwarp.camera import Camera
 
 GROUND = Rectangle(np.zeros(3), np.array([4.0, 0, 0]), np.array([0, 4.0, 0]), object_id=0)
 

@@ -9,13 +9,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
+from attnwarp.fit import FitSettings
 from attnwarp.settings import PRESETS, WarpSettings
 from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
 from attnwarp.warp import TAP_SPREAD
-from attnwarp_eval import checks
-from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval import checks, fitting
+from attnwarp_eval.ablation.cell import Cell, digest
 from attnwarp_eval.ablation.store import write_atomic
 from attnwarp_eval.ablation.study import Splats
 from attnwarp_eval.ablation.world import World, splats, world
@@ -49,8 +51,12 @@ def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
     with meter.stage("setup"):
         at = world(scene, spec["size"])
     views, pictures = [], []
-    probe = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe]
-    for name, figures, shown in probe(at, scene, spec, meter):
+    curve: list[dict[str, Any]] = []
+    if cell.probe == "fit":
+        found = _fit(at, spec, meter, root, curve)
+    else:
+        found = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe](at, scene, spec, meter)
+    for name, figures, shown in found:
         views.append({"view": name, "yaw": at.yaw[name], "metrics": _plain(figures)})
         if name in cell.pictures:
             with meter.stage("pictures"):
@@ -60,6 +66,7 @@ def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
         "spec": spec,
         "views": views,
         "pictures": pictures,
+        **({"curve": curve} if curve else {}),
         "cost": {
             "seconds": meter.seconds(),
             "counters": dict(sorted(meter.counters.items())),
@@ -147,6 +154,52 @@ def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator
         yield name, figures, {"truth": truth, "view": view, "spp": spp}
 
 
+def _fit(at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[dict[str, Any]]) -> Iterator[View]:
+    """Splats fitted to true pictures, on views held out: pictures, depth and normals; and the curve of the fit.
+
+    The fit lies below the run's folder, named by what decides it: cells that measure the same one in another way share
+    it, and one that was cut short is gone on with.
+    """
+    how = spec["fit"]
+    decisive = {**how, "scene": spec["scene"], "size": spec["size"], "spp": spec["spp"], "seed": spec["seed"]}
+    with meter.stage("truth"):
+        cameras = {c.name: c for c in fitting.orbit(at.scene, how["views"]) if c.name in spec["views"]}
+    for camera in cameras.values():
+        at.add(camera)
+    # Its seconds go into the curve, which holds them for fits of earlier sittings as well.
+    result = fitting.fit_scene(
+        at.scene,
+        FitSettings.from_dict(how["settings"]),
+        root / "fits" / digest(decisive)[:16],
+        views=how["views"],
+        spp=spec["spp"],
+        points=how["points"],
+        noise=how["noise"],
+        seed=spec["seed"],
+        geometry=at.geometry,
+    )
+    for record in result.history:
+        known = {"loss": record.loss, "psnr": record.psnr, "psnr_pooled": record.psnr_pooled}
+        defined = _plain({name: math.nan if value is None else value for name, value in known.items()})
+        curve.append({**dataclasses.asdict(record), **defined, "measures": _plain(record.measures)})
+    meter.count(iterations=result.iteration, splats=len(result.gaussians))
+    settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
+    for name, camera in cameras.items():
+        with meter.view():
+            surface = render_surface(result.gaussians, camera, settings)
+        with meter.stage("truth"):
+            truth = at.geometry.trace(camera)
+            image = fitting.picture(at.scene, camera, spec["spp"])
+            edge = at.edge(name)
+        meter.count(pixels=camera.width * camera.height, **surface.counters)
+        with meter.stage("checks"):
+            figures = fitting.picture_error(np.asarray(surface.image), image)
+            figures |= checks.depth.depth_error(
+                surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
+            )
+        yield name, figures, {"fitted": surface, "hits": truth, "image": image}
+
+
 def _warp_truth(at: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:
     source = at.geometry.trace(truth.source)
     return warp_surfaces(
@@ -188,7 +241,7 @@ def _warp_figures(at: World, spec: dict[str, Any], name: str, view: WarpedView, 
 def _save_pictures(cell: Cell, name: str, at: World, shown: dict[str, Any], root: Path) -> list[dict[str, str]]:
     from attnwarp_eval.report import pictures
 
-    found = pictures.of(at, name, **shown)
+    found = pictures.of_fit(**shown) if "fitted" in shown else pictures.of(at, name, **shown)
     saved = []
     for what, data in found.items():
         path = Path("pictures") / cell.id[:16] / f"{name}-{what}.jpg"

@@ -14,13 +14,14 @@ from attnwarp_eval.ablation.cell import Cell
 from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
+    from attnwarp.fit import FitSettings
     from attnwarp.settings import WarpSettings
     from attnwarp_eval.scene import Scene
 
-PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1}
+PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1}
 """Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get new ids."""
 
-ProbeName = Literal["calibration", "depth", "warp"]
+ProbeName = Literal["calibration", "depth", "warp", "fit"]
 
 
 class StudyError(InputError):
@@ -45,13 +46,26 @@ class Splats(_Model):
         return value.lower() if isinstance(value, str) else value
 
 
+class Fits(_Model):
+    """Splats fitted to true pictures from all around the scene; the ``fit`` probe measures them on views held out."""
+
+    views: Annotated[int, Field(ge=9, le=10_000)] = 64
+    points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
+    noise: Annotated[float, Field(ge=0)] = 0.5
+    settings: dict[str, Any] = Field(default_factory=dict, description="fields of attnwarp.fit.FitSettings")
+
+
 class Variant(_Model):
-    """One row of a table: where depth comes from, and how the warp is made."""
+    """One row of a table: where depth comes from, and how the warp is made.
+
+    ``fit`` changes fields of the study's fit settings; only the ``fit`` probe reads it.
+    """
 
     preset: str = "corrected"
     set: dict[str, Any] = Field(default_factory=dict)
     geometry: Literal["splats", "truth"] = "splats"
     splats: dict[str, Any] = Field(default_factory=dict)
+    fit: dict[str, Any] = Field(default_factory=dict)
 
     def settings(self) -> WarpSettings:
         """The preset with this variant's own fields."""
@@ -66,7 +80,7 @@ class Ablation(_Model):
     """A table of the report: variants against a baseline, paired on scene and view."""
 
     title: str
-    probe: Literal["depth", "warp"] = "warp"
+    probe: Literal["depth", "warp", "fit"] = "warp"
     baseline: str
     variants: list[str]
     note: str = ""
@@ -76,7 +90,7 @@ class Front(_Model):
     """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants."""
 
     title: str
-    probe: Literal["depth", "warp"] = "warp"
+    probe: Literal["depth", "warp", "fit"] = "warp"
     metric: str
     variants: list[str]
 
@@ -108,6 +122,7 @@ class Study(_Model):
     feature_sizes: Annotated[list[int], Field(min_length=1)] = [512, 64, 32]
     feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
     splats: Splats = Splats()
+    fit: Fits = Fits()
     variants: Annotated[dict[str, Variant], Field(min_length=1)]
     probes: Annotated[dict[ProbeName, list[str]], Field(min_length=1)]
     ablations: list[Ablation] = Field(default_factory=list)
@@ -121,6 +136,8 @@ class Study(_Model):
             try:
                 variant.settings()
                 self.splats_of(variant)
+                if "fit" in self.probes or variant.fit or self.fit.settings:
+                    self.fit_of(variant, 0)
             except ValidationError as error:
                 raise ValueError(f"variants.{name}.splats: {explain(error, Splats)}") from None
             except ValueError as error:
@@ -142,6 +159,12 @@ class Study(_Model):
         """The study's splats with the variant's own fields."""
         return Splats.model_validate({**self.splats.model_dump(), **variant.splats})
 
+    def fit_of(self, variant: Variant, seed: int) -> FitSettings:
+        """The study's fit settings with the variant's own fields."""
+        from attnwarp.fit import FitSettings
+
+        return FitSettings.from_dict({**self.fit.settings, **variant.fit, "seed": seed})
+
     def cells(self, scenes: dict[str, Scene]) -> list[Cell]:
         """Every cell of the study, scene by scene; variants of the same content share one.
 
@@ -155,11 +178,11 @@ class Study(_Model):
         for scene_name in self.scenes:
             scene = scenes[scene_name]
             views = self._views_of(scene)
-            shown = tuple(v for v in self.pictures.views if v in views)
             for probe, names in self.probes.items():
                 for name in names:
                     for seed in self.seeds:
                         spec = self._spec(scene, views, probe, self.variants[name], seed)
+                        shown = tuple(v for v in self.pictures.views if v in spec["views"])
                         pictures = shown if name in self.pictures.variants or probe == "calibration" else ()
                         cell = Cell(spec, scene_name, name, probe, seed, (name,), pictures)
                         if cell.id in found:
@@ -201,6 +224,12 @@ class Study(_Model):
                 "feature_channels": self.feature_channels,
                 "spp": self.spp,
             }
+        if probe == "fit":
+            from attnwarp_eval.fitting import held_out_names
+
+            how = {**self.fit.model_dump(), "settings": self.fit_of(variant, seed).to_dict()}
+            depth = {name: settings[name] for name in ("depth", "depth_statistic")}
+            return {**spec, "views": held_out_names(self.fit.views), "spp": self.spp, "fit": how, **depth}
         if variant.geometry == "truth":
             spec["geometry"] = "truth"
         else:
@@ -271,6 +300,7 @@ def explain(error: ValidationError, model: type[BaseModel] = Study) -> str:
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     inner: dict[str, type[BaseModel]] = {
         "splats": Splats,
+        "fit": Fits,
         "variants": Variant,
         "ablations": Ablation,
         "fronts": Front,

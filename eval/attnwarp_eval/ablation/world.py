@@ -50,6 +50,13 @@ class World:
         self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
 
+    def add(self, camera: Camera) -> None:
+        """Make a further camera known by its name, as the scene's own are."""
+        to_here, to_source = (c.position[:2] - self.scene.center[:2] for c in (camera, self.source))
+        cosine = to_here @ to_source / (np.linalg.norm(to_here) * np.linalg.norm(to_source))
+        self.targets[camera.name] = camera
+        self.yaw[camera.name] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
     def camera(self, name: str) -> Camera:
         """The source ("source") or a target by its name."""
         return self.source if name == self.source.name else self.targets[name]
@@ -85,7 +92,7 @@ def world(scene: str, size: int) -> World:
     return World(load_scene(scene).with_size(size, size))
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
     """Gaussians on a scene's surfaces; the last few are kept."""
     from attnwarp_eval.splats import surface_splats

@@ -11,6 +11,7 @@ from attnwarp_eval.checks import metric as metric_of
 from attnwarp_eval.checks.occlusion import by_yaw
 from attnwarp_eval.report import figures
 from attnwarp_eval.report.claims import judge, load_claims
+from attnwarp_eval.report.fits import fits
 from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
@@ -38,9 +39,22 @@ DEPTH_COLUMNS = {
     "delta < 1.25": "depth.delta_1_25",
     "normal, deg": "depth.normal_median",
 }
+FIT_COLUMNS = {
+    "PSNR, dB": "fit.psnr",
+    "SSIM": "fit.ssim",
+    "AbsRel": "depth.abs_rel",
+    "AbsRel inside": "depth.abs_rel.interior",
+    "AbsRel at edges": "depth.abs_rel.edge",
+    "bias inside": "depth.bias_relative.interior",
+    "delta < 1.01": "depth.delta_1_01",
+    "normal, deg": "depth.normal_median",
+    "normal inside, deg": "depth.normal_median.interior",
+}
+COLUMNS = {"warp": WARP_COLUMNS, "depth": DEPTH_COLUMNS, "fit": FIT_COLUMNS}
 CONTRASTS = {
     "warp": ["warp.epe_median_layer.64", "warp.feature_all_accepted.64", "occlusion.precision", "occlusion.recall"],
     "depth": ["depth.abs_rel", "depth.abs_rel.interior", "depth.normal_median"],
+    "fit": ["fit.psnr", "fit.ssim", "depth.abs_rel", "depth.abs_rel.interior", "depth.normal_median"],
 }
 
 
@@ -88,6 +102,7 @@ def build(results: Results, root: Path, *, timings: bool = True) -> Report:
         _claims(results),
         _calibration(results),
         *_ablations(results),
+        *fits(results, root, number, timings=timings),
         *_yaw(results, root),
         *_fronts(results, root, timings),
         *_galleries(results),
@@ -122,7 +137,8 @@ def _claims(results: Results) -> Section:
     section.text = [
         "A claim that does not hold on these scenes is a result, not an error. **Here** speaks of these scenes alone: "
         "`seen` when the difference has the expected sign in every scene, with the views that agree beside it. **In "
-        "general** speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot settle it.",
+        "general** speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot "
+        "settle it.",
     ]
     columns = ["claim", "metric", "measured", "difference", "views that agree", "here", "in general"]
     section.tables = [Table(columns, rows)]
@@ -177,7 +193,7 @@ def _ablations(results: Results) -> list[Section]:
         names = [n for n in names if results.records(probe, n)]
         if not names:
             continue
-        columns = WARP_COLUMNS if probe == "warp" else DEPTH_COLUMNS
+        columns = COLUMNS[probe]
         rows = []
         for name in names:
             work = results.counters(probe, name)
@@ -305,7 +321,7 @@ def _galleries(results: Results) -> list[Section]:
         rows.append((f"**{scene}, {view}**", [Picture(p["path"], p["what"]) for p in first if p]))
         for label in dict.fromkeys(label for _, label, _ in found):
             own = {p["what"]: p for _, other, p in found if other == label}
-            wanted = [what for what in ("warped", "mask", "endpoint-error", "depth-error") if what in own]
+            wanted = [what for what in ("warped", "mask", "endpoint-error", "render", "depth-error") if what in own]
             rows.append((label, [Picture(own[what]["path"], what.replace("-", " ")) for what in wanted]))
     legend = "; ".join(f"{colour} {name}" for name, (colour, _) in CLASSES.items())
     text = [

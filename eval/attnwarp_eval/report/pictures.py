@@ -11,7 +11,7 @@ import torch
 from attnwarp.visibility import Surface, WarpedView
 from attnwarp.warp import sample
 from attnwarp_eval.checks.occlusion import AMBIGUOUS, HIDDEN, NONE, VISIBLE
-from attnwarp_eval.truth import TwoView
+from attnwarp_eval.truth import Hits, TwoView
 
 if TYPE_CHECKING:
     from attnwarp_eval.ablation.world import World
@@ -62,8 +62,19 @@ def of(at: World, name: str, *, truth: TwoView, spp: int | None = None, view: Wa
             "endpoint-error": endpoint_map(view.correspondence.xy.numpy(), truth),
         }
     if surface is not None:
-        found["depth-error"] = depth_map(np.asarray(surface.depth, dtype=np.float64), truth)
+        found["depth-error"] = depth_map(np.asarray(surface.depth, dtype=np.float64), truth.hits)
     return {what: jpeg(image) for what, image in found.items()}
+
+
+def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
+    """JPEG files of a view held out from a fit: its truth, what the splats show there, and their depth's error."""
+    depth = np.asarray(fitted.depth, dtype=np.float64)
+    found: dict[str, Image] = {
+        "target": image.astype(np.float32) / 255,
+        "render": np.asarray(fitted.image, dtype=np.float32),
+        "depth-error": depth_map(depth, hits),
+    }
+    return {what: jpeg(picture) for what, picture in found.items()}
 
 
 def jpeg(image: Image) -> bytes:
@@ -135,12 +146,12 @@ def endpoint_map(xy: npt.NDArray[np.float64], truth: TwoView) -> Image:
     return np.where(truth.visible[..., None], image, 0.85).astype(np.float32)
 
 
-def depth_map(depth: npt.NDArray[np.float64], truth: TwoView) -> Image:
+def depth_map(depth: npt.NDArray[np.float64], truth: Hits) -> Image:
     """Signed relative depth error: blue too near, red too far, grey no surface, black no depth."""
     import matplotlib
 
     with np.errstate(invalid="ignore"):
-        error = (depth - truth.hits.depth) / truth.hits.depth
+        error = (depth - truth.depth) / truth.depth
     image = matplotlib.colormaps["RdBu_r"](np.clip(0.5 + 0.5 * np.nan_to_num(error) / DEPTH_RANGE, 0, 1))[..., :3]
     image = np.where(np.isfinite(error)[..., None], image, 0.0)
-    return np.where(truth.hits.valid[..., None], image, 0.7).astype(np.float32)
+    return np.where(truth.valid[..., None], image, 0.7).astype(np.float32)

@@ -8,6 +8,7 @@ import signal
 import time
 
 import pytest
+
 from attnwarp_eval.ablation.cell import Cell, canonical_json
 from attnwarp_eval.ablation.store import Store, StoreError, write_atomic
 

@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+
 from attnwarp_eval.ablation import StudyError, load_study
 from attnwarp_eval.ablation.study import shipped_studies
 from attnwarp_eval.scene import load_scene
