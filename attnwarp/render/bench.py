@@ -1,0 +1,237 @@
+"""How fast splats are rendered on this machine: ``python -m attnwarp.render.bench`` (``make bench``).
+
+One process. The cases take turns, round after round, so that a slow moment of the machine falls on all of them; the
+median over rounds is reported, with the fastest beside it. The machine's own peak is measured in the same rounds:
+independent fused multiply-adds in registers, on as many threads as the renderer uses.
+
+A splat-pixel pair counts as 45 floating-point operations (an intersection, a Gaussian, and the sums of colour, normal,
+depth and distortion). Pairs are those evaluated, 64 for each splat of a tile, whether drawn or not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render.api import render
+
+FLOPS_PER_PAIR = 45
+
+
+@dataclass
+class Case:
+    """One picture to be timed: kind, image size, number of splats, largest sigma; and what was measured."""
+
+    kind: str
+    size: int
+    splats: int
+    sigma: float
+    forward: list[float] = field(default_factory=list)
+    both: list[float] = field(default_factory=list)
+    peak: list[float] = field(default_factory=list)
+    counters: dict[str, int] = field(default_factory=dict)
+    gsplat_seconds: float | None = None
+
+    @property
+    def name(self) -> str:
+        """For the table."""
+        return f"{self.kind} {self.size} {self.splats // 1000}k {self.sigma:g}"
+
+
+def scene(kind: str, count: int, sigma: float, seed: int = 0) -> Gaussians:
+    """Random splats in a unit ball: sigmas uniform up to ``sigma``, opacities uniform in [0, 1], degree 0 colours."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.randn(count, 3, generator=generator)
+    means = means / means.norm(dim=1, keepdim=True) * torch.rand(count, 1, generator=generator) ** (1 / 3)
+    scales = torch.rand(count, 2 if kind == "2d" else 3, generator=generator) * 0.95 * sigma + 0.05 * sigma
+    return Gaussians(
+        "2d" if kind == "2d" else "3d",
+        means,
+        torch.randn(count, 4, generator=generator),
+        scales,
+        torch.rand(count, generator=generator),
+        torch.randn(count, 1, 3, generator=generator) * 0.3,
+    )
+
+
+def camera(size: int) -> Camera:
+    """At distance 3 from the ball's middle, which fills the picture."""
+    return Camera.look_at([0, -3, 0], [0, 0, 0], width=size, height=size, fov_y=42)
+
+
+def measure_peak(threads: int, milliseconds: float = 15) -> float:
+    """Floating-point operations a second in independent fused multiply-adds held in registers, on ``threads``
+    threads."""
+    from attnwarp.render import _peak, _threads
+
+    operations = 2.0 * _peak.LANES * 64
+    rounds = int(milliseconds * 1e-3 * 2e11 / operations)
+    jobs = [(rounds, np.empty(1, np.float32)) for _ in range(threads)]
+    _peak.multiply_add(1, jobs[0][1])
+    start = time.perf_counter()
+    _threads.run(_peak.multiply_add, jobs)
+    return operations * rounds * threads / (time.perf_counter() - start)
+
+
+def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
+    """One forward, one forward with backward, one measure of the peak."""
+    start = time.perf_counter()
+    result = render(splats, view, backend="cpu")
+    case.forward.append(time.perf_counter() - start)
+    case.counters = result.counters
+    names = ("means", "quats", "scales", "opacities", "sh")
+    leaves = [getattr(splats, name).clone().requires_grad_() for name in names]
+    ones = torch.ones(view.height, view.width)
+    start = time.perf_counter()
+    traced = render(Gaussians(splats.kind, *leaves), view, backend="cpu")
+    outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_l1]
+    # Upstream gradients of ones: the loss is not what is measured.
+    grads = [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs]
+    torch.autograd.backward(outputs, grads)
+    case.both.append(time.perf_counter() - start)
+    case.peak.append(measure_peak(torch.get_num_threads()))
+
+
+def fit_line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
+    """Intercept, slope and R^2 of least squares in relative error (each point weighs 1 / y^2)."""
+    a, b = np.asarray(x, float), np.asarray(y, float)
+    design = np.stack([1 / b, a / b], axis=1)
+    (intercept, slope), *_ = np.linalg.lstsq(design, np.ones(len(b)), rcond=None)
+    residual = b - (intercept + slope * a)
+    return float(intercept), float(slope), float(1 - residual.var() / b.var())
+
+
+def run(cases: list[Case], rounds: int, gsplat: bool) -> dict[str, Any]:
+    """Time ``cases``; everything that the table shows, as JSON values."""
+    start = time.perf_counter()
+    for kind in sorted({case.kind for case in cases}):
+        time_once(Case(kind, 32, 100, 0.1), scene(kind, 100, 0.1), camera(32))
+    warm_up = time.perf_counter() - start
+    built = [(case, scene(case.kind, case.splats, case.sigma), camera(case.size)) for case in cases]
+    for _ in range(rounds):
+        for case, splats, view in built:
+            gc.collect()
+            time_once(case, splats, view)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    if gsplat:
+        judge(built)
+    rows = [row(case) for case in cases]
+    line = fit_line([r["pairs"] + 0.0 for r in rows], [r["forward_ms"] for r in rows]) if len(rows) > 2 else None
+    return {
+        "machine": platform.processor() or platform.machine(),
+        "threads": torch.get_num_threads(),
+        "rounds": rounds,
+        "first_call_seconds": round(warm_up, 2),
+        "peak_memory_mib": round(memory, 1),
+        "fma_peak_gflops": round(statistics.median(p for case in cases for p in case.peak) / 1e9, 1),
+        "fit_ms": None if line is None else {"intercept": line[0], "per_million_pairs": line[1] * 1e6, "r2": line[2]},
+        "cases": rows,
+    }
+
+
+def judge(built: list[tuple[Case, Gaussians, Camera]]) -> None:
+    """Time gsplat's torch reference on the smaller cases; its memory grows with pairs."""
+    try:
+        from attnwarp.render import _gsplat_torch
+
+        for case, splats, view in built:
+            if case.counters["contributing"] <= 12_000_000:
+                case.gsplat_seconds = _gsplat_torch.render(splats, view).seconds
+    except ImportError:
+        return
+
+
+def row(case: Case) -> dict[str, Any]:
+    """One line of the table."""
+    forward, both = statistics.median(case.forward), statistics.median(case.both)
+    pairs = case.counters["pairs"]
+    # Against the peak of the same rounds: the machine is shared, and its clock moves.
+    share = statistics.median(pairs * FLOPS_PER_PAIR / f / p for f, p in zip(case.forward, case.peak, strict=True))
+    return {
+        "kind": case.kind,
+        "size": case.size,
+        "splats": case.splats,
+        "max_sigma": case.sigma,
+        "forward_ms": round(1e3 * forward, 2),
+        "forward_best_ms": round(1e3 * min(case.forward), 2),
+        "forward_backward_ms": round(1e3 * both, 2),
+        "backward_over_forward": round((both - forward) / forward, 2),
+        "pairs": pairs,
+        "contributing": case.counters["contributing"],
+        "gigapairs_per_second": round(pairs / forward / 1e9, 3),
+        "fma_share": round(share, 4),
+        "gsplat_torch_ms": None if case.gsplat_seconds is None else round(1e3 * case.gsplat_seconds, 1),
+        "times_gsplat": None if case.gsplat_seconds is None else round(case.gsplat_seconds / forward, 1),
+    }
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result for a person, as Markdown."""
+    head = f"{result['threads']} threads, {result['rounds']} rounds, median; "
+    head += f"FMA peak {result['fma_peak_gflops']} GFLOP/s, peak memory {result['peak_memory_mib']:.0f} MiB, "
+    head += f"first call {result['first_call_seconds']} s (compilation or its cache)"
+    lines = [
+        head,
+        "",
+        "| kind | size | splats | max sigma | forward ms (best) | fwd + bwd ms | bwd / fwd | Mpairs | Gpairs/s "
+        "| of FMA peak | gsplat torch ms | times faster |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in result["cases"]:
+        gsplat = ("", "")
+        if r["gsplat_torch_ms"] is not None:
+            gsplat = (f"{r['gsplat_torch_ms']:.0f}", f"{r['times_gsplat']:.0f}")
+        lines.append(
+            f"| {r['kind']} | {r['size']} | {r['splats']} | {r['max_sigma']:g} | {r['forward_ms']:.1f} "
+            f"({r['forward_best_ms']:.1f}) | {r['forward_backward_ms']:.1f} | {r['backward_over_forward']:.2f} | "
+            f"{r['pairs'] / 1e6:.1f} | {r['gigapairs_per_second']:.2f} | {100 * r['fma_share']:.1f} % | {gsplat[0]} | "
+            f"{gsplat[1]} |"
+        )
+    if result["fit_ms"]:
+        f = result["fit_ms"]
+        lines += [
+            "",
+            f"forward = {f['intercept']:.2f} ms + {f['per_million_pairs']:.3f} ms per million pairs, R^2 {f['r2']:.3f}",
+        ]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m attnwarp.render.bench", description="Time the CPU renderer.")
+    parser.add_argument("--quick", action="store_true", help="256 x 256 with 10k and 50k splats only, 3 rounds")
+    parser.add_argument("--rounds", type=int, default=7, help="times each case is measured (default 7)")
+    parser.add_argument("--no-gsplat", action="store_true", help="leave out gsplat's torch reference")
+    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
+    options = parser.parse_args(arguments)
+    sizes, counts = ([256], [10_000, 50_000]) if options.quick else ([256, 512], [10_000, 50_000, 200_000])
+    cases = [
+        Case(kind, size, count, sigma)
+        for size in sizes
+        for count in counts
+        for sigma in (0.03, 0.1)
+        for kind in ("2d", "3d")
+    ]
+    result = run(cases, 3 if options.quick else options.rounds, gsplat=not options.no_gsplat)
+    print(table(result))
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
