@@ -17,7 +17,8 @@ from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.statistics import Interval, benjamini_hochberg, interval, paired, verdict
 
-YAW_EDGES = (0, 15, 30, 60, 90, 120, 150, 180)
+YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
+"""Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""
 
 WARP_COLUMNS = {
     "EPE, image px": "warp.epe_median",
@@ -34,7 +35,7 @@ DEPTH_COLUMNS = {
     "AbsRel inside": "depth.abs_rel.interior",
     "AbsRel at edges": "depth.abs_rel.edge",
     "RMSE": "depth.rmse",
-    "bias inside": "depth.bias_relative.interior",
+    "median bias inside": "depth.bias_median.interior",
     "delta < 1.01": "depth.delta_1_01",
     "delta < 1.25": "depth.delta_1_25",
     "normal, deg": "depth.normal_median",
@@ -45,7 +46,7 @@ FIT_COLUMNS = {
     "AbsRel": "depth.abs_rel",
     "AbsRel inside": "depth.abs_rel.interior",
     "AbsRel at edges": "depth.abs_rel.edge",
-    "bias inside": "depth.bias_relative.interior",
+    "median bias inside": "depth.bias_median.interior",
     "delta < 1.01": "depth.delta_1_01",
     "normal, deg": "depth.normal_median",
     "normal inside, deg": "depth.normal_median.interior",
@@ -227,12 +228,14 @@ def _contrasts(results: Results, probe: str, baseline: str, names: list[str]) ->
     for (name, metric, difference), p in zip(found, adjusted, strict=True):
         specification = metric_of(metric)
         direction: Literal["higher", "lower"] = "higher" if specification.direction == "higher" else "lower"
-        judged = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+        judged: str = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+        if difference.mean == difference.low == difference.high == 0:
+            judged = "same values"
         rows.append(
             [name, metric, spread(difference), judged, number(difference.detectable), number(p), str(difference.views)]
         )
     columns = ["variant", "metric", "difference", "verdict", "smallest that would be seen", "adjusted p", "views"]
-    return Table(columns, rows, caption=f"Differences from {baseline!r}")
+    return Table(columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True)
 
 
 def _yaw(results: Results, root: Path) -> list[Section]:
@@ -240,17 +243,32 @@ def _yaw(results: Results, root: Path) -> list[Section]:
     if not names:
         return []
     columns = ["variant", *(f"{low}–{high}°" for low, high in itertools.pairwise(YAW_EDGES))]
-    shown = {
+    rates = {
         "occlusion.false_positive_rate": "Of surface that the source does not show, accepted (false positive rate)",
         "occlusion.false_negative_rate": "Of surface that the source shows, rejected (false negative rate)",
         "occlusion.behind_share": "Of what is accepted, behind the source camera",
         "occlusion.hidden_share": "Of what is accepted, hidden from the source",
     }
-    bins = {name: by_yaw(results.counts("warp", name), YAW_EDGES) for name in names}
-    tables = []
-    for metric, caption in shown.items():
-        rows = [[name, *(number(b.scores[metric]) for b in bins[name])] for name in names]
-        tables.append(Table(columns, rows, caption))
+    bins = {
+        (name, region): by_yaw(results.counts("warp", name, region), YAW_EDGES)
+        for name in names
+        for region in ("", ".interior", ".edge")
+    }
+    tables = [
+        Table(columns, [[name, *(number(b.scores[metric]) for b in bins[name, ""])] for name in names], caption)
+        for metric, caption in rates.items()
+    ]
+    places = {"": "everywhere", ".interior": "inside surfaces", ".edge": "at edges"}
+    for metric in ("precision", "recall", "f1", "false_positive_rate", "false_negative_rate"):
+        rows = [
+            [name, place, *(number(b.scores[f"occlusion.{metric}"]) for b in bins[name, region])]
+            for name in names
+            for region, place in places.items()
+        ]
+        caption = f"{metric.replace('_', ' ').capitalize()}, inside surfaces and at edges apart"
+        tables.append(Table([columns[0], "where", *columns[1:]], rows, caption, folded=True))
+    rows = [[name, *(number(_accepted(b.counts, "ambiguous")) for b in bins[name, ""])] for name in names]
+    tables.append(Table(columns, rows, "Of ambiguous pixels, which are not scored, accepted", folded=True))
     text = [
         "Counts of all scenes' views summed in bins of the yaw between source and target. A dash: nothing to measure, "
         "such as a view in which the source shows nothing at all.",
@@ -262,11 +280,17 @@ def _yaw(results: Results, root: Path) -> list[Section]:
             (right, "occlusion.false_negative_rate", "visible surface rejected"),
         ):
             series = [figures.Line(name, *_by_yaw(results, name, metric)) for name in names]
-            figures.lines(axes, series, x="yaw from the source, degrees", y="share", title=title)
+            heading = {"x": "yaw from the source, degrees", "y": "share", "title": title}
+            figures.lines(axes, series, **heading, share=True, legend=axes is right)
     drawn = Picture(
         "figures/masks-by-yaw.svg", "Both errors of the masks by yaw; means and 95 % intervals over scenes."
     )
     return [Section("Masks by yaw", text, tables, [drawn])]
+
+
+def _accepted(counts: dict[str, int], label: str) -> float:
+    total = counts[f"{label}_accepted"] + counts[f"{label}_rejected"]
+    return counts[f"{label}_accepted"] / total if total else math.nan
 
 
 def _by_yaw(results: Results, variant: str, metric: str) -> tuple[list[float], list[Interval]]:

@@ -58,8 +58,18 @@ class Line:
     y: Sequence[Interval]
 
 
-def lines(axes: Axes, series: Sequence[Line], *, x: str, y: str, title: str, log: bool = False) -> None:
-    """Means with their intervals as bars; undefined points are left out."""
+def lines(
+    axes: Axes,
+    series: Sequence[Line],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    share: bool = False,
+    log: bool = False,
+    legend: bool = True,
+) -> None:
+    """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from 0 to 1."""
     for i, line in enumerate(series):
         mean = np.array([v.mean for v in line.y])
         keep = np.isfinite(mean)
@@ -78,7 +88,10 @@ def lines(axes: Axes, series: Sequence[Line], *, x: str, y: str, title: str, log
     axes.set_title(title, loc="left", fontsize=9.5)
     if log:
         axes.set_yscale("log")
-    axes.legend()
+    if share:
+        axes.set_ylim(-0.03, 1.03)
+    if legend:
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
 
 
 def cost_front(axes: Axes, points: Mapping[str, tuple[Interval, Interval]], *, x: str, y: str, title: str) -> list[str]:

@@ -7,18 +7,22 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Table:
-    """A table of ready-made text cells; columns named in ``timed`` hold seconds or memory."""
+    """A table of ready-made text cells.
+
+    Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until a reader opens it.
+    """
 
     columns: list[str]
     rows: list[list[str]]
     caption: str = ""
     timed: tuple[str, ...] = ()
+    folded: bool = False
 
     def without_timings(self) -> Table:
         """The same table without its columns of seconds and memory."""
         keep = [i for i, name in enumerate(self.columns) if name not in self.timed]
         rows = [[row[i] for i in keep] for row in self.rows]
-        return Table([self.columns[i] for i in keep], rows, self.caption)
+        return Table([self.columns[i] for i in keep], rows, self.caption, folded=self.folded)
 
 
 @dataclass

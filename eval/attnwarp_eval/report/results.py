@@ -67,10 +67,10 @@ class Results:
                 table.setdefault(scene, {})[f"{view['view']}/{seed}"] = math.nan if value is None else float(value)
         return table
 
-    def counts(self, probe: str, variant: str) -> list[tuple[float, dict[str, int]]]:
-        """(yaw, confusion counts) of every view of a variant."""
+    def counts(self, probe: str, variant: str, region: str = "") -> list[tuple[float, dict[str, int]]]:
+        """(yaw, confusion counts) of every view of a variant: everywhere, or in ".interior" or ".edge"."""
         return [
-            (float(view["yaw"]), {name: int(view["metrics"][f"occlusion.{name}"]) for name in COUNTS})
+            (float(view["yaw"]), {name: int(view["metrics"][f"occlusion.{name}{region}"]) for name in COUNTS})
             for _, _, record in self.records(probe, variant)
             for view in record["views"]
         ]
