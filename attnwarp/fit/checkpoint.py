@@ -33,7 +33,7 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     path = Path(path)
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError, ValueError) as error:
+    except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, KeyError, ValueError) as error:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise FileFormatError(path, f"not a checkpoint that can be read ({first}); remove it to begin again") from error
     if not isinstance(state, dict) or state.get("format") != FORMAT:

@@ -325,23 +325,26 @@ class _Run:
         camera = self.views.cameras[index]
         background = self.background(fitting=True)
         target = self.views.target(index, background)
-        gaussians = self.model.gaussians()
+        try:
+            gaussians = self.model.gaussians()
+        except ValueError as error:
+            raise RuntimeError(f"after {self.iteration} iterations: {error}; lower the learning rates") from error
         view = self.render(gaussians, camera, background)
         loss = self.loss_of(view, target)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise RuntimeError(
-                f"the loss is {value} after {self.iteration} iterations, on view {camera.name!r}; lower the learning "
-                "rates, or look for a camera inside the scene"
+                f"after {self.iteration} iterations: the loss is {value} on view {camera.name!r}; lower the learning "
+                "rates"
             )
         loss.backward()
         self.iteration += 1
         if self.density.active(self.iteration):
             self.density.watch(self.model, gaussians, camera, view.weight.detach())
         self.model.step(self.iteration / s.iterations)
-        error = float((view.color.detach() - target).square().mean())
+        squared = float((view.color.detach() - target).square().mean())
         self.loss = value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
-        self.error = error if math.isnan(self.error) else SMOOTHING * self.error + (1 - SMOOTHING) * error
+        self.error = squared if math.isnan(self.error) else SMOOTHING * self.error + (1 - SMOOTHING) * squared
 
     def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
         degree = min(self.settings.sh_degree, self.iteration // self.settings.sh_every)

@@ -69,10 +69,10 @@ def fits(results: Results, root: Path, number: Callable[[float | None], str], *,
     fitted = how["views"] - -(-how["views"] // 8)
     text = [
         f"Every fit begins with the same {how['points']} points per scene, scattered about the surfaces by "
-        f"{number(how['noise'])} of their spacing, and sees {fitted} of {how['views']} true pictures at {size} x {size} "
-        "px; every 8th is held out, and measured. PSNR is a mean over views, pooled PSNR that of their mean squared "
-        "error. Depth in this table and in the curves is median depth, by intersection for 2D splats and at the ray's "
-        "peak for 3D ones; other ways to read depth off the same splats stand in the tables above.",
+        f"{number(how['noise'])} of their spacing, and sees {fitted} of {how['views']} true pictures at {size} x "
+        f"{size} px; every 8th is held out, and measured. PSNR is a mean over views, pooled PSNR that of their mean "
+        "squared error. Depth in this table and in the curves is median depth, by intersection for 2D splats and at "
+        "the ray's peak for 3D ones; other ways to read depth off the same splats stand in the tables above.",
     ]
     section = Section("Fits", text, [Table(columns, rows, timed=TIMED)])
     if timings:

@@ -70,7 +70,7 @@ def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict
     """JPEG files of a view held out from a fit: its truth, what the splats show there, and their depth's error."""
     depth = np.asarray(fitted.depth, dtype=np.float64)
     found: dict[str, Image] = {
-        "target": image.astype(np.float32) / 255,
+        "target": (image / 255).astype(np.float32),
         "render": np.asarray(fitted.image, dtype=np.float32),
         "depth-error": depth_map(depth, hits),
     }

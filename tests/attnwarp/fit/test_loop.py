@@ -1,0 +1,257 @@
+"""The fit as a whole: it gets better, it can be stopped and gone on with, and it says what is wrong."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Gaussians
+from attnwarp.fit import FitSettings, Views, fit, from_points
+from attnwarp.fit.loop import CHECKPOINT, SPLATS
+from attnwarp.io import FileFormatError, read_ply
+
+from .conftest import blobs, pictures, ring
+
+BUSY = {
+    "iterations": 60, "densify_from": 10, "densify_every": 10, "densify_until": 0.9, "reset_every": 30,
+    "sh_degree": 1, "sh_every": 20, "normal_from": 0.2, "evaluate_every": 20, "grow_gradient": 1e-5,
+    "max_splats": 90, "background": "random", "prune_opacity": 0.005,
+}  # fmt: skip
+"""Everything that a fit does happens within 60 iterations."""
+
+FAST = {"sh_degree": 0, "densify": False, "lr_means": 1e-3, "lr_dc": 2e-2, "lr_opacity": 0.2, "lr_scales": 2e-2}
+"""40 splats can be pushed harder than thousands."""
+
+
+def begin(scene, **changes):
+    settings = FitSettings(**changes)
+    return from_points(scene[2], scene[3], kind=settings.kind, sh_degree=settings.sh_degree), settings
+
+
+def values(splats: Gaussians):
+    return {name: getattr(splats, name) for name in ("means", "quats", "scales", "opacities", "sh")}
+
+
+def same_bits(a: Gaussians, b: Gaussians) -> bool:
+    return all(torch.equal(x, y) for x, y in zip(values(a).values(), values(b).values(), strict=True))
+
+
+def untimed(history):
+    return [dataclasses.replace(record, seconds=0.0, cpu_seconds=0.0) for record in history]
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_a_fit_brings_held_out_views_closer_to_their_pictures(scene, kind):
+    start, settings = begin(scene, kind=kind, iterations=200, **FAST)
+    result = fit(start, scene[0], settings, held_out=scene[1])
+    first, last = result.history[0], result.history[-1]
+    assert result.stopped == "iterations"
+    assert (first.iteration, last.iteration) == (0, 200)
+    # What 200 steps add is far above what a seed would change.
+    assert last.psnr > first.psnr + 5
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_stopped_anywhere_and_gone_on_with_a_fit_gives_the_same_bits(scene, kind, tmp_path):
+    start, settings = begin(scene, kind=kind, **BUSY)
+    whole = fit(start, scene[0], settings, held_out=scene[1])
+    assert len(whole.gaussians) > len(start)  # splats were added, or nothing much was tested
+    for at in (7, 30, 41):
+        asked = iter(range(1000))
+        fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path, stop=lambda at=at, i=asked: next(i) >= at)
+        if at == 41:
+            parts = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path)
+    assert same_bits(whole.gaussians, parts.gaussians)
+    # Sittings that ended between two evaluations evaluated once more; those in common are equal.
+    common = {record.iteration for record in whole.history}
+    assert untimed(r for r in parts.history if r.iteration in common) == untimed(whole.history)
+
+
+def test_the_folder_always_holds_splats_that_can_be_read(scene, tmp_path):
+    start, settings = begin(scene, **BUSY)
+    seen = []
+
+    def look(step):
+        seen.append(len(read_ply(tmp_path / SPLATS)) if (tmp_path / SPLATS).exists() else 0)
+
+    result = fit(start, scene[0], settings, folder=tmp_path, checkpoint_seconds=0, watch=look)
+    assert seen[0] == 0 and all(seen[1:])
+    final = read_ply(tmp_path / SPLATS)
+    assert torch.equal(final.means, result.gaussians.means)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [CHECKPOINT, SPLATS]
+
+
+def test_a_seed_decides_every_bit(scene):
+    start, settings = begin(scene, **{**BUSY, "iterations": 30})
+    runs = [fit(start, scene[0], dataclasses.replace(settings, seed=seed)) for seed in (1, 1, 2)]
+    assert same_bits(runs[0].gaussians, runs[1].gaussians)
+    assert not same_bits(runs[0].gaussians, runs[2].gaussians)
+
+
+def test_the_splats_that_a_fit_began_with_are_left_alone(scene):
+    start, settings = begin(scene, iterations=3, sh_degree=0)
+    before = {name: value.clone() for name, value in values(start).items()}
+    fit(start, scene[0], settings)
+    assert all(torch.equal(before[name], value) for name, value in values(start).items())
+
+
+def test_a_world_far_from_its_origin_is_fitted_as_well():
+    # Offsets that are whole numbers leave the fractions that float64 can hold at 1e6.
+    figures = []
+    for offset in ((0.0, 0.0, 0.0), (1e6, -2e6, 5e5)):
+        truth, cameras = blobs(offset=offset), ring(offset=np.array(offset))
+        start = from_points(truth.world_means(), kind="2d", sh_degree=0)
+        settings = FitSettings(iterations=40, sh_degree=0, densify=False)
+        result = fit(start, pictures(truth, cameras[1:]), settings, held_out=pictures(truth, cameras[:1]))
+        figures.append([record.psnr for record in result.history])
+    # Positions differ by 1e-10 after the offset; Adam's sign-like steps make 1e-2 dB of it at most.
+    np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
+
+
+def test_scaling_the_world_changes_nothing():
+    figures = []
+    for scale in (1.0, 1e-3, 1e3):
+        truth = blobs()
+        truth = dataclasses.replace(truth, means=truth.means * scale, scales=truth.scales * scale)
+        cameras = ring()
+        moved = []
+        for camera in cameras:
+            pose = camera.world_to_camera.copy()
+            pose[:3, 3] *= scale
+            moved.append(dataclasses.replace(camera, world_to_camera=pose))
+        near = 0.01 * scale
+        from attnwarp.render import render
+
+        images = [render(truth, c, near=near).color.clamp(0, 1).numpy() for c in moved]
+        start = from_points(truth.world_means(), kind="2d", sh_degree=0)
+        settings = FitSettings(iterations=40, sh_degree=0, densify=False, normal_from=0, distortion_from=0)
+        result = fit(start, Views(moved[1:], images[1:]), settings, held_out=Views(moved[:1], images[:1]))
+        figures.append([record.psnr for record in result.history])
+    np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
+    np.testing.assert_allclose(figures[0], figures[2], atol=0.05)
+
+
+def test_a_random_background_keeps_what_is_transparent_transparent():
+    truth, cameras = blobs(), ring()
+    views = pictures(truth, cameras, alpha=True)
+    assert views.transparent
+    start = from_points(truth.world_means(), kind="3d", sh_degree=0)
+    result = fit(start, views, FitSettings(kind="3d", iterations=200, **FAST))
+    from attnwarp.render import render
+
+    alpha = render(result.gaussians, cameras[0]).alpha.numpy()
+    assert np.abs(alpha - views.images[0][..., 3]).mean() < 0.05
+
+
+def test_no_seconds_left_means_no_iteration(scene):
+    start, settings = begin(scene, iterations=50, sh_degree=0)
+    result = fit(start, scene[0], settings, held_out=scene[1], max_seconds=0)
+    assert (result.stopped, result.iteration, len(result.history)) == ("time", 0, 1)
+
+
+def test_patience_ends_a_fit_that_no_longer_gains(scene):
+    start, settings = begin(
+        scene, iterations=500, sh_degree=0, densify=False, evaluate_every=10, patience=2, min_gain=50.0
+    )
+    result = fit(start, scene[0], settings, held_out=scene[1])
+    assert (result.stopped, result.iteration) == ("patience", 20)
+
+
+def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
+    start, settings = begin(scene, iterations=20, sh_degree=0, evaluate_every=10)
+    result = fit(start, scene[0], settings, folder=tmp_path, measure=lambda g: {"largest": float(g.scales.max())})
+    assert [record.iteration for record in result.history] == [0, 10, 20]
+    assert all(record.measures["largest"] > 0 for record in result.history)
+    assert all(record.psnr is None for record in result.history)
+    # Finished: taking it up again computes nothing and returns the same.
+    again = fit(start, scene[0], settings, folder=tmp_path)
+    assert again.history == result.history and same_bits(again.gaussians, result.gaussians)
+
+
+def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_path):
+    start, settings = begin(scene, iterations=5, sh_degree=0)
+    fit(start, scene[0], settings, folder=tmp_path)
+    with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)"):
+        fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
+    with pytest.raises(ValueError, match="other views"):
+        fit(start, scene[1], settings, folder=tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 half a zip"])
+def test_a_damaged_checkpoint_is_refused_by_path(scene, tmp_path, content):
+    (tmp_path / CHECKPOINT).write_bytes(content)
+    start, settings = begin(scene, iterations=5, sh_degree=0)
+    with pytest.raises(FileFormatError, match=r"checkpoint\.pt: .*remove it to begin again"):
+        fit(start, scene[0], settings, folder=tmp_path)
+
+
+def test_a_truncated_checkpoint_is_refused(scene, tmp_path):
+    start, settings = begin(scene, iterations=2, sh_degree=0)
+    fit(start, scene[0], settings, folder=tmp_path)
+    whole = (tmp_path / CHECKPOINT).read_bytes()
+    (tmp_path / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match="remove it to begin again"):
+        fit(start, scene[0], settings, folder=tmp_path)
+
+
+def test_numbers_that_explode_end_in_a_clear_error(scene):
+    start, settings = begin(scene, iterations=5, sh_degree=0, lr_dc=1e39)
+    with pytest.raises(RuntimeError, match=r"after 1 iterations: .*lower the learning rates"):
+        fit(start, scene[0], settings)
+
+
+def test_splats_of_another_kind_or_degree_are_refused(scene):
+    start, _ = begin(scene, sh_degree=0)
+    with pytest.raises(ValueError, match=r"start: is of kind '2d', but settings.kind is '3d'"):
+        fit(start, scene[0], FitSettings(kind="3d", sh_degree=0))
+    with pytest.raises(ValueError, match=r"harmonics of degree 0, but settings.sh_degree is 3"):
+        fit(start, scene[0], FitSettings())
+
+
+def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
+    start, settings = begin(
+        scene, kind="2d", sh_degree=0, iterations=60, densify_from=10, densify_every=10, densify_until=1.0,
+        prune_opacity=0.5,
+    )  # fmt: skip
+    start.means = start.means + 100
+    with pytest.raises(RuntimeError, match="check that cameras and points are in one coordinate system"):
+        fit(start, scene[0], settings)
+
+
+def test_settings_survive_json():
+    settings = FitSettings(kind="3d", max_splats=1000, ssim=0.35, patience=3)
+    assert FitSettings.from_dict(json.loads(json.dumps(settings.to_dict()))) == settings
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "4d"}, "kind: got '4d'"),
+        ({"iterations": 0}, "iterations: got 0, expected a whole number >= 1"),
+        ({"iterations": 10.5}, "iterations: got 10.5, expected a whole number"),
+        ({"ssim": 1.5}, r"ssim: got 1.5, expected a number in \[0, 1\]"),
+        ({"lr_means": float("nan")}, "lr_means: got nan"),
+        ({"densify": 1}, "densify: got 1, expected true or false"),
+        ({"background": "blue"}, "background: got 'blue'"),
+        ({"antialiased": True}, "antialiased: applies to kind '3d' only"),
+        ({"distortion_form": "l2"}, "distortion_form: got 'l2'"),
+        ({"iterations": True}, "iterations: got True"),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        FitSettings(**changes)
+
+
+def test_an_unknown_setting_is_refused_with_the_nearest_known_one():
+    with pytest.raises(ValueError, match="did you mean 'lr_means'"):
+        FitSettings.from_dict({"lr_mean": 1e-4})
+
+
+def test_defaults_that_depend_on_the_kind_follow_it():
+    flat = FitSettings()
+    solid = dataclasses.replace(flat, kind="3d")
+    assert (flat.normal_weight, flat.opacity_floor) == (0.05, 0.05)
+    assert (solid.normal_weight, solid.distortion_weight, solid.opacity_floor) == (0.0, 0.0, 0.005)

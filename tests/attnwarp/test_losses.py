@@ -1,0 +1,166 @@
+"""Losses against other libraries, closed forms and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Camera, Gaussians, losses
+from attnwarp.render import render
+
+
+def pictures(height=40, width=52, channels=3, dtype=torch.float64, seed=0):
+    random = torch.Generator().manual_seed(seed)
+    image = torch.rand(height, width, channels, generator=random, dtype=dtype)
+    target = (image + 0.2 * torch.randn(image.shape, generator=random, dtype=dtype)).clamp(0, 1)
+    return image, target
+
+
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_ssim_is_that_of_scikit_image(channels):
+    from skimage.metrics import structural_similarity
+
+    image, target = pictures(channels=channels)
+    expected = structural_similarity(
+        image.numpy(), target.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        channel_axis=-1, data_range=1.0,
+    )  # fmt: skip
+    # Both in float64; scikit-image's kernel is cut at 3.5 sigma, 11 taps as here.
+    assert float(losses.ssim(image, target)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_ssim_map_is_that_of_kornia():
+    import kornia
+
+    image, target = pictures()
+    expected = kornia.metrics.ssim(
+        image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], window_size=11, padding="valid", eps=0.0
+    )
+    # kornia's C1, C2 are the same; eps is what it adds to the denominator.
+    torch.testing.assert_close(losses.ssim_map(image, target), expected[0].permute(1, 2, 0), rtol=0, atol=1e-10)
+
+
+def test_ssim_in_float32_keeps_five_digits():
+    image, target = pictures()
+    # E[x^2] - E[x]^2 loses about 1e-7 against C2 = 9e-4.
+    assert float(losses.ssim(image.float(), target.float())) == pytest.approx(
+        float(losses.ssim(image, target)), abs=1e-5
+    )
+
+
+def test_ssim_of_equal_pictures_is_one_and_its_gradient_zero():
+    image, _ = pictures()
+    image.requires_grad_(True)
+    value = losses.ssim(image, image.detach())
+    value.backward()
+    assert float(value.detach()) == pytest.approx(1, abs=1e-12)
+    assert float(image.grad.abs().max()) < 1e-12
+
+
+def test_ssim_gradient_is_that_of_finite_differences_in_both_pictures():
+    image, target = pictures(13, 12, 2)
+    image.requires_grad_(True)
+    target.requires_grad_(True)
+    assert torch.autograd.gradcheck(losses.ssim_map, (image, target), atol=1e-7)
+
+
+def test_ssim_of_constant_pictures_is_the_luminance_term():
+    a, b = 0.3, 0.5
+    value = losses.ssim(torch.full((16, 16, 3), a).double(), torch.full((16, 16, 3), b).double())
+    expected = (2 * a * b + losses.SSIM_C1) / (a * a + b * b + losses.SSIM_C1)
+    assert float(value) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(10, 30, 3), (1, 1, 3), (30, 10, 3)])
+def test_ssim_below_its_window_is_refused(shape):
+    with pytest.raises(ValueError, match="undefined below 11 x 11"):
+        losses.ssim(torch.zeros(shape), torch.zeros(shape))
+
+
+def test_pictures_of_different_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"target: got shape \(8, 9, 3\)"):
+        losses.l1(torch.zeros(9, 9, 3), torch.zeros(8, 9, 3))
+
+
+def test_l1_is_the_mean_absolute_difference():
+    image, target = pictures()
+    assert float(losses.l1(image, target)) == pytest.approx(np.abs(image.numpy() - target.numpy()).mean(), rel=1e-12)
+
+
+def test_psnr_is_that_of_scikit_image_and_infinite_for_equal_pictures():
+    from skimage.metrics import peak_signal_noise_ratio
+
+    image, target = pictures()
+    expected = peak_signal_noise_ratio(image.numpy(), target.numpy(), data_range=1.0)
+    assert losses.psnr(image, target) == pytest.approx(expected, abs=1e-9)
+    assert losses.psnr(image, image) == math.inf
+
+
+def plane(angle, size=0.12, half=12):
+    """A sheet of discs through the origin, turned by ``angle`` degrees about the y axis, that face its own normal."""
+    u, v = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1))
+    flat = np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], -1) * size
+    a = math.radians(angle)
+    R = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+    n = len(flat)
+    quats = torch.tensor([math.cos(a / 2), 0, math.sin(a / 2), 0], dtype=torch.float64).repeat(n, 1)
+    return Gaussians(
+        "2d", torch.tensor(flat @ R.T), quats, torch.full((n, 2), 0.7 * size, dtype=torch.float64),
+        torch.full((n,), 0.9, dtype=torch.float64), torch.zeros(n, 1, 3, dtype=torch.float64),
+    )  # fmt: skip
+
+
+CAMERA = Camera.look_at([0, 0, 4], [0, 0, 0], width=24, height=24, fov_y=20, up=[0, 1, 0])
+
+
+def test_normals_of_a_tilted_plane_agree_with_its_depth():
+    view = render(plane(35), CAMERA, backend="reference")
+    # Depth by intersection is exact on a plane, so both normals are the plane's; the rest is rounding.
+    assert float(losses.normal_consistency(view)) == pytest.approx(0, abs=1e-6)
+
+
+def test_discs_turned_out_of_their_plane_cost_one_minus_the_cosine():
+    sheet = plane(0)
+    turned = math.radians(20)
+    sheet.quats[:] = torch.tensor([math.cos(turned / 2), math.sin(turned / 2), 0, 0], dtype=torch.float64)
+    view = render(sheet, CAMERA, backend="reference", depth="center")
+    # By centre depth the sheet is flat at z = 4 whatever way its discs are turned, so N is its true normal. 22 x 22 of
+    # the 24 x 24 pixels have one.
+    inner = view.alpha[1:-1, 1:-1].sum() / 24**2
+    expected = float(inner) * (1 - math.cos(turned))
+    assert float(losses.normal_consistency(view)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_normal_consistency_of_nothing_is_zero_with_zero_gradient():
+    sheet = plane(0)
+    sheet.means = (sheet.means + torch.tensor([0.0, 0, 9])).requires_grad_(True)  # behind the camera
+    loss = losses.normal_consistency(render(sheet, CAMERA, backend="reference"))
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert float(sheet.means.grad.abs().max()) == 0
+
+
+def two_discs(gap):
+    return Gaussians(
+        "2d", torch.tensor([[0.0, 0, gap / 2], [0, 0, -gap / 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.full((2, 2), 50.0), torch.tensor([0.5, 0.8]), torch.zeros(2, 1, 3),
+    )  # fmt: skip
+
+
+def test_distortion_of_two_sheets_is_the_closed_form_in_both_forms():
+    gap = 0.6
+    view = render(two_discs(gap), CAMERA, backend="reference")
+    w1, w2, z1, z2 = 0.5, 0.5 * 0.8, 4 - gap / 2, 4 + gap / 2
+    # Discs of sigma 50 are constant across the picture to 1e-4.
+    assert float(losses.depth_distortion(view)) == pytest.approx(2 * w1 * w2 * gap, rel=1e-3)
+    assert float(losses.depth_distortion(view, scale=5.0)) == pytest.approx(2 * w1 * w2 * gap / 5, rel=1e-3)
+    near, far = 0.2, 100.0
+    m1, m2 = (far / (far - near) * (1 - near / z) for z in (z1, z2))
+    assert float(losses.depth_distortion(view, "l2_ndc")) == pytest.approx(w1 * w2 * (m1 - m2) ** 2, rel=1e-3)
+
+
+def test_an_unknown_form_of_distortion_is_refused():
+    view = render(two_discs(0.1), CAMERA, backend="reference")
+    with pytest.raises(ValueError, match=r"form: got 'l2', expected one of 'l1', 'l2_ndc'"):
+        losses.depth_distortion(view, "l2")
