@@ -140,7 +140,7 @@ def _pairs(
     reach = 3.4 * splats.scales.amax(dim=-1)
     z = depths.clamp(min=near)
     slope = torch.tensor(camera.directions([[0, 0], [width, height]]), dtype=depths.dtype).abs().amax()
-    spread = (reach / (z - reach).clamp(min=near) * (1 + slope) * float(camera.K[0, 0] + camera.K[1, 1]) + 12).numpy()
+    spread = (reach / (z - reach).clamp(min=near) * (1 + slope) * float(camera.K.max()) + 4).numpy()
     xy = centers.numpy()
     low = np.clip(np.floor(xy - spread[:, None]), 0, [width, height]).astype(np.int64)
     high = np.clip(np.ceil(xy + spread[:, None]), 0, [width, height]).astype(np.int64)

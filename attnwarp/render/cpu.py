@@ -24,11 +24,18 @@ from attnwarp.render import _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
 BIN_CHUNKS = 8
-ROWS_AT_ONCE = 1 << 17
+ROWS_AT_ONCE = 1 << 16
+"""Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
 
 def _array(tensor: torch.Tensor, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy(), dtype=dtype)
+
+
+def _tensor(array: np.ndarray, shape: torch.Size, dtype: torch.dtype) -> torch.Tensor:
+    """Converted by numpy: torch starts its thread pool for it, which on a busy machine takes longer than a picture."""
+    wanted = np.float32 if dtype == torch.float32 else np.float64
+    return torch.from_numpy(array.astype(wanted, copy=False).reshape(tuple(shape)))
 
 
 def _aligned(size: int) -> np.ndarray:
@@ -201,7 +208,7 @@ class _Composite(torch.autograd.Function):
             None,
             None,
             *(
-                torch.from_numpy(grad).reshape(shape).to(dtype) if needed else None
+                _tensor(grad, shape, dtype) if needed else None
                 for grad, (shape, dtype), needed in zip(grads, ctx.shapes, ctx.needs_input_grad[2:], strict=True)
             ),
         )
@@ -210,21 +217,24 @@ class _Composite(torch.autograd.Function):
 def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
     """(N, columns) gradients in the projected splats, summed over tiles in their order.
 
-    One row for each splat of each tile is more than should be held at once, so groups of tiles take turns.
+    One row for each splat of each tile would be more than should be held at once, so groups of tiles take turns.
     """
-    h, w = ctx.alpha.shape
     n = len(scene.means)
     columns = kernels.GRADIENTS + scene.features.shape[1]
     total = np.zeros((n, columns))
     done = ctx.done
     before = np.concatenate([[0], np.cumsum(done)])
-    room = ROWS_AT_ONCE + n + h * w
+    room = ROWS_AT_ONCE
+    buffer = np.empty((0, columns), np.float32)
     slots = kernels.BACK_SLOTS + max(0, scene.channels - 3)
     first = 0
     while first < scene.tiles:
         last = max(first + 1, int(np.searchsorted(before, before[first] + room, side="right")) - 1)
         last = min(last, scene.tiles)
-        rows = np.empty((int(before[last] - before[first]), columns), np.float32)
+        count = int(before[last] - before[first])
+        if len(buffer) < count:
+            buffer = np.empty((max(count, min(room, int(before[-1]))), columns), np.float32)
+        rows = buffer[:count]
         place = before[:-1] - before[first]
         pieces = 8 * _threads.count()
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
