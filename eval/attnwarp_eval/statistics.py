@@ -97,6 +97,38 @@ def paired(a: ByView, b: ByView) -> Interval:
     return interval(differences)
 
 
+@dataclass(frozen=True)
+class Ratio:
+    """How much longer one thing took than another.
+
+    Attributes:
+        ratio: median over rounds of the ratio within a round, geometric mean over groups (scenes).
+        low, high: 95 % bootstrap interval over rounds, resampled within each group.
+    """
+
+    ratio: float
+    low: float
+    high: float
+
+
+def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]], *, resamples: int = 1000) -> Ratio:
+    """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds a group, paired round by round.
+
+    Raises:
+        ValueError: other numbers of groups or rounds, or seconds that are not positive.
+    """
+    logs = []
+    for left, right in zip(a, b, strict=True):
+        x, y = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
+        if x.shape != y.shape or not ((x > 0).all() and (y > 0).all()):
+            raise ValueError("a, b: expected the same number of rounds on both sides, all of them positive seconds")
+        logs.append(np.log(x / y))
+    rng = np.random.default_rng(0)
+    drawn = np.mean([np.median(v[rng.integers(len(v), size=(resamples, len(v)))], axis=1) for v in logs], axis=0)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Ratio(float(np.exp(np.mean([np.median(v) for v in logs]))), float(np.exp(low)), float(np.exp(high)))
+
+
 def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
     """In how many of the views that both have b - a has the given sign: (those, all).
 

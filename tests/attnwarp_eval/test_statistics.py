@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from attnwarp_eval.statistics import agreement, benjamini_hochberg, front, interval, paired, verdict
+from attnwarp_eval.statistics import agreement, benjamini_hochberg, front, interval, paired, time_ratio, verdict
 
 
 def test_mean_is_over_scenes_so_a_scene_with_many_views_does_not_outvote_the_others():
@@ -125,3 +125,23 @@ def test_agreement_counts_the_views_that_show_the_sign():
     b = {"s": {"v": 2.0, "w": 1.0, "x": 1.0}, "t": {"v": 3.0, "y": 1.0}}
     assert agreement(a, b, +1) == (2, 3)
     assert agreement(a, b, -1) == (1, 3)
+
+
+def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
+    rng = np.random.default_rng(5)
+    # The machine slows down eightfold while the rounds go on; the true ratio is 1.25 throughout.
+    drift = np.geomspace(1, 8, 60)
+    a = 1.25 * drift * rng.lognormal(0, 0.03, 60)
+    b = drift * rng.lognormal(0, 0.03, 60)
+    found = time_ratio([a, a], [b, b])
+    assert found.low < 1.25 < found.high
+    assert found.high / found.low < 1.05
+    same = time_ratio([b], [b])
+    assert (same.ratio, same.low, same.high) == (1, 1, 1)
+
+
+def test_rounds_that_do_not_belong_together_are_refused():
+    with pytest.raises(ValueError, match="same number of rounds"):
+        time_ratio([[1.0, 2.0]], [[1.0]])
+    with pytest.raises(ValueError, match="positive"):
+        time_ratio([[1.0, 0.0]], [[1.0, 1.0]])

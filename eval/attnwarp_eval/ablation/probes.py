@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -52,8 +53,13 @@ def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
         at = world(scene, spec["size"])
     views, pictures = [], []
     curve: list[dict[str, Any]] = []
+    rounds: dict[str, list[list[float]]] = {}
+    found: Iterator[View]
     if cell.probe == "fit":
         found = _fit(at, spec, meter, root, curve)
+    elif cell.probe == "timing":
+        rounds = _timing(at, scene, spec, meter)
+        found = iter(())
     else:
         found = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe](at, scene, spec, meter)
     for name, figures, shown in found:
@@ -72,6 +78,7 @@ def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
             "counters": dict(sorted(meter.counters.items())),
             "peak_memory_mb": peak_memory_mb(),
             "threads": torch.get_num_threads(),
+            **({"rounds": rounds} if rounds else {}),
         },
         "environment": environment(),
     }
@@ -198,6 +205,46 @@ def _fit(at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[
                 surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
             )
         yield name, figures, {"fitted": surface, "hits": truth, "image": image}
+
+
+def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[str, list[list[float]]]:
+    """Seconds of every contestant in every round, taken in turn in one process, in an order drawn anew each round.
+
+    The machine's speed drifts; contestants of one round see the same machine, so their ratio within a round can be
+    trusted where two separate means cannot. The first contestant runs twice a round: the ratio of it to itself is what
+    noise alone does here. A first round, which compiles and fills caches, is not kept.
+
+    Returns:
+        "render" (the target's surface) and "pair" (render, correspondence, mask, feature grids), each a list over
+        contestants, the first one's second run last, of seconds a round.
+    """
+    target = at.targets[spec["views"][0]]
+    contestants = [
+        (
+            splats(scene, spec["size"], spec["seed"], Splats.model_validate(contestant["splats"])),
+            WarpSettings.from_dict(contestant["settings"]),
+        )
+        for contestant in spec["contestants"]
+    ]
+    contestants.append(contestants[0])
+    sources = [render_surface(model, at.source, settings) for model, settings in contestants]
+    rng = np.random.default_rng(spec["seed"])
+    seconds: dict[str, list[list[float]]] = {stage: [[] for _ in contestants] for stage in ("render", "pair")}
+    for turn in range(spec["rounds"] + 1):
+        for index in rng.permutation(len(contestants)):
+            model, settings = contestants[index]
+            start = time.perf_counter()
+            render_surface(model, target, settings)
+            rendered = time.perf_counter()
+            view = warp_view(model, at.source, target, settings, source_surface=sources[index])
+            for layer in spec["feature_sizes"]:
+                view.at((layer, layer))
+            done = time.perf_counter()
+            if turn:
+                seconds["render"][index].append(rendered - start)
+                seconds["pair"][index].append(done - rendered)
+    meter.count(rounds=spec["rounds"], contestants=len(contestants))
+    return seconds
 
 
 def _warp_truth(at: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:

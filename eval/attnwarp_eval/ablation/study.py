@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from attnwarp.settings import WarpSettings
     from attnwarp_eval.scene import Scene
 
-PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1}
+PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1, "timing": 1}
 """Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get new ids."""
 
-ProbeName = Literal["calibration", "depth", "warp", "fit"]
+ProbeName = Literal["calibration", "depth", "warp", "fit", "timing"]
 
 
 class StudyError(InputError):
@@ -87,7 +87,10 @@ class Ablation(_Model):
 
 
 class Front(_Model):
-    """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants."""
+    """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants.
+
+    Seconds come from the ``timing`` probe where it has all of them, taken in turn; else from the cells themselves.
+    """
 
     title: str
     probe: Literal["depth", "warp", "fit"] = "warp"
@@ -121,6 +124,7 @@ class Study(_Model):
     spp: Annotated[int, Field(ge=1)] = 16
     feature_sizes: Annotated[list[int], Field(min_length=1)] = [512, 64, 32]
     feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
+    timing_rounds: Annotated[int, Field(ge=3)] = 15
     splats: Splats = Splats()
     fit: Fits = Fits()
     variants: Annotated[dict[str, Variant], Field(min_length=1)]
@@ -179,6 +183,13 @@ class Study(_Model):
             scene = scenes[scene_name]
             views = self._views_of(scene)
             for probe, names in self.probes.items():
+                if probe == "timing":
+                    for seed in self.seeds:
+                        cell = Cell(
+                            self._timing(scene, views, names, seed), scene_name, "all", probe, seed, tuple(names)
+                        )
+                        found[cell.id] = cell
+                    continue
                 for name in names:
                     for seed in self.seeds:
                         spec = self._spec(scene, views, probe, self.variants[name], seed)
@@ -198,6 +209,26 @@ class Study(_Model):
                             )
                         found[cell.id] = cell
         return list(found.values())
+
+    def _timing(self, scene: Scene, views: list[str], names: list[str], seed: int) -> dict[str, Any]:
+        """One cell for all contestants: only times that were taken in turn, in one process, can be compared."""
+        return {
+            "probe": "timing",
+            "protocol": PROTOCOLS["timing"],
+            "scene": scene.content_hash,
+            "size": self.size,
+            "views": [views[len(views) // 2]],
+            "seed": seed,
+            "feature_sizes": self.feature_sizes,
+            "rounds": self.timing_rounds,
+            "contestants": [
+                {
+                    "settings": self.variants[name].settings().to_dict(),
+                    "splats": self.splats_of(self.variants[name]).model_dump(),
+                }
+                for name in names
+            ],
+        }
 
     def _views_of(self, scene: Scene) -> list[str]:
         known = [c.name for c in scene.targets]

@@ -12,6 +12,7 @@ from attnwarp_eval.checks.occlusion import by_yaw
 from attnwarp_eval.report import figures
 from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.report.fits import fits
+from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
@@ -105,7 +106,7 @@ def build(results: Results, root: Path, *, timings: bool = True) -> Report:
         *_ablations(results),
         *fits(results, root, number, timings=timings),
         *_yaw(results, root),
-        *_fronts(results, root, timings),
+        *(fronts(results, root, number, spread) if timings else []),
         *_galleries(results),
         *_failures(results),
         _how(results, timings),
@@ -280,8 +281,8 @@ def _yaw(results: Results, root: Path) -> list[Section]:
             (right, "occlusion.false_negative_rate", "visible surface rejected"),
         ):
             series = [figures.Line(name, *_by_yaw(results, name, metric)) for name in names]
-            heading = {"x": "yaw from the source, degrees", "y": "share", "title": title}
-            figures.lines(axes, series, **heading, share=True, legend=axes is right)
+            x, y = "yaw from the source, degrees", "share"
+            figures.lines(axes, series, x=x, y=y, title=title, share=True, legend=axes is right)
     drawn = Picture(
         "figures/masks-by-yaw.svg", "Both errors of the masks by yaw; means and 95 % intervals over scenes."
     )
@@ -297,38 +298,6 @@ def _by_yaw(results: Results, variant: str, metric: str) -> tuple[list[float], l
     yaws = sorted({view["yaw"] for _, _, record in results.records("warp", variant) for view in record["views"]})
     tables = [results.views("warp", variant, metric, (yaw, yaw)) for yaw in yaws]
     return yaws, [interval({s: list(v.values()) for s, v in table.items()}) for table in tables]
-
-
-def _fronts(results: Results, root: Path, timings: bool) -> list[Section]:
-    if not timings or not results.study["fronts"]:
-        return []
-    section = Section("What accuracy costs in time")
-    section.text = [
-        "Seconds are those of the method alone (rendering, correspondence, mask, feature grids), steady state, median "
-        "over the views of a cell; set-up and the checks are not in them. A point is on the front when nothing cheaper "
-        "is as good. These seconds come from one pass and are for orientation: compare work by its counters, and use "
-        "`make bench` for timings that are interleaved.",
-    ]
-    for index, wanted in enumerate(results.study["fronts"]):
-        points = {}
-        for name in wanted["variants"]:
-            seconds = results.cost(wanted["probe"], name, "steady")
-            quality = _mean(results, wanted["probe"], name, wanted["metric"])
-            if seconds:
-                points[name] = (interval({s: [v] for s, v in seconds.items()}), quality)
-        if not points:
-            continue
-        path = root / "figures" / f"front-{index}.svg"
-        label = f"{wanted['metric']} ({metric_of(wanted['metric']).unit})"
-        with figures.drawing(path) as (axes,):
-            kept = figures.cost_front(axes, points, x="seconds a view", y=label, title=wanted["title"])
-        section.figures.append(Picture(f"figures/{path.name}", wanted["title"]))
-        rows = [
-            [name, spread(quality), spread(seconds), "yes" if name in kept else "no"]
-            for name, (seconds, quality) in points.items()
-        ]
-        section.tables.append(Table(["variant", label, "seconds a view", "on the front"], rows, wanted["title"]))
-    return [section] if section.tables else []
 
 
 def _galleries(results: Results) -> list[Section]:
@@ -347,7 +316,7 @@ def _galleries(results: Results) -> list[Section]:
             own = {p["what"]: p for _, other, p in found if other == label}
             wanted = [what for what in ("warped", "mask", "endpoint-error", "render", "depth-error") if what in own]
             rows.append((label, [Picture(own[what]["path"], what.replace("-", " ")) for what in wanted]))
-    legend = "; ".join(f"{colour} {name}" for name, (colour, _) in CLASSES.items())
+    legend = "; ".join(f"`{colour}` {name}" for name, (colour, _) in CLASSES.items())
     text = [
         "Warped: the source's own colours as the warp carries them, squares where the mask rejects. "
         f"Mask against truth: {legend}. Endpoint error: dark {EPE_RANGE[0]:g} px to bright {EPE_RANGE[1]:g} px, "

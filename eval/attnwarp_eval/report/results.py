@@ -84,6 +84,26 @@ class Results:
                 found.setdefault(scene, []).append(float(value))
         return {scene: sum(v) / len(v) for scene, v in found.items()}
 
+    def rounds(self, stage: str, variant: str | None) -> list[list[float]]:
+        """Seconds taken in turn by the timing probe: a list of rounds for each scene and seed, empty if there are none.
+
+        Args:
+            stage: "render" or "pair".
+            variant: a contestant; None is the first contestant's second run.
+        """
+        found = []
+        for cell in self.cells:
+            if cell["probe"] != "timing" or cell["record"] is None or (variant and variant not in cell["variants"]):
+                continue
+            index = cell["variants"].index(variant) if variant else -1
+            found.append([float(s) for s in cell["record"]["cost"]["rounds"][stage][index]])
+        return found
+
+    @property
+    def timing_baseline(self) -> str | None:
+        """The first contestant of the timing probe."""
+        return next((c["variants"][0] for c in self.cells if c["probe"] == "timing" and c["record"]), None)
+
     def counters(self, probe: str, variant: str) -> Counter[str]:
         """Work counters summed over a variant's cells."""
         total: Counter[str] = Counter()
