@@ -32,11 +32,11 @@ def fronts(results: Results, root: Path, number: Number, spread: Format) -> list
     section = Section("What accuracy costs in time")
     section.text = [
         "Seconds are those of the method alone: a render of the target for depth; render, correspondence, mask and "
-        "feature grids for a warp. Set-up and checks are not in them. All contestants ran in turn in one process, in an "
-        "order drawn anew each round; a ratio is the median over rounds of the ratio to the first contestant within a "
-        "round, with a bootstrap interval over rounds. The row `again` is the first contestant against itself: what "
-        "noise alone does on this machine. Inside that band nothing is called faster or slower. A point is on the front "
-        "when nothing cheaper is as good.",
+        "feature grids for a warp. Set-up and checks are not in them. All contestants ran in turn in one process, in "
+        "an order drawn anew each round; a ratio is the median over rounds of the ratio to the first contestant within "
+        "a round, with a bootstrap interval over rounds. The row `again` is the first contestant against itself: what "
+        "noise alone does on this machine. Inside that band nothing is called faster or slower. A point is on the "
+        "front when nothing cheaper is as good.",
     ]
     for index, wanted in enumerate(results.study["fronts"]):
         points, rows = _points(results, wanted, number, spread)
