@@ -12,20 +12,35 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 import yaml
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from attnwarp.camera import Camera
 from attnwarp_eval import shapes
+from attnwarp_eval.bodies import BodySpec
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.errors import InputError
+from attnwarp_eval.nature import ScatterSpec, TerrainSpec
+from attnwarp_eval.optics import (
+    TEXTURED,
+    DiffuseMaterial,
+    EffectsSpec,
+    EmissionSpec,
+    LensSpec,
+    Material,
+    MediumSpec,
+    PointSpec,
+    SpotSpec,
+    contradictions,
+)
 from attnwarp_eval.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
-from attnwarp_eval.textures import Color, Direction, Spec, Texture, linear_rgb
+from attnwarp_eval.textures import LATER, Color, Direction, Plain, Spec, Texture
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -83,42 +98,6 @@ class BoxSpec(Spec):
     repeat: Repeat | None = None
 
 
-class EllipsoidPart(Spec):
-    """An ellipsoid with radii along x, y, z, pitched about y."""
-
-    type: Literal["ellipsoid"]
-    center: Vector
-    radii: tuple[Positive, Positive, Positive]
-    pitch: float = 0.0
-    mirror: bool = False
-    color: Color = "#ffffff"
-    blend: bool = True
-
-
-class CapsulePart(Spec):
-    """A rod with round ends, its radius running from the first of ``radii`` to the second."""
-
-    type: Literal["capsule"]
-    start: Vector
-    end: Vector
-    radii: tuple[Positive, Positive]
-    mirror: bool = False
-    color: Color = "#ffffff"
-    blend: bool = True
-
-
-class BodySpec(Spec):
-    """A body of blended parts (signed distances), meshed by marching cubes. ``mirror`` doubles a part across y = 0."""
-
-    type: Literal["body"]
-    parts: tuple[Annotated[EllipsoidPart | CapsulePart, Field(discriminator="type")], ...] = Field(min_length=1)
-    blend: float = Field(0.1, ge=0)
-    resolution: int = Field(128, ge=8, le=512)
-    position: Vector = (0.0, 0.0, 0.0)
-    yaw: float = 0.0
-    scale: Positive = 1.0
-
-
 class MeshSpec(Spec):
     """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright axis."""
 
@@ -130,15 +109,35 @@ class MeshSpec(Spec):
     up: Literal["y", "z"] = "z"
 
 
-ShapeSpec = Annotated[SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec, Field(discriminator="type")]
+ShapeSpec = Annotated[
+    SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec | TerrainSpec | ScatterSpec, Field(discriminator="type")
+]
 
 
 class ObjectSpec(Spec):
-    """One object: its index in the list is its object id."""
+    """One object: its index in the list is its object id.
+
+    ``texture`` colours diffuse and plastic things; mirrors, metal and glass have a ``tint``, and what shines is black.
+    """
 
     name: str = Field(min_length=1)
     shape: ShapeSpec
-    texture: Texture
+    texture: Texture = Plain(type="plain", color="#ffffff", variation=0.0, grain=0.1)
+    material: Material = Field(DiffuseMaterial(), json_schema_extra=LATER)
+    emission: EmissionSpec | None = Field(None, json_schema_extra=LATER)
+    velocity: Vector | None = Field(None, json_schema_extra=LATER)
+
+    @model_validator(mode="after")
+    def _a_texture_where_it_shows(self) -> ObjectSpec:
+        shows = isinstance(self.material, TEXTURED) and self.emission is None
+        said = "texture" in self.model_fields_set
+        if shows and not said:
+            raise ValueError(f"got no texture, but {self.material.type} things need one; add 'texture: {{type: ...}}'")
+        if said and not isinstance(self.material, TEXTURED):
+            raise ValueError(f"got a texture, but {self.material.type} shows none; use the material's 'tint' instead")
+        if self.emission is not None and not isinstance(self.material, DiffuseMaterial):
+            raise ValueError(f"got emission and the material {self.material.type}; what shines has no other material")
+        return self
 
 
 class SunSpec(Spec):
@@ -160,7 +159,7 @@ class SkySpec(Spec):
     radiance: float = Field(1.0, gt=0)
 
 
-LightSpec = Annotated[SunSpec | SkySpec, Field(discriminator="type")]
+LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discriminator="type")]
 
 
 class ViewSpec(Spec):
@@ -183,12 +182,16 @@ class CamerasSpec(Spec):
     size: tuple[int, int] = (512, 512)
     source: ViewSpec
     targets: tuple[ViewSpec, ...] = Field(min_length=1)
+    lens: LensSpec | None = Field(None, json_schema_extra=LATER)
 
 
 class AppearanceSpec(Spec):
-    """How pictures are made: light bounces (1 is direct light only) and samples a pixel."""
+    """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
 
-    bounces: int = Field(default=1, ge=1, le=64)
+    ``bounces: unlimited`` follows light until it is gone; every surface and every scattering counts as a bounce.
+    """
+
+    bounces: Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"] = 1
     spp: int = Field(default=16, ge=1, le=65536)
 
 
@@ -200,9 +203,11 @@ class SceneSpec(Spec):
     description: str = ""
     units: str = "metres"
     objects: tuple[ObjectSpec, ...] = Field(min_length=1)
-    lights: tuple[LightSpec, ...] = Field(min_length=1)
+    lights: tuple[LightSpec, ...]
     cameras: CamerasSpec
     appearance: AppearanceSpec = Field(default_factory=AppearanceSpec)
+    medium: MediumSpec | None = Field(None, json_schema_extra=LATER)
+    effects: EffectsSpec = Field(EffectsSpec(), json_schema_extra=LATER)
 
 
 # The scene -----------------------------------------------------------------------------------------------------------
@@ -302,8 +307,7 @@ class Scene:
                     step = np.array(spec.repeat.step) * k if spec.repeat else np.zeros(3)
                     yield Box(np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id)
             case BodySpec():
-                mesh = shapes.mesh_body(_parts(spec), spec.blend, spec.resolution)
-                yield _placed(mesh, _turn_z(spec.yaw), spec.scale, spec.position, object_id)
+                yield _placed(spec.mesh(), _turn_z(spec.yaw), spec.scale, spec.position, object_id)
             case MeshSpec():
                 path = self.mesh_path(spec)
                 try:
@@ -312,6 +316,20 @@ class Scene:
                     raise SceneError(str(error), self.path) from error
                 upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
                 yield _placed(mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id)
+            case TerrainSpec():
+                yield replace(spec.mesh(), object_id=object_id)
+            case ScatterSpec():
+                yield replace(spec.mesh(self._ground(spec)), object_id=object_id)
+
+    def _ground(self, spec: ScatterSpec) -> Callable[[Array], Array]:
+        """Height of what things are strewn on."""
+        for item in self.spec.objects:
+            if item.name == spec.on and isinstance(item.shape, TerrainSpec):
+                return item.shape.height_at
+            if item.name == spec.on and isinstance(item.shape, RectangleSpec):
+                level = item.shape.center[2]
+                return lambda xy: np.full(len(xy), level)
+        return lambda xy: np.full(len(xy), spec.center[2])
 
     def mesh_path(self, spec: MeshSpec) -> Path:
         """Where the mesh file of an object lies."""
@@ -320,13 +338,13 @@ class Scene:
 
     @functools.cached_property
     def world_hash(self) -> str:
-        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, protocol versions."""
+        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, fog, protocol versions."""
         files = {
             item.shape.file: hashlib.sha256(self.mesh_path(item.shape).read_bytes()).hexdigest()
             for item in self.spec.objects
             if isinstance(item.shape, MeshSpec)
         }
-        said = self.spec.model_dump(mode="json", include={"objects", "lights"})
+        said = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
         return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, said, files)
 
     @functools.cached_property
@@ -348,22 +366,6 @@ def _turn_y(degrees: float) -> Array:
 def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int) -> Mesh:
     moved = mesh.turned(R).moved(scale, position)
     return Mesh(moved.vertices, moved.faces, moved.normals, moved.tint, object_id)
-
-
-def _parts(spec: BodySpec) -> list[shapes.Part]:
-    parts: list[shapes.Part] = []
-    for part in spec.parts:
-        color = linear_rgb(part.color)
-        for side in (1.0, -1.0) if part.mirror else (1.0,):
-
-            def flip(v: Vector, side: float = side) -> Vector:
-                return (v[0], v[1] * side, v[2])
-
-            if isinstance(part, EllipsoidPart):
-                parts.append(shapes.Ellipsoid(flip(part.center), part.radii, part.pitch, color, part.blend))
-            else:
-                parts.append(shapes.Capsule(flip(part.start), flip(part.end), part.radii, color, part.blend))
-    return parts
 
 
 def view_name(view: ViewSpec, index: int) -> str:
@@ -557,6 +559,15 @@ def _check(scene: Scene, root: yaml.Node) -> None:
             refuse(f"objects[{k}].name: {item.name!r} is also the name of objects[{names[item.name]}]; rename one",
                    "objects", k, "name")  # fmt: skip
         names[item.name] = k
+        if isinstance(item.shape, ScatterSpec):
+            on = item.shape.on
+            grounds = [o.name for o in scene.spec.objects if isinstance(o.shape, TerrainSpec | RectangleSpec)]
+            if on is not None and on not in grounds:
+                refuse(f"objects[{k}].shape.on: got {on!r}{_suggest(on, grounds)}; expected the name of a terrain or "
+                       f"a rectangle of this scene: {', '.join(grounds) or 'there is none'}", *("objects", k, "shape", "on"))  # fmt: skip
+            if not len(item.shape.places()):
+                refuse(f"objects[{k}].shape.avoid: leaves no room for any of the {item.shape.count}; make it smaller "
+                       "or the radius larger", *("objects", k, "shape", "avoid"))  # fmt: skip
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
             where = ("objects", k, "shape", "file")
@@ -571,6 +582,10 @@ def _check(scene: Scene, root: yaml.Node) -> None:
     skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
     if len(skies) > 1:
         refuse(f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one", "lights", skies[1])
+    if not scene.spec.lights and not any(item.emission for item in scene.spec.objects):
+        refuse("lights: there is none, and no object has an 'emission'; add a sun, a sky, a point or a spot", "lights")
+    for message, at_fault in contradictions(scene.spec):
+        refuse(message, *at_fault)
     cameras = _check_cameras(scene, refuse)
     for item in scene.spec.objects:
         inside = _inside(scene, item)
@@ -605,12 +620,7 @@ def _inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
     """A test whether a point is inside the object. A body is asked by its distance, which needs no meshing."""
     spec = item.shape
     if isinstance(spec, BodySpec):
-        parts, R, offset = _parts(spec), _turn_z(spec.yaw), np.array(spec.position)
-
-        def within(point: Array) -> bool:
-            local = (point - offset) @ R / spec.scale
-            return bool(shapes.body_distance(parts, spec.blend, local[None])[0] < 0)
-
-        return within
+        R, offset = _turn_z(spec.yaw), np.array(spec.position)
+        return lambda point: spec.contains((point - offset) @ R / spec.scale)
     solids = list(scene._build(item, 0))
     return lambda point: any(solid.contains(point) for solid in solids)

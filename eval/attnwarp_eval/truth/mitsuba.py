@@ -26,6 +26,7 @@ from attnwarp_eval.textures import albedo, linear_rgb
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 
 if TYPE_CHECKING:
+    from attnwarp_eval.optics import PointSpec, SpotSpec
     from attnwarp_eval.scene import Scene, SkySpec, SunSpec
 
 Array = npt.NDArray[np.float64]
@@ -86,6 +87,8 @@ def plan_rendering(scene: Scene, spp: int | None = None) -> Plan:
     spp = wanted.spp if spp is None else spp
     lights = scene.spec.lights
     reasons = ["every material is diffuse and opaque: no path passes through glass or a medium, and none is specular"]
+    if wanted.bounces == "unlimited":
+        return Plan((Pass(tuple(range(len(lights))), "path", -1, 1, 1, spp),), tuple(reasons))
     if wanted.bounces > 1:
         reasons.append(f"the scene asks for {wanted.bounces} bounces: paths of up to {wanted.bounces + 1} edges")
         depth = wanted.bounces + 1
@@ -146,7 +149,7 @@ def _render(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
         options: dict[str, Any] = {"type": step.integrator}
         if step.integrator == "path":
             # Roulette would end paths at random: unbiased, but noise that so short a path is not worth.
-            options |= {"max_depth": step.max_depth, "rr_depth": step.max_depth + 1}
+            options |= {"max_depth": step.max_depth, "rr_depth": step.max_depth + 1 if step.max_depth > 0 else 5}
         else:
             options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
         world, center = _world(scene, step.lights)
@@ -314,7 +317,8 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
         file.write(faces.tobytes())
 
 
-def _light(light: SunSpec | SkySpec) -> dict[str, Any]:
+def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec) -> dict[str, Any]:
+    from attnwarp_eval.optics import PointSpec, SpotSpec
     from attnwarp_eval.scene import SunSpec
 
     mi = _mitsuba()
@@ -325,6 +329,8 @@ def _light(light: SunSpec | SkySpec) -> dict[str, Any]:
             "direction": (-sun_direction(light)).tolist(),
             "irradiance": {"type": "rgb", "value": color},
         }
+    if isinstance(light, PointSpec | SpotSpec):
+        raise ValueError(f"lights: a {light.type} light cannot be rendered yet")
     # The colour depends on the elevation only, so that the map's longitude does not matter.
     up = np.cos((np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * np.pi)
     directions = np.stack([np.sqrt(1 - up**2), np.zeros(SKY_ROWS), up], axis=-1)
