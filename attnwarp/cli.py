@@ -83,12 +83,13 @@ def fit(
     change: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; see docs/fitting.md.")
     ] = None,
+    checkpoint_seconds: Annotated[float, typer.Option(min=0, help="Write what there is so often.")] = 30.0,
     restart: Annotated[bool, typer.Option("--restart", help="Begin again, whatever is in the folder.")] = False,
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
     with clear_errors():
         result = _fit(data, out, kind, iterations, max_seconds, max_size, max_splats, points, hold_out, seed,
-                      change or [], restart)  # fmt: skip
+                      change or [], checkpoint_seconds, restart)  # fmt: skip
     last = result.history[-1]
     held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
     typer.echo(
@@ -112,6 +113,7 @@ def _fit(
     every: int,
     seed: int,
     changes: list[str],
+    checkpoint_seconds: float,
     restart: bool,
 ) -> Fit:
     # The options that need nothing heavy are read first: a typing error is answered at once.
@@ -144,8 +146,9 @@ def _fit(
         (out / CHECKPOINT).unlink(missing_ok=True)
     with _asked_to_stop() as stop, shown(title=out.name) as watch:
         result = fitting.fit(
-            start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds, watch=watch, stop=stop
-        )
+            start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
+            checkpoint_seconds=checkpoint_seconds, watch=watch, stop=stop,
+        )  # fmt: skip
     _write_results(out, result, held_out)
     return result
 

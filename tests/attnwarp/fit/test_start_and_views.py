@@ -1,0 +1,217 @@
+"""What a fit begins with: first splats, pictures from files, and which of them are held out."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from attnwarp import Camera
+from attnwarp.fit import Views, extent_of, from_points, hold_out, load_views, random_points, read_image
+from attnwarp.io import Dataset, FileFormatError
+
+from .conftest import ring
+
+
+def grid(n=4, step=0.5):
+    ticks = np.arange(n) * step
+    return np.stack(np.meshgrid(ticks + 10, ticks - 20, ticks + 5), -1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+def test_first_splats_are_as_large_as_the_gaps_around_them(kind):
+    g = from_points(grid(), kind=kind)
+    # In a grid the three nearest neighbours are one step away, at corners too.
+    torch.testing.assert_close(g.scales, torch.full_like(g.scales, 0.5))
+    np.testing.assert_allclose(g.world_means(), grid(), atol=1e-6)
+    assert g.opacities.unique().tolist() == [pytest.approx(0.1)]
+
+
+def test_first_splats_have_their_points_colours():
+    colors = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
+    g = from_points([[0, 0, 0], [1, 0, 0]], colors, kind="3d", sh_degree=2)
+    assert g.sh.shape == (2, 9, 3)
+    torch.testing.assert_close(g.sh[:, 0] * 0.28209479177387814 + 0.5, torch.tensor(colors / 255, dtype=torch.float32))
+    assert float(g.sh[:, 1:].abs().max()) == 0
+
+
+def test_first_discs_are_turned_every_way_and_first_ellipsoids_none():
+    points = np.random.default_rng(0).normal(size=(3000, 3))
+    normals = from_points(points, kind="2d").normals()
+    # The mean of n random unit vectors has length of about 1 / sqrt(n) = 0.018; their covariance is I / 3.
+    assert float(normals.mean(0).norm()) < 0.08
+    torch.testing.assert_close(normals.T @ normals / 3000, torch.eye(3) / 3, rtol=0, atol=0.03)
+    torch.testing.assert_close(from_points(points, kind="3d").rotations(), torch.eye(3).expand(3000, 3, 3))
+
+
+def test_points_at_one_place_become_one_splat():
+    g = from_points([[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0]], kind="3d")
+    assert len(g) == 2
+    torch.testing.assert_close(g.scales, torch.ones(2, 3))
+
+
+def test_one_point_alone_is_a_splat():
+    assert len(from_points([[1e6, 2e6, 3e6]], kind="2d")) == 1
+
+
+@pytest.mark.parametrize(
+    ("points", "colors", "message"),
+    [
+        (np.zeros((0, 3)), None, "points: got none"),
+        (np.zeros((2, 2)), None, r"points: got shape \(2, 2\)"),
+        (np.array([[0, 0, np.nan]]), None, r"points: nan at index \(0, 2\)"),
+        (np.zeros((1, 3)), np.zeros((1, 3)), "colors: got float64, expected uint8"),
+    ],
+)
+def test_points_that_cannot_be_used_are_refused(points, colors, message):
+    with pytest.raises(ValueError, match=message):
+        from_points(points, colors, kind="2d")
+
+
+def test_random_points_surround_what_the_cameras_look_at():
+    offset = np.array([100.0, -50.0, 7.0])
+    points, colors = random_points(ring(offset=offset), 5000, seed=2)
+    distance = np.linalg.norm(ring()[0].position)
+    assert colors.dtype == np.uint8 and len(points) == 5000
+    # The mean of n draws from a cube of half an edge h errs by h / sqrt(3 n) = 0.02 an axis.
+    np.testing.assert_allclose(points.mean(0), offset, atol=0.15)
+    assert np.abs(points - offset).max() == pytest.approx(distance, rel=0.1)
+
+
+def test_random_points_lie_in_front_of_parallel_cameras():
+    cameras = [Camera.look_at([x, 0, 0], [x, 5, 0], width=8, height=8, fov_y=40) for x in (-1.0, 0.0, 1.0)]
+    points, _ = random_points(cameras, 1000)
+    assert points[:, 1].mean() > 0.5
+
+
+def test_extent_is_that_of_3dgs_and_one_for_a_single_camera():
+    cameras = ring(4)
+    centers = np.stack([c.position for c in cameras])
+    assert extent_of(cameras) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    assert extent_of(cameras[:1]) == 1
+
+
+def camera(width=6, height=4, name="a.png"):
+    return Camera.look_at([3, 0, 0], [0, 0, 0], width=width, height=height, fov_y=40, name=name)
+
+
+def test_transparent_pixels_show_the_background():
+    image = np.zeros((4, 6, 4), np.uint8)
+    image[..., 0] = 255
+    image[0, 0, 3], image[0, 1, 3] = 255, 51
+    views = Views([camera()], [image])
+    assert views.transparent
+    seen = views.target(0, torch.tensor([0.0, 0.5, 1.0]))
+    torch.testing.assert_close(seen[0, 0], torch.tensor([1.0, 0, 0]))
+    torch.testing.assert_close(seen[0, 1], torch.tensor([0.2, 0.4, 0.8]))
+    torch.testing.assert_close(seen[1, 1], torch.tensor([0.0, 0.5, 1.0]))
+
+
+def test_an_opaque_alpha_channel_is_not_transparent():
+    assert not Views([camera()], [np.full((4, 6, 4), 255, np.uint8)]).transparent
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+def test_white_is_one_in_every_depth(dtype):
+    top = np.iinfo(dtype).max if np.dtype(dtype).kind == "u" else 1
+    seen = Views([camera()], [np.full((4, 6, 3), top, dtype)]).target(0, torch.zeros(3))
+    assert seen.dtype == torch.float32 and float(seen.min()) == 1
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 5, 3), np.uint8), r"images\[0\] \(a.png\): got 5 x 4 px, its camera has 6 x 4"),
+        (np.zeros((4, 6), np.uint8), r"got shape \(4, 6\)"),
+        (np.zeros((4, 6, 3), np.int32), "got int32"),
+        (np.full((4, 6, 3), 1.5, np.float32), r"got values in \[1.5, 1.5\]"),
+        (np.full((4, 6, 3), np.nan, np.float32), "not finite"),
+    ],
+)
+def test_pictures_that_cannot_be_used_are_refused_by_name(image, message):
+    with pytest.raises(ValueError, match=message):
+        Views([camera()], [image])
+
+
+def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
+    pixels = np.zeros((4, 6, 3), np.uint8)
+    pixels[:, :3] = 255
+    tags = Image.Exif()
+    tags[0x0112] = 6  # "turn by 90 degrees"
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=tags, quality=100)
+    image = read_image(tmp_path / "a.jpg")
+    assert image.shape == (4, 6, 3)
+    assert image[:, 0].min() > 200 and image[:, -1].max() < 50
+
+
+def test_files_come_as_rgb_in_their_own_depth(tmp_path):
+    rgb = np.array([[[60000, 3, 500]]], np.uint16)
+    cv2.imwrite(str(tmp_path / "deep.png"), rgb[..., ::-1])
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), rgb)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.array([[7, 8]], np.uint8))
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), [[[7] * 3, [8] * 3]])
+    rgba = np.array([[[1, 2, 3, 4]]], np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "clear.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "clear.png"), rgba)
+
+
+def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"nothing")
+    with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):
+        read_image(tmp_path / "a.png")
+
+
+def test_pictures_are_shrunk_by_area_and_their_cameras_with_them(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    big = camera(60, 40)
+    views = load_views(Dataset([big], [tmp_path / "a.png"]), max_size=30)
+    small = pixels.astype(float).reshape(20, 2, 30, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(views.images[0], small, atol=0.51)
+    np.testing.assert_allclose(views.cameras[0].K, big.resize(30, 20).K)
+
+
+def test_colour_of_transparent_pixels_does_not_bleed_when_shrunk(tmp_path):
+    pixels = np.zeros((8, 8, 4), np.uint8)
+    pixels[:, ::2] = [200, 100, 50, 255]
+    pixels[:, 1::2] = [0, 255, 0, 0]  # green that nobody can see
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    views = load_views(Dataset([camera(8, 8)], [tmp_path / "a.png"]), max_size=4)
+    np.testing.assert_allclose(views.images[0].astype(float), np.tile([200, 100, 50, 127.5], (4, 4, 1)), atol=1)
+
+
+def named(count, splits=None):
+    cameras = [camera(name=f"{k:02d}.png") for k in range(count)]
+    return Dataset(cameras[::-1], [None] * count, splits=splits or [])
+
+
+def test_one_of_eight_is_held_out_in_the_order_of_names():
+    train, test = hold_out(named(17))
+    assert [c.name for c in test.cameras] == ["16.png", "08.png", "00.png"]
+    assert len(train) == 14
+    everything, nothing = hold_out(named(17), 0)
+    assert len(everything) == 17 and nothing is None
+
+
+def test_a_data_sets_own_splits_are_kept_to():
+    train, test = hold_out(named(4, ["train", "val", "test", "train"]))
+    assert (len(train), len(test)) == (2, 1)
+    train, test = hold_out(named(3, ["train", "val", "train"]))
+    assert len(test) == 1
+    with pytest.raises(ValueError, match="none is 'train'"):
+        hold_out(named(2, ["val", "test"]))
+
+
+def test_a_single_picture_is_fitted_on_and_not_held_out():
+    train, test = hold_out(named(1))
+    assert len(train) == 1 and test is None
+
+
+def test_the_digest_knows_pixels_and_cameras_but_not_names():
+    image = np.zeros((4, 6, 3), np.uint8)
+    same = Views([camera(name="b.png")], [image.copy()])
+    other = image.copy()
+    other[0, 0, 0] = 1
+    assert Views([camera()], [image]).digest == same.digest
+    assert Views([camera()], [other]).digest != same.digest
+    assert Views([camera().moved([0, 0, 1e-9])], [image]).digest != same.digest
