@@ -218,6 +218,33 @@ def render(
     typer.echo(written[-1])
 
 
+@scenes_app.command()
+def export(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    out: Annotated[Path, typer.Argument(help="Folder; what is in it already is overwritten.")],
+    views: Annotated[int, typer.Option(min=1, help="Views around the scene; every 8th is of the split 'test'.")] = 64,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
+    points: Annotated[int, typer.Option(min=10, help="Points scattered about the surfaces.")] = 5000,
+    noise: Annotated[float, typer.Option(min=0, help="How far, in spacings between the points.")] = 0.5,
+    seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
+) -> None:
+    """Write a scene as transforms.json, images and points: what `attnwarp fit` and other programs read."""
+    from rich.console import Console
+
+    with clear_errors():
+        from attnwarp_eval import fitting
+        from attnwarp_eval.scene import load_scene
+
+        loaded = load_scene(scene)
+        with Console(stderr=True).status("points") as status:
+            fitting.export(
+                loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
+                progress=lambda text: status.update(f"{loaded.name}: {text}"),
+            )  # fmt: skip
+    typer.echo(out / "transforms.json")
+
+
 @app.command()
 def studies() -> None:
     """List the studies that ship with the package."""
