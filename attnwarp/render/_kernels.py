@@ -440,20 +440,29 @@ def outline(first, last, key, table, view, tiles_x, tiles_y, spans, begins, coun
 
 
 @bare
-def scatter(first, last, order, base, begins, counts, spans, fill, cursor, entries):
-    """Count (fill = False) or write (True) the entries of the splats order[first:last] in each tile.
+def scatter(first, last, order, base, begins, counts, spans, live, before, fill, cursor, entries):
+    """Count (fill = False) or write (True) the entries of the splats order[first:last] in each tile that is live.
 
-    ``base`` (chunks) is where the runs of each chunk of splats begin; ``cursor`` counts per tile, or holds the place in
+    ``base`` (chunks) is where the runs of each chunk of splats begin, ``before`` (tiles + 1) the number of live tiles
+    before each; ``cursor`` counts per tile, or holds the place in
     ``entries`` of the next one.
     """
     for place in range(first, last):
         i = order[place]
+        # In the order of depth, every access is a cache miss: ask early, for the runs' place first, then for the runs.
+        later, soon = order[min(place + 16, last - 1)], order[min(place + 6, last - 1)]
+        _prefetch(begins, later)
+        _prefetch(counts, later)
+        _prefetch(spans, 2 * (base[soon // CHUNK] + begins[soon]))
         begin = base[i // CHUNK] + begins[i]
         for k in range(begin, begin + counts[i]):
+            if before[spans[k, 0]] == before[spans[k, 0] + spans[k, 1]]:
+                continue
             for t in range(spans[k, 0], spans[k, 0] + spans[k, 1]):
-                if fill:
-                    entries[cursor[t]] = i
-                cursor[t] += 1
+                if live[t]:
+                    if fill:
+                        entries[cursor[t]] = i
+                    cursor[t] += 1
 
 
 @bare
@@ -547,13 +556,13 @@ def _shade_round(buf, table, i, ox, oy):
 
 
 @bare
-def forward(first, last, view, tiles_x, starts, entries, table, features, background, ndc_scale, color, alpha, depth,
-            median, normal, l1, l2, state, done, seen, counts, buf):  # fmt: skip
-    """Composite the tiles first..last.
+def forward(first, last, view, tiles_x, live, starts, entries, table, features, background, ndc_scale, color, alpha,
+            depth, median, normal, l1, l2, state, done, drawn_in, full, seen, buf):  # fmt: skip
+    """Composite those of the tiles first..last that are live.
 
-    ``state`` (5, H, W) keeps what the backward pass needs (transmittance, last and median entry, mean and spread of 1
-    / z), ``done`` the entries worked off in each tile, ``seen`` the sum of weights of each entry, ``counts`` [pairs,
-    contributing].
+    ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry, mean and spread of
+    1 / z. Per tile, ``done`` is the number of entries worked off, ``drawn_in`` that of contributing pairs, ``full``
+    whether every pixel has ended; ``seen`` is the sum of weights of each entry.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
@@ -562,10 +571,12 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
         # From the tile's middle: offsets are small, and so is what they round.
         buf[XS * 64 + p] = f32(p % TILE) - f32(3.5)
         buf[YS * 64 + p] = f32(p // TILE) - f32(3.5)
-    pairs, contributing = 0, 0
     stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
     for t in range(first, last):
+        if not live[t]:
+            continue
         begin, end = starts[t], starts[t + 1]
+        contributing = 0
         ty, tx = t // tiles_x, t % tiles_x
         ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
         cols, rows = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
@@ -648,8 +659,12 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                     left = max(left, buf[TT * 64 + p])
                 if left <= stop:
                     break
+        left = f32(0.0)
+        for p in range(PIXELS):
+            left = max(left, buf[TT * 64 + p])
+        full[t] = left <= stop
         done[t] = e - begin
-        pairs += (e - begin) * PIXELS
+        drawn_in[t] = contributing
         for r in range(rows):
             for k in range(cols):
                 p = r * TILE + k
@@ -671,8 +686,6 @@ def forward(first, last, view, tiles_x, starts, entries, table, features, backgr
                 state[2, y, x] = buf[MEDK * 64 + p]
                 state[3, y, x] = buf[IREF * 64 + p] + a1 / A if covered else f32(0.0)
                 state[4, y, x] = spread
-    counts[0] = pairs
-    counts[1] = contributing
 
 
 @bare

@@ -24,6 +24,8 @@ from attnwarp.render import _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
 BIN_CHUNKS = 8
+FRONT = 256
+"""Splats a tile to begin with in a deep scene: about as many as make a pixel opaque."""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
@@ -94,30 +96,42 @@ class _Scene:
         _threads.run(set_up, [(k,) for k in range(len(pieces))])
         self.order = kernels.radix_order(key)
         order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values])
-        self._bin(np.concatenate([np.empty((0, 2), np.int32), *spans]), [len(rows) for rows in spans], begins, counts)
+        self.spans = np.concatenate([np.empty((0, 2), np.int32), *spans])
+        self.base = np.concatenate([[0], np.cumsum([len(rows) for rows in spans], dtype=np.int64)])
+        self.begins, self.counts = begins, counts
+        # Filled by bin(), tile by tile of the lists that were used in the end.
+        self.starts = np.zeros(self.tiles, np.int64)
+        self.entries = np.empty(0, np.int32)
 
-    def _bin(self, spans: np.ndarray, lengths: list[int], begins: np.ndarray, counts: np.ndarray) -> None:
-        base = np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)])
-        size = max(256, -(-len(self.order) // BIN_CHUNKS))
-        pieces = _threads.ranges(len(self.order), size)
+    def front(self) -> int:
+        """How many of the nearest splats to begin with: all, unless they would make lists far longer than needed."""
+        length = int(self.spans[:, 1].sum(dtype=np.int64)) / self.tiles
+        return len(self.order) if length < 4 * FRONT else -(-len(self.order) * FRONT // int(length))
+
+    def bin(self, count: int, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lists of the nearest ``count`` splats in the tiles that are ``live``: (tiles + 1) starts, and entries."""
+        size = max(256, -(-count // BIN_CHUNKS))
+        pieces = _threads.ranges(count, size)
         cursors = np.zeros((max(1, len(pieces)), self.tiles), np.int64)
-        self.starts = np.zeros(self.tiles + 1, np.int64)
+        starts = np.zeros(self.tiles + 1, np.int64)
         entries = np.empty(0, np.int32)
+        before = np.concatenate([[0], np.cumsum(live, dtype=np.int64)])
         for fill in (False, True):
             jobs = [
-                (*piece, self.order, base, begins, counts, spans, fill, cursors[k], entries)
+                (*piece, self.order, self.base, self.begins, self.counts, self.spans, live, before, fill, cursors[k],
+                 entries)
                 for k, piece in enumerate(pieces)
-            ]
+            ]  # fmt: skip
             _threads.run(kernels.scatter, jobs)
             if not fill:
-                kernels.place_cursors(cursors, self.starts)
-                entries = np.empty(self.starts[-1], np.int32)
-        self.entries = entries
+                kernels.place_cursors(cursors, starts)
+                entries = np.empty(starts[-1], np.int32)
+        return starts, entries
 
-    def tile_ranges(self) -> list[tuple[int, int]]:
+    def tile_ranges(self, starts: np.ndarray) -> list[tuple[int, int]]:
         """Consecutive tiles in pieces of about equal work."""
         pieces = 8 * _threads.count()
-        cost = self.starts + 32 * np.arange(self.tiles + 1)
+        cost = starts + 32 * np.arange(self.tiles + 1)
         cuts = np.unique(np.searchsorted(cost, np.linspace(0, cost[-1], pieces + 1)[1:-1]))
         edges = [0, *(int(c) for c in cuts if 0 < c < self.tiles), self.tiles]
         return list(itertools.pairwise(edges))
@@ -136,29 +150,44 @@ class _Composite(torch.autograd.Function):
         normal = np.empty((h, w, 3), np.float32)
         alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
         state = np.empty((5, h, w), np.float32)
-        done = np.zeros(scene.tiles, np.int64)
-        seen = np.empty(len(scene.entries), np.float32)
-        jobs = scene.tile_ranges()
-        counts = np.zeros((len(jobs), 2), np.int64)
+        done, drawn = np.zeros(scene.tiles, np.int64), np.zeros(scene.tiles, np.int64)
+        full = np.zeros(scene.tiles, np.bool_)
         slots = kernels.SLOTS + max(0, scene.channels - 3)
-        _threads.run(
-            kernels.forward,
-            [
-                (*job, scene.view, scene.tiles_x, scene.starts, scene.entries, scene.table, scene.features,
-                 scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, seen, counts[k],
-                 _aligned(slots * kernels.PIXELS))
-                for k, job in enumerate(jobs)
-            ],
-        )  # fmt: skip
+        live = np.ones(scene.tiles, np.bool_)
+        count, worked_off = scene.front(), 0
+        lists: list[np.ndarray] = []
+        weights: list[np.ndarray] = []
+        # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
+        while True:
+            starts, entries = scene.bin(count, live)
+            seen = np.empty(len(entries), np.float32)
+            _threads.run(
+                kernels.forward,
+                [
+                    (*job, scene.view, scene.tiles_x, live, starts, entries, scene.table, scene.features,
+                     scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, drawn, full,
+                     seen, _aligned(slots * kernels.PIXELS))
+                    for job in scene.tile_ranges(starts)
+                ],
+            )  # fmt: skip
+            scene.starts[live] = sum(len(part) for part in lists) + starts[:-1][live]
+            lists.append(entries)
+            weights.append(seen)
+            worked_off += int(done[live].sum())
+            live = live & ~full
+            if count == len(scene.order) or not live.any():
+                break
+            count = len(scene.order)
+        scene.entries = np.concatenate(lists)
         weight = np.zeros(len(scene.means), np.float32)
-        kernels.gather_weights(scene.starts, done, scene.entries, seen, weight)
+        kernels.gather_weights(scene.starts, done, scene.entries, np.concatenate(weights), weight)
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
             tiles=scene.tiles,
-            tile_pairs=int(done.sum()),
-            pairs=int(counts[:, 0].sum()),
-            contributing=int(counts[:, 1].sum()),
+            tile_pairs=worked_off,
+            pairs=worked_off * kernels.PIXELS,
+            contributing=int(drawn.sum()),
         )
         ctx.scene, ctx.state, ctx.alpha, ctx.depth, ctx.done, ctx.scale = scene, state, alpha, depth, done, scale
         ctx.origin = _array(inputs.origin, np.float64)
