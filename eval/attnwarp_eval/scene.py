@@ -12,6 +12,7 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -22,8 +23,10 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from attnwarp.camera import Camera
 from attnwarp_eval import shapes
+from attnwarp_eval.bodies import BodySpec
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.errors import InputError
+from attnwarp_eval.nature import ScatterSpec, TerrainSpec
 from attnwarp_eval.optics import (
     TEXTURED,
     DiffuseMaterial,
@@ -37,7 +40,7 @@ from attnwarp_eval.optics import (
     contradictions,
 )
 from attnwarp_eval.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
-from attnwarp_eval.textures import LATER, Color, Direction, Plain, Spec, Texture, linear_rgb
+from attnwarp_eval.textures import LATER, Color, Direction, Plain, Spec, Texture
 
 Array = npt.NDArray[np.float64]
 Vector = tuple[float, float, float]
@@ -95,42 +98,6 @@ class BoxSpec(Spec):
     repeat: Repeat | None = None
 
 
-class EllipsoidPart(Spec):
-    """An ellipsoid with radii along x, y, z, pitched about y."""
-
-    type: Literal["ellipsoid"]
-    center: Vector
-    radii: tuple[Positive, Positive, Positive]
-    pitch: float = 0.0
-    mirror: bool = False
-    color: Color = "#ffffff"
-    blend: bool = True
-
-
-class CapsulePart(Spec):
-    """A rod with round ends, its radius running from the first of ``radii`` to the second."""
-
-    type: Literal["capsule"]
-    start: Vector
-    end: Vector
-    radii: tuple[Positive, Positive]
-    mirror: bool = False
-    color: Color = "#ffffff"
-    blend: bool = True
-
-
-class BodySpec(Spec):
-    """A body of blended parts (signed distances), meshed by marching cubes. ``mirror`` doubles a part across y = 0."""
-
-    type: Literal["body"]
-    parts: tuple[Annotated[EllipsoidPart | CapsulePart, Field(discriminator="type")], ...] = Field(min_length=1)
-    blend: float = Field(0.1, ge=0)
-    resolution: int = Field(128, ge=8, le=512)
-    position: Vector = (0.0, 0.0, 0.0)
-    yaw: float = 0.0
-    scale: Positive = 1.0
-
-
 class MeshSpec(Spec):
     """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright axis."""
 
@@ -142,7 +109,9 @@ class MeshSpec(Spec):
     up: Literal["y", "z"] = "z"
 
 
-ShapeSpec = Annotated[SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec, Field(discriminator="type")]
+ShapeSpec = Annotated[
+    SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec | TerrainSpec | ScatterSpec, Field(discriminator="type")
+]
 
 
 class ObjectSpec(Spec):
@@ -338,8 +307,7 @@ class Scene:
                     step = np.array(spec.repeat.step) * k if spec.repeat else np.zeros(3)
                     yield Box(np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id)
             case BodySpec():
-                mesh = shapes.mesh_body(_parts(spec), spec.blend, spec.resolution)
-                yield _placed(mesh, _turn_z(spec.yaw), spec.scale, spec.position, object_id)
+                yield _placed(spec.mesh(), _turn_z(spec.yaw), spec.scale, spec.position, object_id)
             case MeshSpec():
                 path = self.mesh_path(spec)
                 try:
@@ -348,6 +316,20 @@ class Scene:
                     raise SceneError(str(error), self.path) from error
                 upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
                 yield _placed(mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id)
+            case TerrainSpec():
+                yield replace(spec.mesh(), object_id=object_id)
+            case ScatterSpec():
+                yield replace(spec.mesh(self._ground(spec)), object_id=object_id)
+
+    def _ground(self, spec: ScatterSpec) -> Callable[[Array], Array]:
+        """Height of what things are strewn on."""
+        for item in self.spec.objects:
+            if item.name == spec.on and isinstance(item.shape, TerrainSpec):
+                return item.shape.height_at
+            if item.name == spec.on and isinstance(item.shape, RectangleSpec):
+                level = item.shape.center[2]
+                return lambda xy: np.full(len(xy), level)
+        return lambda xy: np.full(len(xy), spec.center[2])
 
     def mesh_path(self, spec: MeshSpec) -> Path:
         """Where the mesh file of an object lies."""
@@ -384,22 +366,6 @@ def _turn_y(degrees: float) -> Array:
 def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int) -> Mesh:
     moved = mesh.turned(R).moved(scale, position)
     return Mesh(moved.vertices, moved.faces, moved.normals, moved.tint, object_id)
-
-
-def _parts(spec: BodySpec) -> list[shapes.Part]:
-    parts: list[shapes.Part] = []
-    for part in spec.parts:
-        color = linear_rgb(part.color)
-        for side in (1.0, -1.0) if part.mirror else (1.0,):
-
-            def flip(v: Vector, side: float = side) -> Vector:
-                return (v[0], v[1] * side, v[2])
-
-            if isinstance(part, EllipsoidPart):
-                parts.append(shapes.Ellipsoid(flip(part.center), part.radii, part.pitch, color, part.blend))
-            else:
-                parts.append(shapes.Capsule(flip(part.start), flip(part.end), part.radii, color, part.blend))
-    return parts
 
 
 def view_name(view: ViewSpec, index: int) -> str:
@@ -593,6 +559,16 @@ def _check(scene: Scene, root: yaml.Node) -> None:
             refuse(f"objects[{k}].name: {item.name!r} is also the name of objects[{names[item.name]}]; rename one",
                    "objects", k, "name")  # fmt: skip
         names[item.name] = k
+        if isinstance(item.shape, ScatterSpec):
+            on = item.shape.on
+            grounds = [o.name for o in scene.spec.objects if isinstance(o.shape, TerrainSpec | RectangleSpec)]
+            here = ("objects", k, "shape")
+            if on is not None and on not in grounds:
+                refuse(f"objects[{k}].shape.on: got {on!r}{_suggest(on, grounds)}; expected the name of a terrain or "
+                       f"a rectangle of this scene: {', '.join(grounds) or 'there is none'}", *here, "on")  # fmt: skip
+            if not len(item.shape.places()):
+                refuse(f"objects[{k}].shape.avoid: leaves no room for any of the {item.shape.count}; make it smaller "
+                       "or the radius larger", *here, "avoid")  # fmt: skip
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
             where = ("objects", k, "shape", "file")
@@ -645,12 +621,7 @@ def _inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
     """A test whether a point is inside the object. A body is asked by its distance, which needs no meshing."""
     spec = item.shape
     if isinstance(spec, BodySpec):
-        parts, R, offset = _parts(spec), _turn_z(spec.yaw), np.array(spec.position)
-
-        def within(point: Array) -> bool:
-            local = (point - offset) @ R / spec.scale
-            return bool(shapes.body_distance(parts, spec.blend, local[None])[0] < 0)
-
-        return within
+        R, offset = _turn_z(spec.yaw), np.array(spec.position)
+        return lambda point: spec.contains((point - offset) @ R / spec.scale)
     solids = list(scene._build(item, 0))
     return lambda point: any(solid.contains(point) for solid in solids)

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.textures import fractal_noise
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -162,11 +163,14 @@ class Mesh:
         return np.stack([used.min(0), used.max(0)])
 
     def contains(self, point: Array) -> bool:
-        """Whether the (3,) ``point`` lies inside, by the generalised winding number.
+        """Whether the (3,) ``point`` lies inside, by the generalised winding number; never outside the bounding box.
 
         A solid angle of more than half the sphere counts as inside, so small holes and a few duplicated faces do
         not change the answer (Jacobson et al. 2013; triangle angles after Van Oosterom and Strackee 1983).
         """
+        low, high = self.bounds()
+        if (point < low).any() or (point > high).any():
+            return False
         a, b, c = (self.vertices[self.faces[:, k]] - point for k in range(3))
         la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
         numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -216,19 +220,57 @@ Shape = Sphere | Rectangle | Box | Mesh
 
 
 @dataclass(frozen=True)
-class Ellipsoid:
-    """Part of a body: an ellipsoid with its ``radii`` along x, y, z, pitched about the y axis by ``pitch`` degrees."""
+class _Part:
+    """What every part of a body has.
+
+    Attributes:
+        color: linear RGB.
+        blend: True to join it to the parts before it in the body's own width, False for a sharp joint, or a width.
+        carve: it is taken away from the blended parts before it.
+    """
+
+    color: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), kw_only=True)
+    blend: bool | float = field(default=True, kw_only=True)
+    carve: bool = field(default=False, kw_only=True)
+
+    def row(self) -> list[float]:
+        """What the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the body's), shape."""
+        mode = 2.0 if self.carve else float(bool(self.blend))
+        width = -1.0 if isinstance(self.blend, bool) else float(self.blend)
+        shape = [*self._shape(), *([0.0] * 13)]
+        return [self._kind(), mode, width, *shape[:13]]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        raise TypeError(f"{type(self).__name__} says no reach")
+
+    def _kind(self) -> float:
+        raise TypeError(f"{type(self).__name__} says no kind")
+
+    def _shape(self) -> list[float]:
+        raise TypeError(f"{type(self).__name__} says no shape")
+
+
+def _turn(yaw: float, pitch: float, roll: float) -> list[float]:
+    a = np.radians([pitch, yaw, roll])
+    return [float(f(x)) for x in a for f in (np.cos, np.sin)]
+
+
+@dataclass(frozen=True)
+class Ellipsoid(_Part):
+    """An ellipsoid with its ``radii`` along its own x, y, z: rolled about x, pitched about y, then turned about z."""
 
     center: tuple[float, float, float]
     radii: tuple[float, float, float]
     pitch: float = 0.0
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    blend: bool = True
+    yaw: float = 0.0
+    roll: float = 0.0
 
-    def row(self) -> list[float]:
-        """What the kernels read: kind 0, blend, center, radii, cosine and sine of the pitch."""
-        a = np.radians(self.pitch)
-        return [0.0, float(self.blend), *self.center, *self.radii, float(np.cos(a)), float(np.sin(a))]
+    def _kind(self) -> float:
+        return 0.0
+
+    def _shape(self) -> list[float]:
+        return [*self.center, *self.radii, *_turn(self.yaw, self.pitch, self.roll)]
 
     def reach(self) -> Array:
         """(2, 3) box that holds the part."""
@@ -237,18 +279,18 @@ class Ellipsoid:
 
 
 @dataclass(frozen=True)
-class Capsule:
-    """Part of a body: a rod from ``start`` to ``end`` whose radius goes from ``radii[0]`` to ``radii[1]``."""
+class Capsule(_Part):
+    """A rod from ``start`` to ``end`` whose radius goes from ``radii[0]`` to ``radii[1]``."""
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
     radii: tuple[float, float]
-    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    blend: bool = True
 
-    def row(self) -> list[float]:
-        """What the kernels read: kind 1, blend, start, end, radii."""
-        return [1.0, float(self.blend), *self.start, *self.end, *self.radii]
+    def _kind(self) -> float:
+        return 1.0
+
+    def _shape(self) -> list[float]:
+        return [*self.start, *self.end, *self.radii]
 
     def reach(self) -> Array:
         """(2, 3) box that holds the part."""
@@ -256,25 +298,118 @@ class Capsule:
         return np.stack([ends.min(0) - r, ends.max(0) + r])
 
 
-Part = Ellipsoid | Capsule
+@dataclass(frozen=True)
+class Torus(_Part):
+    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z; turned as an :class:`Ellipsoid` is."""
+
+    center: tuple[float, float, float]
+    radii: tuple[float, float]
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 2.0
+
+    def _shape(self) -> list[float]:
+        return [*self.center, *self.radii, 0.0, *_turn(self.yaw, self.pitch, self.roll)]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), sum(self.radii)
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Block(_Part):
+    """A box of ``size`` along its own x, y, z with edges rounded by ``round``; turned as an :class:`Ellipsoid` is."""
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    round: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 3.0
+
+    def _shape(self) -> list[float]:
+        half = (x / 2 - self.round for x in self.size)
+        return [*self.center, *half, *_turn(self.yaw, self.pitch, self.roll), self.round]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), float(np.linalg.norm(self.size)) / 2
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Disc(_Part):
+    """An upright cylinder of ``radius`` and ``height``, edges rounded by ``round``; turned as an Ellipsoid is."""
+
+    center: tuple[float, float, float]
+    radius: float
+    height: float
+    round: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 4.0
+
+    def _shape(self) -> list[float]:
+        shape = [self.radius - self.round, self.height / 2 - self.round, 0.0]
+        return [*self.center, *shape, *_turn(self.yaw, self.pitch, self.roll), self.round]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), math.hypot(self.radius, self.height / 2)
+        return np.stack([c - r, c + r])
+
+
+Part = Ellipsoid | Capsule | Torus | Block | Disc
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Noise that moves a body's surface out and in by up to ``depth``, with features of ``size``."""
+
+    depth: float
+    size: float
+    octaves: int = 3
+    seed: int = 0
 
 
 @numba.njit(cache=True, nogil=True)
 def _part_distance(x: float, y: float, z: float, part: Array) -> float:
-    x, y, z = x - part[2], y - part[3], z - part[4]
+    x, y, z = x - part[3], y - part[4], z - part[5]
+    if part[0] == 1.0:
+        # Capsule: distance from the segment, less the radius there.
+        bx, by, bz = part[6] - part[3], part[7] - part[4], part[8] - part[5]
+        length = bx * bx + by * by + bz * bz
+        along = min(max((x * bx + y * by + z * bz) / length, 0.0), 1.0) if length > 0 else 0.0
+        gap = math.sqrt((x - along * bx) ** 2 + (y - along * by) ** 2 + (z - along * bz) ** 2)
+        return gap - (part[9] + along * (part[10] - part[9]))
+    # Into the part's own axes: back by the yaw, the pitch and the roll.
+    x, y = part[11] * x + part[12] * y, part[11] * y - part[12] * x
+    x, z = part[9] * x - part[10] * z, part[10] * x + part[9] * z
+    y, z = part[13] * y + part[14] * z, part[13] * z - part[14] * y
     if part[0] == 0.0:
         # Ellipsoid: |q|(|q| - 1) / |q / r| with q = p / r, a bound of the distance (Quilez, "ellipsoid - distance").
-        c, s = part[8], part[9]
-        qx, qy, qz = (c * x - s * z) / part[5], y / part[6], (s * x + c * z) / part[7]
+        qx, qy, qz = x / part[6], y / part[7], z / part[8]
         k0 = math.sqrt(qx * qx + qy * qy + qz * qz)
-        k1 = math.sqrt((qx / part[5]) ** 2 + (qy / part[6]) ** 2 + (qz / part[7]) ** 2)
-        return k0 * (k0 - 1) / k1 if k1 > 0 else -min(part[5], part[6], part[7])
-    # Capsule: distance from the segment, less the radius there.
-    bx, by, bz = part[5] - part[2], part[6] - part[3], part[7] - part[4]
-    length = bx * bx + by * by + bz * bz
-    along = min(max((x * bx + y * by + z * bz) / length, 0.0), 1.0) if length > 0 else 0.0
-    gap = math.sqrt((x - along * bx) ** 2 + (y - along * by) ** 2 + (z - along * bz) ** 2)
-    return gap - (part[8] + along * (part[9] - part[8]))
+        k1 = math.sqrt((qx / part[6]) ** 2 + (qy / part[7]) ** 2 + (qz / part[8]) ** 2)
+        return k0 * (k0 - 1) / k1 if k1 > 0 else -min(part[6], part[7], part[8])
+    if part[0] == 2.0:
+        return math.sqrt((math.sqrt(x * x + y * y) - part[6]) ** 2 + z * z) - part[7]
+    if part[0] == 3.0:
+        dx, dy, dz = abs(x) - part[6], abs(y) - part[7], abs(z) - part[8]
+        out = math.sqrt(max(dx, 0.0) ** 2 + max(dy, 0.0) ** 2 + max(dz, 0.0) ** 2)
+        return out + min(max(dx, dy, dz), 0.0) - part[15]
+    dr, dz = math.sqrt(x * x + y * y) - part[6], abs(z) - part[7]
+    return math.sqrt(max(dr, 0.0) ** 2 + max(dz, 0.0) ** 2) + min(max(dr, dz), 0.0) - part[15]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -284,11 +419,19 @@ def _body_distance(points: Array, parts: Array, blend: float) -> Array:
         soft, hard = np.inf, np.inf
         for k in range(parts.shape[0]):
             d = _part_distance(points[i, 0], points[i, 1], points[i, 2], parts[k])
+            width = blend if parts[k, 2] < 0 else parts[k, 2]
             if parts[k, 1] == 0.0:
                 hard = min(hard, d)
-            elif blend > 0 and soft < np.inf:
-                h = min(max(0.5 + 0.5 * (soft - d) / blend, 0.0), 1.0)
-                soft = soft + h * (d - soft) - blend * h * (1 - h)
+            elif parts[k, 1] == 2.0:
+                # What is carved is the smooth maximum with the part turned inside out.
+                if width > 0 and soft < np.inf:
+                    h = min(max(0.5 + 0.5 * (-soft - d) / width, 0.0), 1.0)
+                    soft = -(-soft + h * (d + soft) - width * h * (1 - h))
+                else:
+                    soft = max(soft, -d)
+            elif width > 0 and soft < np.inf:
+                h = min(max(0.5 + 0.5 * (soft - d) / width, 0.0), 1.0)
+                soft = soft + h * (d - soft) - width * h * (1 - h)
             else:
                 soft = min(soft, d)
         out[i] = min(soft, hard)
@@ -310,68 +453,93 @@ def _table(parts: Sequence[Part]) -> Array:
     return np.array([part.row() for part in parts], dtype=np.float64)
 
 
-def body_distance(parts: Sequence[Part], blend: float, points: npt.ArrayLike) -> Array:
+def body_distance(parts: Sequence[Part], blend: float, points: npt.ArrayLike, relief: Relief | None = None) -> Array:
     """Signed distance bound of a body, negative inside.
 
-    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend``; the others (eyes, a
-    nose) are joined sharply.
+    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend`` or their own; the others
+    (eyes, a nose) are joined sharply. A part that carves is taken away from the blended ones before it.
 
     Args:
         parts: at least one.
         blend: width of the joints in scene units, 0 for sharp ones.
         points: (N, 3).
+        relief: noise added to the distance.
 
     Returns:
         (N,) float64.
     """
-    return _body_distance(np.ascontiguousarray(points, dtype=np.float64), _table(parts), float(blend))
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    distance = _body_distance(points, _table(parts), float(blend))
+    if relief is not None:
+        near = np.flatnonzero(np.abs(distance) < 4 * relief.depth)
+        noise = fractal_noise(points[near] / relief.size, relief.octaves, relief.seed)
+        distance[near] += relief.depth * (1 - 2 * noise)
+    return distance
 
 
 def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
     distances = _part_distances(points, _table(parts))
     # A sharp part owns its whole surface; blended parts share their colours across the joint.
-    weights = np.exp(-np.clip(distances - distances.min(0), 0, None) / max(width, 1e-12))
+    solid = [not part.carve for part in parts]
+    nearest = distances[solid].min(0)
+    weights = np.exp(-np.clip(distances - nearest, 0, None) / max(width, 1e-12))
     for k, part in enumerate(parts):
-        if not part.blend:
-            mine = distances[k] < 1e-3 * width + 1e-9
+        if part.carve:
+            weights[k] = 0
+        # A cut without a colour of its own shows that of what was cut.
+        if not part.blend or (part.carve and part.color != (1.0, 1.0, 1.0)):
+            mine = (np.abs(distances[k]) if part.carve else distances[k]) < 1e-3 * width + 1e-9
             weights[:, mine] = 0
             weights[k, mine] = 1
     colors = np.array([part.color for part in parts])
     return (weights.T @ colors) / weights.sum(0)[:, None]
 
 
-def mesh_body(parts: Sequence[Part], blend: float, resolution: int) -> Mesh:
+def mesh_body(parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None = None) -> Mesh:
     """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the distance.
 
     Args:
-        parts: see :func:`body_distance`.
+        parts, blend, relief: see :func:`body_distance`.
         resolution: cells along the longest side of the bounding box.
 
     Returns:
         A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by content.
     """
-    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key.
-    key = content_key("body", MESHING_PROTOCOL, [repr(part) for part in parts], blend, resolution)
+    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours are no part of
+    # it: a body painted otherwise is the same mesh.
+    bare = [replace(part, color=(1.0, 1.0, 1.0)) for part in parts]
+    key = content_key("body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief))
     stored = read_arrays("meshes", key)
     if stored is None:
-        stored = _march(parts, blend, resolution)
+        stored = _march(parts, blend, resolution, relief)
         write_arrays("meshes", key, stored)
-    return Mesh(stored["vertices"], stored["faces"], stored["normals"], stored["tint"])
+    step = _lattice_of(parts, resolution)[2]
+    tint = _part_colors(parts, max(blend, step) / 3, stored["vertices"])
+    return Mesh(stored["vertices"], stored["faces"], stored["normals"], tint)
 
 
-def _march(parts: Sequence[Part], blend: float, resolution: int) -> dict[str, npt.NDArray]:
+def _lattice_of(parts: Sequence[Part], resolution: int) -> tuple[Array, Array, float]:
+    reach = np.stack([part.reach() for part in parts if not part.carve])
+    low, high = reach[:, 0].min(0), reach[:, 1].max(0)
+    return low, high, float((high - low).max() / resolution)
+
+
+def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None) -> dict[str, npt.NDArray]:
     from skimage.measure import marching_cubes
 
-    reach = np.stack([part.reach() for part in parts])
-    low, high = reach[:, 0].min(0), reach[:, 1].max(0)
-    step = float((high - low).max() / resolution)
-    low, high = low - 2 * step - blend / 4, high + 2 * step + blend / 4
+    low, high, step = _lattice_of(parts, resolution)
+    depth = relief.depth if relief else 0.0
+    low, high = low - 2 * step - blend / 4 - depth, high + 2 * step + blend / 4 + depth
+
+    def distance(points: Array) -> Array:
+        return body_distance(parts, blend, points, relief)
+
     counts = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
     volume = np.empty(counts)
     for i, x in enumerate(axes[0]):  # slab by slab: a whole grid of points would take gigabytes at high resolutions
         slab = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), -1).reshape(-1, 3)
-        volume[i] = body_distance(parts, blend, slab).reshape(counts[1:])
+        volume[i] = distance(slab).reshape(counts[1:])
     if volume.min() >= 0:
         raise ValueError(f"body: no part is thick enough to be seen at resolution {resolution}; raise it")
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent")
@@ -380,17 +548,11 @@ def _march(parts: Sequence[Part], blend: float, resolution: int) -> dict[str, np
     def gradient(points: Array) -> Array:
         e = 1e-4 * step
         shifts = np.eye(3) * e
-        return np.stack(
-            [
-                (body_distance(parts, blend, points + s) - body_distance(parts, blend, points - s)) / (2 * e)
-                for s in shifts
-            ],
-            axis=-1,
-        )
+        return np.stack([(distance(points + s) - distance(points - s)) / (2 * e) for s in shifts], axis=-1)
 
     for _ in range(2):
         g = gradient(vertices)
-        move = body_distance(parts, blend, vertices) / np.maximum((g**2).sum(-1), 1e-12)
+        move = distance(vertices) / np.maximum((g**2).sum(-1), 1e-12)
         # Half a cell at most, so that creases, where the gradient jumps, cannot fold the mesh.
         vertices = vertices - g * np.clip(move, -0.5 * step, 0.5 * step)[:, None]
     normals = gradient(vertices)
@@ -407,7 +569,6 @@ def _march(parts: Sequence[Part], blend: float, resolution: int) -> dict[str, np
         "vertices": mesh.vertices,
         "faces": np.ascontiguousarray(mesh.faces),
         "normals": normals,
-        "tint": _part_colors(parts, max(blend, step) / 3, vertices),
     }
 
 
