@@ -136,10 +136,10 @@ def _print_failures(summary: Summary) -> None:
     Console(stderr=True).print(table)
 
 
-def _write_report(store: Store, *, timings: bool = True) -> None:
+def _write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> None:
     from attnwarp_eval.report import write_report
 
-    for path in write_report(store, timings=timings):
+    for path in write_report(store, timings=timings, pictures=pictures):
         typer.echo(path)
 
 
@@ -147,12 +147,13 @@ def _write_report(store: Store, *, timings: bool = True) -> None:
 def report(
     run: Annotated[Path, typer.Argument(help="The run's folder.")],
     timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
+    pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
 ) -> None:
     """Make report.md, report.html and results.jsonl again from the cells of a run."""
     from attnwarp_eval.ablation.store import Store
 
     with clear_errors():
-        _write_report(Store(run), timings=timings)
+        _write_report(Store(run), timings=timings, pictures=pictures)
 
 
 @app.command()

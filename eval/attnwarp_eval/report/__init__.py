@@ -11,13 +11,14 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 
-def write_report(store: Store, *, timings: bool = True) -> list[Path]:
+def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> list[Path]:
     """Write the report of a run's folder, from whatever cells are done.
 
     Args:
         store: the run.
         timings: False leaves out everything measured in seconds or memory, so that two runs of the same study on the
             same code give the same bytes.
+        pictures: False leaves out the views' pictures, for a report that is kept beside the code or in a CI summary.
 
     Returns:
         The files written, the one a person opens first at the end.
@@ -28,7 +29,7 @@ def write_report(store: Store, *, timings: bool = True) -> list[Path]:
     from attnwarp_eval.report.write import markdown, page
 
     results = Results.of(store)
-    report = build(results, store.root, timings=timings)
+    report = build(results, store.root, timings=timings, pictures=pictures)
     files = {
         "results.jsonl": "".join(f"{line}\n" for line in results.lines(timings)),
         "report.md": markdown(report),

@@ -82,13 +82,14 @@ def spread(value: Interval) -> str:
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{lost}"
 
 
-def build(results: Results, root: Path, *, timings: bool = True) -> Report:
+def build(results: Results, root: Path, *, timings: bool = True, pictures: bool = True) -> Report:
     """The report's content; figures are written below ``root``/figures.
 
     Args:
         results: of the run.
         root: the run's folder.
         timings: whether anything measured in seconds or bytes of memory is shown.
+        pictures: whether the views' pictures are shown.
     """
     study = results.study
     total = len(results.cells)
@@ -107,7 +108,7 @@ def build(results: Results, root: Path, *, timings: bool = True) -> Report:
         *fits(results, root, number, timings=timings),
         *_yaw(results, root),
         *(fronts(results, root, number, spread) if timings else []),
-        *_galleries(results),
+        *(_galleries(results) if pictures else []),
         *_failures(results),
         _how(results, timings),
     ]

@@ -123,7 +123,7 @@ class Results:
                 metric = metric_of(name)
                 if metric.unit == "pixels":
                     continue  # counts that describe; they stay in the cell's own file
-                values = {v["view"]: v["metrics"].get(name) for v in record["views"]}
+                values = {v["view"]: _shortened(v["metrics"].get(name)) for v in record["views"]}
                 known = [v for v in values.values() if v is not None]
                 row = {
                     "scene": cell["scene"],
@@ -136,7 +136,7 @@ class Results:
                     "unit": metric.unit,
                     "direction": metric.direction,
                     "version": metric.version,
-                    "value": sum(known) / len(known) if known else None,
+                    "value": _shortened(sum(known) / len(known)) if known else None,
                     "n": len(known),
                     "undefined": len(values) - len(known),
                     "views": values,
@@ -148,3 +148,8 @@ class Results:
                 key = tuple(str(row[k]) for k in ("scene", "probe", "variant", "seed", "metric"))
                 rows.append((key, canonical_json(row)))
         return [text for _, text in sorted(rows)]
+
+
+def _shortened(value: float | None) -> float | None:
+    """Nine significant digits: more than any tolerance asks for. The cells keep every bit."""
+    return None if value is None else float(f"{value:.9g}")
