@@ -55,17 +55,18 @@ def clear_errors() -> Iterator[None]:
         raise fail(str(error)) from None
 
 
-@app.callback()
-def common(
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")] = None,
-) -> None:
-    """What holds for every command."""
-    if threads is not None:
-        import cv2
-        import torch
+def _use_threads(threads: int | None) -> None:
+    """Threads for the renderer alone: the rest is too small for them, and its bits would depend on their number."""
+    import os
 
-        torch.set_num_threads(threads)
-        cv2.setNumThreads(threads)
+    import cv2
+    import torch
+
+    from attnwarp.render import _threads
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    _threads.choose(threads or len(os.sched_getaffinity(0)))
 
 
 @app.command()
@@ -84,12 +85,16 @@ def fit(
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; see docs/fitting.md.")
     ] = None,
     checkpoint_seconds: Annotated[float, typer.Option(min=0, help="Write what there is so often.")] = 30.0,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")] = None,
     restart: Annotated[bool, typer.Option("--restart", help="Begin again, whatever is in the folder.")] = False,
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
     with clear_errors():
+        # What needs nothing heavy is read first: a typing error is answered at once.
+        given = _assignments(change or [])
+        _use_threads(threads)
         result = _fit(data, out, kind, iterations, max_seconds, max_size, max_splats, points, hold_out, seed,
-                      change or [], checkpoint_seconds, restart)  # fmt: skip
+                      given, checkpoint_seconds, restart)  # fmt: skip
     last = result.history[-1]
     held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
     typer.echo(
@@ -112,12 +117,11 @@ def _fit(
     points: int,
     every: int,
     seed: int,
-    changes: list[str],
+    given: dict[str, Any],
     checkpoint_seconds: float,
     restart: bool,
 ) -> Fit:
-    # The options that need nothing heavy are read first: a typing error is answered at once.
-    given = {**_assignments(changes), "kind": kind.value[:2], "seed": seed}
+    given = {**given, "kind": kind.value[:2], "seed": seed}
     if iterations is not None:
         given["iterations"] = iterations
     if max_splats is not None:
@@ -230,6 +234,7 @@ def render(
     size: Annotated[int | None, typer.Option(min=1, help="Longest side in px; the cameras' own if left out.")] = None,
     near: Annotated[float, typer.Option(help="Nothing nearer than this is drawn, scene units.")] = 0.01,
     depth: Annotated[bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")] = False,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")] = None,
     normal: Annotated[bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")] = False,
 ) -> None:
     """Render splats from every camera of a data set; the images need not be there."""
@@ -242,6 +247,7 @@ def render(
         from attnwarp.io._file import write_atomically
         from attnwarp.render import render as draw
 
+        _use_threads(threads)
         splats = read_ply(model)
         views = read_dataset(cameras, missing_images="none").cameras
         out.mkdir(parents=True, exist_ok=True)

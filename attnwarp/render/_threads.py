@@ -28,9 +28,24 @@ def _forget() -> None:
 os.register_at_fork(after_in_child=_forget)
 
 
+_chosen: int | None = None
+
+
+def choose(threads: int | None) -> None:
+    """Use so many threads from now on, whatever torch is set to; None: torch's setting again.
+
+    A fit spends the rest of its time in tensor operations too small to gain from torch's threads, which then only
+    wait, and wait by spinning.
+    """
+    global _chosen
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads: got {threads}, expected at least 1")
+    _chosen = threads
+
+
 def count() -> int:
-    """Threads to use: torch's own setting, ``torch.set_num_threads``."""
-    return max(1, torch.get_num_threads())
+    """Threads to use: those chosen, or else torch's own setting, ``torch.set_num_threads``."""
+    return _chosen or max(1, torch.get_num_threads())
 
 
 def run(work: Callable[..., None], jobs: Sequence[tuple]) -> None:

@@ -16,9 +16,18 @@ from typer.testing import CliRunner
 from attnwarp import Camera, Gaussians
 from attnwarp.cli import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
-from attnwarp.render import render
+from attnwarp.render import _threads, render
 
 ATTNWARP = [sys.executable, "-m", "attnwarp.cli"]
+
+
+@pytest.fixture(autouse=True)
+def threads_as_before():
+    before = torch.get_num_threads(), cv2.getNumThreads()
+    yield
+    torch.set_num_threads(before[0])
+    cv2.setNumThreads(before[1])
+    _threads.choose(None)
 
 
 def in_process(*arguments):
@@ -80,7 +89,7 @@ def test_help_imports_nothing_heavy():
 def test_fit_and_render_do_what_they_say(data, tmp_path):
     out = tmp_path / "fit"
     done = call(
-        "--threads", 1, "fit", data, "--kind", "2dgs", "--out", out, "--iterations", 60, "--set", "sh_degree=0",
+        "fit", data, "--threads", 1, "--kind", "2dgs", "--out", out, "--iterations", 60, "--set", "sh_degree=0",
         "--set", "evaluate_every=20",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -119,6 +128,13 @@ def test_the_ply_opens_in_another_reader(data, tmp_path):
     assert {"x", "f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= {p.name for p in vertex.properties}
 
 
+def test_the_number_of_threads_changes_no_bit(data, tmp_path):
+    for threads in (1, 3):
+        done = in_process("fit", data, "--out", tmp_path / str(threads), "--iterations", 20, "--threads", threads)
+        assert done.exit_code == 0, done.stderr
+    assert (tmp_path / "1" / "splats.ply").read_bytes() == (tmp_path / "3" / "splats.ply").read_bytes()
+
+
 def start_and_wait_for_a_checkpoint(arguments, out):
     process = subprocess.Popen([*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     end = time.monotonic() + 100
@@ -135,7 +151,7 @@ def start_and_wait_for_a_checkpoint(arguments, out):
 def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, number, code):
     out = tmp_path / "fit"
     long = [
-        "--threads", 1, "fit", data, "--out", out, "--set", "sh_degree=0", "--iterations", "200000",
+        "fit", data, "--threads", 1, "--out", out, "--set", "sh_degree=0", "--iterations", "200000",
         "--checkpoint-seconds", "0.05",
     ]  # fmt: skip
     process = start_and_wait_for_a_checkpoint(long, out)
@@ -144,7 +160,7 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
     assert process.returncode == code
     before = read_ply(out / "splats.ply")
     assert len(before) > 0
-    done = in_process(*long[2:], "--max-seconds", "0.5")
+    done = in_process(*long, "--max-seconds", "0.5")
     assert done.exit_code == 0, done.stderr
     assert "iterations in" in done.stdout
 
