@@ -24,8 +24,8 @@ from attnwarp.render import _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
 BIN_CHUNKS = 8
-FRONT = 256
-"""Splats a tile to begin with in a deep scene: about as many as make a pixel opaque."""
+FRONT = 512
+"""Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
