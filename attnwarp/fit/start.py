@@ -51,7 +51,7 @@ def from_points(
         seed: of the random turns.
 
     Returns:
-        float32 splats relative to an ``origin`` in the middle of the points.
+        float32 splats relative to an ``origin`` at the points' median.
 
     Raises:
         ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out of range.
@@ -74,7 +74,8 @@ def from_points(
     _, first = np.unique(xyz, axis=0, return_index=True)
     first.sort()
     xyz, rgb = xyz[first], rgb[first]
-    origin = (xyz.min(0) + xyz.max(0)) / 2
+    # The median: a few points far astray must not cost the others their digits.
+    origin = np.median(xyz, axis=0)
     local = xyz - origin
     n = len(local)
     size = np.full(n, 0.01 * max(1e-6, float(np.abs(local).max())))
