@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -69,6 +69,15 @@ def quaternion_to(normal: np.ndarray) -> np.ndarray:
     x, y, z = normal
     q = np.array([1 + z, -y, x, 0.0])
     return np.array([0.0, 1, 0, 0]) if np.linalg.norm(q) < 1e-9 else q / np.linalg.norm(q)
+
+
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """The reference's tensors are small here: torch's threads would only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture

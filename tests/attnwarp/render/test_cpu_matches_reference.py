@@ -49,6 +49,7 @@ def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Ten
     return result
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("block", range(8))
 def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_splats) -> None:
     """Crossing the camera plane, edge-on, opacity 0 and 1, equal depths are in every scene of 12 splats or more."""

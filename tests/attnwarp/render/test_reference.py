@@ -15,6 +15,7 @@ BACKENDS = ("reference", "cpu")
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
 
 
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(("kind", "mode", "antialiased"), [("2d", "intersection", False), ("3d", "peak", True)])
 def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, make_camera, make_splats) -> None:
     camera = make_camera(8, 9, 7)
