@@ -7,6 +7,9 @@ from typing import Any
 
 import torch
 
+# The function, not the class: torch.optim.Adam imports torch's compiler, which takes a second.
+from torch.optim.adam import adam
+
 from attnwarp.fit.settings import FitSettings
 from attnwarp.gaussians import Gaussians
 
@@ -16,6 +19,9 @@ NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
 SMALLEST, LARGEST = 1e-7, 1e3
 """Scales stay within these shares of the extent: beyond, they would leave float32 and show nothing."""
+
+EPSILON = 1e-15
+"""Adam's (3DGS): gradients of a mean over pixels are tiny, and must not be taken for noise."""
 
 LARGEST_LOGIT = 15.0
 """Opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its gradient can still bring it back in float32."""
@@ -27,6 +33,9 @@ class Model:
     Attributes:
         tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity" (N,) logits,
             "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
+        first, second: Adam's moments by name.
+        steps: steps done.
+        rates: learning rates by name.
         extent: of the scene, in its units.
     """
 
@@ -42,7 +51,7 @@ class Model:
             "scales": g.scales.log(),
             "quats": g.quats.clone(),
         }
-        rates = {
+        self.rates = {
             "means": settings.lr_means * extent,
             "dc": settings.lr_dc,
             "rest": settings.lr_rest,
@@ -52,12 +61,9 @@ class Model:
         }
         for tensor in self.tensors.values():
             tensor.requires_grad_(True)
-        # eps: gradients of a mean over pixels are tiny, and Adam must not take them for noise (3DGS).
-        self.adam = torch.optim.Adam(
-            [{"params": [self.tensors[name]], "lr": rates[name], "name": name} for name in NAMES],
-            eps=1e-15,
-            fused=True,
-        )
+        self.steps = 0
+        self.first = {name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()}
+        self.second = {name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()}
 
     def __len__(self) -> int:
         return int(self.tensors["means"].shape[0])
@@ -87,49 +93,47 @@ class Model:
             rate = math.exp((1 - progress) * math.log(s.lr_means) + progress * math.log(s.lr_means_final))
         else:
             rate = (1 - progress) * s.lr_means + progress * s.lr_means_final
-        self.adam.param_groups[NAMES.index("means")]["lr"] = rate * self.extent
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
+        self.rates["means"] = rate * self.extent
+        for name, tensor in self.tensors.items():
+            if tensor.grad is None or tensor.numel() == 0:
+                continue
+            adam(
+                [tensor.detach()], [tensor.grad], [self.first[name]], [self.second[name]], [],
+                [torch.tensor(float(self.steps))], fused=True, amsgrad=False, beta1=0.9, beta2=0.999,
+                lr=self.rates[name], weight_decay=0.0, eps=EPSILON, maximize=False,
+            )  # fmt: skip
+            tensor.grad = None
+        self.steps += 1
         with torch.no_grad():
             self.tensors["scales"].clamp_(math.log(SMALLEST * self.extent), math.log(LARGEST * self.extent))
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:
         """Keep the splats at the index ``keep`` with Adam's memory of them, and append ``added``, which have none."""
-        for group, name in zip(self.adam.param_groups, NAMES, strict=True):
-            old = self.tensors[name]
-            new = torch.cat([old.detach()[keep], added[name]]).requires_grad_(True)
-            state = self.adam.state.pop(old, {})
-            for key, value in state.items():
-                if key != "step":
-                    fresh = torch.zeros_like(new.detach()[len(keep) :])
-                    state[key] = torch.cat([value[keep], fresh])
-            self.adam.state[new] = state
-            group["params"] = [new]
-            self.tensors[name] = new
+        for name in NAMES:
+            self.tensors[name] = torch.cat([self.tensors[name].detach()[keep], added[name]]).requires_grad_(True)
+            for moment in (self.first, self.second):
+                moment[name] = torch.cat([moment[name][keep], torch.zeros_like(added[name])])
 
     def lower_opacity(self, limit: float) -> None:
         """Bring every opacity down to at most ``limit``, and forget where Adam was taking them."""
-        opacity = self.tensors["opacity"]
         with torch.no_grad():
-            opacity.clamp_(max=math.log(limit / (1 - limit)))
-        for key, value in self.adam.state[opacity].items():
-            if key != "step":
-                value.zero_()
+            self.tensors["opacity"].clamp_(max=math.log(limit / (1 - limit)))
+        self.first["opacity"].zero_()
+        self.second["opacity"].zero_()
 
     def state(self) -> dict[str, Any]:
         """Everything that the next step depends on."""
         return {
+            "steps": self.steps,
             "tensors": {name: tensor.detach().clone() for name, tensor in self.tensors.items()},
-            "adam": [
-                {key: value.clone() for key, value in self.adam.state[self.tensors[name]].items()} for name in NAMES
-            ],
+            "first": {name: moment.clone() for name, moment in self.first.items()},
+            "second": {name: moment.clone() for name, moment in self.second.items()},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what :meth:`state` gave."""
-        for group, name, memory in zip(self.adam.param_groups, NAMES, state["adam"], strict=True):
-            self.adam.state.pop(self.tensors[name], None)
-            tensor = state["tensors"][name].clone().requires_grad_(True)
-            group["params"], self.tensors[name] = [tensor], tensor
-            self.adam.state[tensor] = {key: value.clone() for key, value in memory.items()}
+        self.steps = int(state["steps"])
+        for name in NAMES:
+            self.tensors[name] = state["tensors"][name].clone().requires_grad_(True)
+            self.first[name], self.second[name] = state["first"][name].clone(), state["second"][name].clone()

@@ -141,14 +141,13 @@ def test_those_that_stay_keep_adams_memory_and_new_ones_have_none():
     start = splats(5, scale=0.01)
     model, _ = model_and_density(start)
     step(model)
-    before = {name: {k: v.clone() for k, v in model.adam.state[model.tensors[name]].items()} for name in NAMES}
+    before = model.state()
     model.replace(torch.tensor([3, 0]), {name: tensor.detach()[[1]] for name, tensor in model.tensors.items()})
     for name in NAMES:
-        after = model.adam.state[model.tensors[name]]
-        for key in ("exp_avg", "exp_avg_sq"):
-            torch.testing.assert_close(after[key][:2], before[name][key][[3, 0]], rtol=0, atol=0)
-            assert float(after[key][2].abs().max()) == 0
-        assert float(after["step"]) == 1
+        for moment in ("first", "second"):
+            after = getattr(model, moment)[name]
+            torch.testing.assert_close(after[:2], before[moment][name][[3, 0]], rtol=0, atol=0)
+            assert float(after[2].abs().max()) == 0
     step(model)  # and Adam accepts what it finds
 
 
@@ -161,8 +160,7 @@ def test_a_reset_lowers_every_opacity_and_forgets_where_it_was_going():
     density.refine(model, 5, torch.Generator())
     now = model.gaussians().opacities.detach()
     torch.testing.assert_close(now, was.clamp_max(0.01), rtol=1e-5, atol=0)
-    state = model.adam.state[model.tensors["opacity"]]
-    assert float(state["exp_avg"].abs().max()) == float(state["exp_avg_sq"].abs().max()) == 0
+    assert float(model.first["opacity"].abs().max()) == float(model.second["opacity"].abs().max()) == 0
 
 
 def test_the_centres_learning_rate_falls_exponentially_with_the_scenes_size():
@@ -171,7 +169,7 @@ def test_the_centres_learning_rate_falls_exponentially_with_the_scenes_size():
         for tensor in model.tensors.values():
             tensor.grad = torch.zeros_like(tensor)
         model.step(progress)
-        assert model.adam.param_groups[0]["lr"] == pytest.approx(expected * EXTENT, rel=1e-12)
+        assert model.rates["means"] == pytest.approx(expected * EXTENT, rel=1e-12)
 
 
 def test_a_step_is_adams():
