@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,6 +24,9 @@ Indices = npt.NDArray[np.int64]
 
 MESHING_PROTOCOL = 2
 """Raised whenever the same description of a body would give other vertices; part of every cache key."""
+
+BLOCK = 8
+"""Lattice points along the side of the blocks that are sampled, or left out, together."""
 
 DEGENERATE_AREA = 1e-12
 """Triangles whose area is below this times their longest edge squared have no usable plane and are dropped."""
@@ -536,10 +539,7 @@ def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief 
 
     counts = np.ceil((high - low) / step).astype(int) + 1
     axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
-    volume = np.empty(counts)
-    for i, x in enumerate(axes[0]):  # slab by slab: a whole grid of points would take gigabytes at high resolutions
-        slab = np.stack(np.meshgrid([x], axes[1], axes[2], indexing="ij"), -1).reshape(-1, 3)
-        volume[i] = distance(slab).reshape(counts[1:])
+    volume = _sample(axes, distance, depth)
     if volume.min() >= 0:
         raise ValueError(f"body: no part is thick enough to be seen at resolution {resolution}; raise it")
     vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent")
@@ -570,6 +570,32 @@ def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief 
         "faces": np.ascontiguousarray(mesh.faces),
         "normals": normals,
     }
+
+
+def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float) -> Array:
+    """The distance at every point of a lattice near its zero; farther off, the right sign.
+
+    Blocks of the lattice whose middle is farther from the surface than they reach, with half as much to spare since
+    the distance is only a bound, take the middle's value: no triangle comes from them.
+    """
+    step = float(axes[0][1] - axes[0][0])
+    volume = np.empty([len(axis) for axis in axes])
+    starts = [np.arange(0, len(axis), BLOCK) for axis in axes]
+    middles = np.meshgrid(*(axis[0] + step * (s + (BLOCK - 1) / 2) for axis, s in zip(axes, starts, strict=True)),
+                          indexing="ij")  # fmt: skip
+    coarse = distance(np.stack(middles, -1).reshape(-1, 3)).reshape(middles[0].shape)
+    reach = 1.5 * step * BLOCK * math.sqrt(3) / 2 + depth
+    for i, x0 in enumerate(starts[0]):
+        xs = slice(x0, x0 + BLOCK)
+        for j, y0 in enumerate(starts[1]):
+            ys = slice(y0, y0 + BLOCK)
+            row = np.repeat(coarse[i, j], BLOCK)[: len(axes[2])]
+            volume[xs, ys] = row
+            near = np.flatnonzero(np.repeat(np.abs(coarse[i, j]) <= reach, BLOCK)[: len(axes[2])])
+            if near.size:
+                points = np.stack(np.meshgrid(axes[0][xs], axes[1][ys], axes[2][near], indexing="ij"), -1)
+                volume[xs, ys, near] = distance(points.reshape(-1, 3)).reshape(points.shape[:-1])
+    return volume
 
 
 # Files ---------------------------------------------------------------------------------------------------------------

@@ -122,10 +122,20 @@ class Bricks(_Texture):
     joint: float = Field(0.02, gt=0)
 
 
-Texture = Annotated[Plain | Checker | Stripes | Noise | Bricks, Field(discriminator="type")]
+class Rings(_Texture):
+    """Rings of the given colours, each ``size`` wide, about the upright through ``center``: the year rings of wood."""
+
+    type: Literal["rings"]
+    colors: tuple[Color, ...] = Field(min_length=2)
+    size: float = Field(gt=0)
+    center: tuple[float, float] = (0.0, 0.0)
+    wobble: float = Field(0.0, ge=0)  # how far noise bends the rings, in rings
 
 
-def albedo(texture: Plain | Checker | Stripes | Noise | Bricks, points: npt.ArrayLike) -> Array:
+Texture = Annotated[Plain | Checker | Stripes | Noise | Bricks | Rings, Field(discriminator="type")]
+
+
+def albedo(texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: npt.ArrayLike) -> Array:
     """(N, 3) linear RGB albedo in [0, 0.9] at (N, 3) world ``points``."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     match texture:
@@ -149,6 +159,12 @@ def albedo(texture: Plain | Checker | Stripes | Noise | Bricks, points: npt.Arra
             low = np.minimum(at.astype(np.int64), len(ramp) - 2)
             part = (at - low)[:, None]
             color = ramp[low] * (1 - part) + ramp[low + 1] * part
+        case Rings():
+            away = points[:, :2] - np.array(texture.center)
+            ring = np.linalg.norm(away, axis=-1) / texture.size + 0.37
+            if texture.wobble:
+                ring = ring + texture.wobble * (2 * fractal_noise(points / (6 * texture.size), 3, 13) - 1)
+            color = _palette(texture.colors)[np.floor(ring).astype(np.int64) % len(texture.colors)]
         case Bricks():
             length, height = texture.size
             row = np.floor(points[:, 2] / height)
