@@ -89,9 +89,9 @@ def _prefetch(typing: Any, array: Any, item: Any) -> Any:
         kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
         call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
         builder.call(call, [pointer, word(0), word(3), word(1)])
-        return context.get_dummy_value()
+        return word(0)
 
-    return nb.void(array, nb.int64), codegen
+    return nb.int32(array, nb.int64), codegen
 
 
 @inlined
