@@ -41,22 +41,21 @@ def shown(console: Console | None = None, *, title: str = "fit") -> Iterator[Cal
         MofNCompleteColumn,
         Progress,
         TextColumn,
-        TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.table import Column
 
     where = console or Terminal(stderr=True)
     if not where.is_terminal:
         yield _lines(where, title)
         return
+    # On a narrow terminal the figures go over two lines rather than the counts losing their digits.
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[figures]}", markup=False),
+        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
+        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
+        MofNCompleteColumn(table_column=Column(no_wrap=True)),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        TextColumn("{task.fields[figures]}", markup=False, table_column=Column(no_wrap=False)),
     )
     with Progress(*columns, console=where) as bar:
         task = bar.add_task(title, total=None, figures="")
