@@ -78,7 +78,7 @@ def fits(results: Results, root: Path, number: Callable[[float | None], str], *,
     if timings:
         section.text.append(
             "Curves: means over scenes at each evaluation, 95 % intervals over scenes, against the CPU seconds of the "
-            "iterations on one thread (evaluations and files are not in them)."
+            "iterations, those of all threads together (evaluations and files are not in them)."
         )
         section.figures.append(_curves(results, root, names))
     return [section]
