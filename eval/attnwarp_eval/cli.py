@@ -246,6 +246,36 @@ def export(
     typer.echo(out / "transforms.json")
 
 
+@scenes_app.command()
+def effects(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    as_json: Annotated[bool, typer.Option("--json", help="JSON with the keys effects and plan.")] = False,
+    prove: Annotated[
+        bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
+    ] = False,
+    budget: Annotated[float, typer.Option(min=1, help="Seconds that the proof may render.")] = 60.0,
+) -> None:
+    """Which light transport a scene needs, how it is rendered, what that saves, and a proof that nothing is lost."""
+    import json
+
+    with clear_errors():
+        from attnwarp_eval import effects as planning
+        from attnwarp_eval.proof import prove as hold
+        from attnwarp_eval.scene import load_scene
+
+        loaded = load_scene(scene)
+        about = planning.report(loaded, cost=planning.measure(loaded))
+        proof = hold(loaded, seconds=budget) if prove else None
+    if proof is not None:
+        about["proof"] = proof.to_dict()
+    lines = [json.dumps(about, indent=2)] if as_json else list(planning.describe(loaded, about))
+    if proof is not None and not as_json:
+        lines += ["", *proof.lines()]
+    typer.echo("\n".join(lines))
+    if proof is not None and proof.verdict != "certified":
+        raise fail(f"{loaded.name}: the plan is not certified: {proof.verdict}", TOO_LITTLE)
+
+
 @app.command()
 def studies() -> None:
     """List the studies that ship with the package."""

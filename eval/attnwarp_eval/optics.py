@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from attnwarp_eval.textures import Color, Spec
 
@@ -92,6 +92,12 @@ class GlassMaterial(Spec):
     @classmethod
     def _not_nearly_smooth(cls, value: float) -> float:
         return _roughness(value)
+
+    @model_validator(mode="after")
+    def _a_pane_has_no_inside(self) -> GlassMaterial:
+        if self.thin and (self.roughness or self.interior):
+            raise ValueError("got thin glass with roughness or an interior, but a thin pane has neither; drop 'thin'")
+        return self
 
 
 def _roughness(value: float) -> float:
@@ -221,7 +227,7 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
             continue
         rough = getattr(material, "roughness", 0.0)
         note("glossy" if rough else "specular", f"{name}, roughness {rough:g}")
-        if not isinstance(material, PlasticMaterial) and rough < 0.3:
+        if not rough:
             bent.append(name)
         if isinstance(material, GlassMaterial):
             note("refraction", name)

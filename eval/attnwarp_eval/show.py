@@ -17,7 +17,7 @@ Image = npt.NDArray[Any]
 
 def describe(scene: Scene) -> str:
     """A scene in words: objects, lights, cameras, and how its pictures are planned."""
-    from attnwarp_eval.truth.mitsuba import plan_rendering
+    from attnwarp_eval.effects import plan
 
     spec = scene.spec
     lines = [
@@ -38,11 +38,11 @@ def describe(scene: Scene) -> str:
         x, y, z = camera.position
         lines.append(f"  {camera.name:12} at ({x:.2f}, {y:.2f}, {z:.2f})")
     lines.append("pictures are made by")
-    plan = plan_rendering(scene)
-    for step in plan.passes:
-        shining = ", ".join(spec.lights[k].type for k in step.lights)
+    planned = plan(scene)
+    for step in planned.passes:
+        shining = ", ".join([spec.lights[k].type for k in step.lights] + ["lamps"] * step.lamps)
         lines.append(f"  {step.integrator}, {step.spp} samples a pixel, light from {shining}")
-    lines += [f"  because {reason}" for reason in plan.reasons]
+    lines += [f"  because {reason}" for reason in planned.reasons]
     return "\n".join(lines)
 
 

@@ -4,21 +4,23 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
+from attnwarp_eval.effects import Pass, Plan, plan
 from attnwarp_eval.scene import Scene, SceneSpec, load_scene
 from attnwarp_eval.textures import linear_rgb
-from attnwarp_eval.truth import Geometry, appearance, plan_rendering
+from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth import mitsuba as renderer
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
 
+FLOOR = {
+    "name": "floor",
+    "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [40, 40]},
+    "texture": {"type": "plain", "color": "#b08040"},
+}
+
 
 def world(lights, objects=None, **appearance_):
-    floor = {
-        "name": "floor",
-        "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [40, 40]},
-        "texture": {"type": "plain", "color": "#b08040"},
-    }
     spec = {
-        "name": "test", "title": "t", "objects": objects or [floor], "lights": lights, "appearance": appearance_,
+        "name": "test", "title": "t", "objects": objects or [FLOOR], "lights": lights, "appearance": appearance_,
         "cameras": {"look_at": [0, 0, 0], "radius": 3, "size": [48, 32], "source": {"yaw": 20, "height": 2},
                     "targets": [{"yaw": 90, "height": 1}]},
     }  # fmt: skip
@@ -128,19 +130,19 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
 
 def test_the_same_seed_gives_the_same_bits_and_another_seed_other_noise(monkeypatch, tmp_path):
     scene = load_scene("spheres").with_size(32, 32)
-    plan = plan_rendering(scene, 2)
-    first = renderer._render(scene, scene.source, plan, 5)
+    planned = plan(scene, 2)
+    first = renderer.render_plan(scene, scene.source, planned, 5)
     assert first.dtype == np.float32 and np.isfinite(first).all()
-    assert np.array_equal(first, renderer._render(scene, scene.source, plan, 5))
-    assert not np.array_equal(first, renderer._render(scene, scene.source, plan, 6))
+    assert np.array_equal(first, renderer.render_plan(scene, scene.source, planned, 5))
+    assert not np.array_equal(first, renderer.render_plan(scene, scene.source, planned, 6))
 
 
 def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     scene = world([SUN, SKY], spp=1).with_size(16, 16)
     calls = []
-    real = renderer._render
-    monkeypatch.setattr(renderer, "_render", lambda *a: calls.append(a) or real(*a))
+    real = renderer.render_plan
+    monkeypatch.setattr(renderer, "render_plan", lambda *a: calls.append(a) or real(*a))
     first = appearance(scene, scene.source)
     assert np.array_equal(first, appearance(scene, scene.source, spp=1)) and len(calls) == 1
     appearance(scene, scene.source, seed=1)
@@ -151,21 +153,26 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
 
 
 def test_the_plan_follows_from_the_scene_and_says_why():
-    direct = plan_rendering(world([SUN, SKY]), 8)
+    direct = plan(world([SUN, SKY]), 8)
     assert [(p.integrator, p.lights, p.spp) for p in direct.passes] == [("direct", (0,), 8), ("direct", (1,), 8)]
     assert any("one bounce" in reason for reason in direct.reasons)
-    (only,) = plan_rendering(world([SUN, SKY], bounces=3)).passes
+    ball = {
+        "name": "ball",
+        "shape": {"type": "sphere", "center": [0, 0, 1.0], "radius": 0.5},
+        "texture": {"type": "plain", "color": "#b08040"},
+    }
+    (only,) = plan(world([SUN, SKY], [FLOOR, ball], bounces=3)).passes
     assert (only.integrator, only.max_depth, only.lights) == ("path", 4, (0, 1))
     with pytest.raises(ValueError, match="spp: got 0, expected at least 1"):
-        plan_rendering(world([SUN]), 0)
+        plan(world([SUN]), 0)
 
 
 def test_the_plan_of_one_bounce_and_a_path_tracer_of_one_bounce_agree():
     # The two passes add up to what one path-traced picture of all lights converges to.
     scene = load_scene("fence").with_size(48, 48)
-    path = renderer.Plan((renderer.Pass((0, 1), "path", 2, 1, 1, 64),), ())
-    reference = np.stack([renderer._render(scene, scene.source, path, k) for k in range(4)])
-    ours = np.stack([renderer._render(scene, scene.source, plan_rendering(scene, 16), k) for k in range(4)])
+    path = Plan((Pass((0, 1), "path", 2, 1, 1, 64),), ())
+    reference = np.stack([renderer.render_plan(scene, scene.source, path, k) for k in range(4)])
+    ours = np.stack([renderer.render_plan(scene, scene.source, plan(scene, 16), k) for k in range(4)])
     error = np.sqrt(reference.var(0, ddof=1) / 4 + ours.var(0, ddof=1) / 4).mean()
     difference = reference.mean(0) - ours.mean(0)
     # Standard error of the mean over 48 x 48 x 3 values, of which the channels are not independent.

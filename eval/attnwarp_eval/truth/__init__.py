@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.truth.mitsuba import Plan, appearance, plan_rendering
+from attnwarp_eval.truth.mitsuba import appearance, render_plan
 from attnwarp_eval.truth.pairs import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView, edge_band, two_view
 from attnwarp_eval.truth.raycast import Geometry, Hits, RayHits
 
@@ -14,12 +14,11 @@ __all__ = [
     "VISIBLE",
     "Geometry",
     "Hits",
-    "Plan",
     "RayHits",
     "TwoView",
     "appearance",
     "edge_band",
-    "plan_rendering",
+    "render_plan",
     "to_srgb",
     "two_view",
 ]

@@ -1,7 +1,7 @@
-"""Appearance: pictures of a scene by Mitsuba 3, variant scalar_rgb.
+"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.effects` plans them.
 
-scalar_rgb is the variant that works everywhere; the llvm ones are faster where the machine's LLVM suits them and abort
-the whole process where it does not.
+Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else ``scalar_rgb``, which works
+everywhere: see :func:`variant`.
 
 Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64 first. Its cameras look
 along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1, -1, 1).
@@ -9,10 +9,13 @@ along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1, -1, 1
 
 from __future__ import annotations
 
+import functools
 import math
+import os
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +24,22 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.effects import Plan, plan, sampler, smooth_first
+from attnwarp_eval.optics import (
+    GlassMaterial,
+    InteriorSpec,
+    MetalMaterial,
+    MirrorMaterial,
+    PlasticMaterial,
+    PointSpec,
+    SpotSpec,
+)
 from attnwarp_eval.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.textures import albedo, linear_rgb
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 
 if TYPE_CHECKING:
-    from attnwarp_eval.optics import PointSpec, SpotSpec
-    from attnwarp_eval.scene import Scene, SkySpec, SunSpec
+    from attnwarp_eval.scene import ObjectSpec, Scene, SkySpec, SunSpec
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -43,67 +55,6 @@ SKY_ROWS = 256
 
 TEXEL_SIZE = 0.5
 """Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the middle."""
-
-
-@dataclass(frozen=True)
-class Pass:
-    """One rendering; the picture is the sum of the passes, since light adds up.
-
-    Attributes:
-        lights: indices of the scene's lights that shine in it.
-        integrator: Mitsuba's plugin, "direct" or "path".
-        max_depth: longest path in edges from the camera; 2 is direct light.
-        emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit ("direct" only).
-        spp: samples a pixel.
-    """
-
-    lights: tuple[int, ...]
-    integrator: str
-    max_depth: int
-    emitter_samples: int
-    bsdf_samples: int
-    spp: int
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How a picture is made, and why that suffices."""
-
-    passes: tuple[Pass, ...]
-    reasons: tuple[str, ...]
-
-
-def plan_rendering(scene: Scene, spp: int | None = None) -> Plan:
-    """The cheapest rendering that shows what ``scene`` asks for.
-
-    Args:
-        spp: samples a pixel; the scene's own number if left out.
-    """
-    from attnwarp_eval.scene import SunSpec
-
-    wanted = scene.spec.appearance
-    if spp is not None and spp < 1:
-        raise ValueError(f"spp: got {spp}, expected at least 1")
-    spp = wanted.spp if spp is None else spp
-    lights = scene.spec.lights
-    reasons = ["every material is diffuse and opaque: no path passes through glass or a medium, and none is specular"]
-    if wanted.bounces == "unlimited":
-        return Plan((Pass(tuple(range(len(lights))), "path", -1, 1, 1, spp),), tuple(reasons))
-    if wanted.bounces > 1:
-        reasons.append(f"the scene asks for {wanted.bounces} bounces: paths of up to {wanted.bounces + 1} edges")
-        depth = wanted.bounces + 1
-        return Plan((Pass(tuple(range(len(lights))), "path", depth, 1, 1, spp),), tuple(reasons))
-    reasons.append("the scene asks for one bounce: light sampled at each visible point is the whole sum")
-    suns = tuple(k for k, light in enumerate(lights) if isinstance(light, SunSpec))
-    skies = tuple(k for k in range(len(lights)) if k not in suns)
-    passes = []
-    if suns:
-        passes.append(Pass(suns, "direct", 2, 1, 0, spp))
-        reasons.append("the sun comes from one direction, so its own pass has no noise but that of the pixel's area")
-    if skies:
-        passes.append(Pass(skies, "direct", 2, 0, 1, spp))
-        reasons.append("the sky is smooth, so rays spread by the cosine leave only the noise of what covers it")
-    return Plan(tuple(passes), tuple(reasons))
 
 
 def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
@@ -123,48 +74,89 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
     """
     import mitsuba
 
-    plan = plan_rendering(scene, spp)
+    planned = plan(scene, spp)
     pose = {name: value for name, value in camera.to_dict().items() if name != "name"}
     key = content_key(
         "appearance",
         APPEARANCE_PROTOCOL,
         mitsuba.__version__,
+        variant(),
         scene.world_hash,
         _texel(scene),
+        # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
+        scene.spec.cameras.model_dump(mode="json", exclude={"size"}) if planned.lens or planned.media else None,
         pose,
-        asdict(plan),
+        planned.identity(),
         int(seed),
     )
     stored = read_arrays("appearance", key)
     if stored is None:
-        stored = {"image": _render(scene, camera, plan, seed)}
+        stored = {"image": render_plan(scene, camera, planned, seed)}
         write_arrays("appearance", key, stored)
     return stored["image"]
 
 
-def _render(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
+def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
+    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB. Nothing is kept; the same seed gives the same bits."""
     mi = _mitsuba()
     total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
     for number, step in enumerate(plan.passes):
         options: dict[str, Any] = {"type": step.integrator}
-        if step.integrator == "path":
-            # Roulette would end paths at random: unbiased, but noise that so short a path is not worth.
-            options |= {"max_depth": step.max_depth, "rr_depth": step.max_depth + 1 if step.max_depth > 0 else 5}
-        else:
+        if step.integrator == "direct":
             options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
-        world, center = _world(scene, step.lights)
-        sensor = _sensor(camera, center, {"type": _sampler(step.spp), "sample_count": step.spp}, world)
-        picture = mi.render(
-            world, sensor=sensor, integrator=mi.load_dict(options), seed=len(plan.passes) * int(seed) + number
+        else:
+            # Without an end a path still needs a number there; Mitsuba's is -1.
+            options |= {"max_depth": step.max_depth, "rr_depth": step.rr_depth}
+        if step.integrator == "ptracer":
+            # Lamps, seen directly, are the other pass's.
+            options |= {"hide_emitters": True}
+        world, center, fog = _world(scene, step.lights, step.lamps, plan.media)
+        pass_seed = len(plan.passes) * int(seed) + number
+        if step.first == "smooth":
+            total += _smooth_part(scene, camera, plan, options, step.spp, pass_seed, (world, center, fog))
+            continue
+        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to stratify.
+        kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
+        sensor = _sensor(
+            scene, camera, center, {"type": kind, "sample_count": step.spp}, world, plan, fog if plan.media else None
         )
+        picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=pass_seed)
         total += np.array(picture, dtype=np.float32)[..., :3]
     return total
 
 
-def _sampler(spp: int) -> str:
-    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would render more."""
-    rows = math.isqrt(spp)
-    return "multijitter" if rows * math.ceil(spp / rows) == spp else "independent"
+def _smooth_part(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    options: dict[str, Any],
+    spp: int,
+    seed: int,
+    loaded: tuple[Any, Array, Any],
+) -> Image:
+    """What is seen in mirrors, through glass, of lamps and of the sky; zero where another surface is seen first.
+
+    Camera rays go through the middles of a grid of k x k cells a pixel, one or more a cell, since for those the first
+    surface is known by ray casting. The rest of the picture is made of paths from the light.
+    """
+    mi = _mitsuba()
+    world, center, fog = loaded
+    k = max(1, math.isqrt(spp))
+    fine = camera.resize(camera.width * k, camera.height * k)
+    each = math.ceil(spp / k**2)
+    if each > 1:
+        each = 4 ** math.ceil(math.log(each, 4))
+    keep = smooth_first(scene, fine)
+    total = np.zeros((*keep.shape, 3), dtype=np.float64)
+    if not keep.any():
+        return total[::k, ::k].astype(np.float32)
+    for number in range(each):
+        middles = {"type": "stratified", "sample_count": 1, "jitter": False}
+        sensor = _sensor(scene, fine, center, middles, world, plan, fog)
+        picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=seed * 64 + number, spp=1)
+        total += np.array(picture, dtype=np.float64)[..., :3]
+    total *= keep[..., None] / each
+    return total.reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -174,12 +166,12 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
         position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is hit.
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
-    mi = _mitsuba()
-    world, center = _world(scene, ())
+    mi = _mitsuba("scalar_rgb")
+    world, center, _ = _world(scene, (), False, False, "scalar_rgb")
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would lie nowhere.
-    sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
-    sensor = _sensor(camera, center, sampler, world)
+    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
+    sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None, "scalar_rgb")
     picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64)
     shape = np.round(picture[..., 3]).astype(np.int64)  # 1 + place among the shapes, 0 for none
     owners = np.array([-1, *_owners(scene)])
@@ -187,26 +179,180 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
     return position, owners[shape]
 
 
-def _mitsuba() -> Any:
-    import mitsuba as mi
+PROBE = """
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"},
+    "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
+total = float(mi.render(scene, spp=4).array.numpy().sum())
+print("works" if total == total and total > 0 else "black")
+"""
 
-    if mi.variant() != "scalar_rgb":
-        mi.set_variant("scalar_rgb")
-    mi.set_log_level(mi.LogLevel.Warn)
+
+@functools.cache
+def variant() -> str:
+    """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
+
+    With some LLVMs (14 and 15) ``llvm_*`` aborts the process instead of raising, so a child process tries it, once in
+    the life of this one. ``DRJIT_LIBLLVM_PATH`` names another LLVM; ``ATTNWARP_MITSUBA`` names the variant and saves
+    the try.
+    """
+    named = os.environ.get("ATTNWARP_MITSUBA")
+    if named:
+        return named
+    try:
+        tried = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return "scalar_rgb"
+    return "llvm_ad_rgb" if tried.returncode == 0 and tried.stdout.strip() == "works" else "scalar_rgb"
+
+
+def _mitsuba(name: str | None = None) -> Any:
+    import mitsuba
+
+    mi: Any = mitsuba
+    wanted = name or variant()
+    if mi.variant() != wanted:
+        mi.set_variant(wanted)
+        mi.set_log_level(mi.LogLevel.Warn)
+        # ptracer draws its progress bar whatever the level; what goes wrong is raised, not logged.
+        mi.logger().clear_appenders()
     return mi
 
 
-def _world(scene: Scene, lights: tuple[int, ...]) -> tuple[Any, Array]:
-    """The loaded Mitsuba scene with some of its lights, and the (3,) world position of its origin."""
-    mi = _mitsuba()
+def _world(
+    scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, name: str | None = None
+) -> tuple[Any, Array, Any]:
+    """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and the fog or None."""
+    mi = _mitsuba(name)
     texel = _texel(scene)
-    shapes, center = _kept((scene.world_hash, texel), lambda: _load_shapes(scene, texel))
-    lamps = {f"light_{k}": _light(scene.spec.lights[k]) for k in lights}
-    # optimize=False: the default merges shapes, after which their indices mean something else.
-    return _kept(
-        (scene.world_hash, texel, lights),
-        lambda: (mi.load_dict({"type": "scene"} | shapes | lamps, optimize=False), center),
+    base = (mi.variant(), scene.world_hash, texel)
+    forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
+    shone = {f"light_{k}": _light(scene.spec.lights[k], center) for k in lights}
+    media = media and (scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects))
+
+    def make() -> tuple[Any, Array, Any]:
+        shapes: dict[str, Any] = {}
+        fog = None
+        around: tuple[Array, Array] | None = None
+        if media and scene.spec.medium is not None:
+            fog = mi.load_dict(_homogeneous(scene.spec.medium))
+            around = fog_box(scene)
+            pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
+            pose[:3, 3] = (around[0] + around[1]) / 2 - center
+            shapes["medium"] = mi.load_dict(
+                {"type": "cube", "to_world": mi.ScalarTransform4f(pose), "bsdf": {"type": "null"}, "interior": fog}
+            )
+        for key, (shape, owner, form) in forms.items():
+            item = scene.spec.objects[owner]
+            extra: dict[str, Any] = {}
+            if lamps and item.emission:
+                extra["emitter"] = {"type": "area", "radiance": _rgb(item.emission.radiance, item.emission.color)}
+            if media and _interior(item):
+                extra["interior"] = _homogeneous(item.material.interior)
+            if fog is not None and isinstance(item.material, GlassMaterial) and _within(scene, owner, around):
+                # Light that leaves the glass is in the fog again.
+                extra["exterior"] = fog
+            shapes[key] = mi.load_dict(form() | extra, optimize=False) if extra else shape
+        # optimize=False: the default merges shapes, after which their indices mean something else.
+        return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
+
+    cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
+    return _kept((*base, lights, lamps, media, cameras), make)
+
+
+def _interior(item: ObjectSpec) -> InteriorSpec | None:
+    return item.material.interior if isinstance(item.material, GlassMaterial) else None
+
+
+def fog_box(scene: Scene) -> tuple[Array, Array]:
+    """(3,) lowest and highest corner of the scene's medium."""
+    said = scene.spec.medium
+    if said is not None and said.box is not None:
+        middle, half = np.array(said.box.center), np.array(said.box.size) / 2
+        return middle - half, middle + half
+    points = [corner for shape in scene.shapes() for corner in shape.bounds()]
+    points += [camera.position for camera in scene.cameras]
+    points += [np.array(light.position) for light in scene.spec.lights if isinstance(light, PointSpec | SpotSpec)]
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    # A wall of fog in the very plane of a floor would be hit before or after it by chance.
+    return low - 0.01 * np.max(high - low), high + 0.01 * np.max(high - low)
+
+
+def _within(scene: Scene, owner: int, box: tuple[Array, Array] | None) -> bool:
+    if box is None:
+        return False
+    bounds = [shape.bounds() for shape in scene.shapes() if shape.object_id == owner]
+    middle = np.mean([b.mean(0) for b in bounds], axis=0)
+    return bool(((middle > box[0]) & (middle < box[1])).all())
+
+
+def _homogeneous(said: InteriorSpec) -> dict[str, Any]:
+    return {
+        "type": "homogeneous",
+        "sigma_t": said.sigma_t,
+        "albedo": _rgb(said.albedo, said.tint),
+        "phase": {"type": "hg", "g": said.g},
+    }
+
+
+def _rgb(scale: float, color: str) -> dict[str, Any]:
+    return {"type": "rgb", "value": (scale * np.array(linear_rgb(color))).tolist()}
+
+
+def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
+    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as loaded."""
+    mi = _mitsuba()
+    everything = tuple(range(len(scene.spec.lights)))
+    world, center, fog = _world(scene, everything, True, True)
+    forms, _, plugins = _kept(
+        (mi.variant(), scene.world_hash, _texel(scene)), lambda: _load_shapes(scene, _texel(scene))
     )
+    names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}
+    parsed = [(where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n) for where, n in plugins]
+    for k in everything:
+        parsed += _plugins(f"lights[{k}]", _light(scene.spec.lights[k], center))
+    for k, item in enumerate(scene.spec.objects):
+        inside = _interior(item)
+        if inside is not None:
+            parsed += _plugins(f"objects[{k}].interior", _homogeneous(inside))
+    if scene.spec.medium is not None:
+        parsed += _plugins("medium.interior", _homogeneous(scene.spec.medium))
+    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
+    sensor = _sensor(scene, scene.source, center, middles, world, plan(scene, 1), fog)
+    parsed.append(("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective")))
+    loaded = [(names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]):], thing)
+              for where, thing in _walk(world)]  # fmt: skip
+    return parsed, loaded
+
+
+def _plugins(where: str, form: Any) -> list[tuple[str, str]]:
+    if not isinstance(form, dict):
+        return []
+    out = [(where, str(form["type"]))] if "type" in form else []
+    for key, value in form.items():
+        out += _plugins(f"{where}.{key}", value)
+    return out
+
+
+def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
+    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives it."""
+    mi = _mitsuba()
+    found: list[tuple[str, Any]] = []
+
+    class Visit(mi.TraversalCallback):  # type: ignore[name-defined]
+        def put(self, name: str, value: Any, *_: Any) -> None:
+            if isinstance(value, mi.Object):
+                found.append((where + name, value))
+                found.extend(_walk(value, f"{where}{name}."))
+
+        put_object = put
+
+        def put_value(self, name: str, value: Any, *_: Any) -> None:
+            """Numbers are of no interest here."""
+
+    thing.traverse(Visit())
+    return found
 
 
 _loaded: dict[Any, Any] = {}
@@ -221,13 +367,29 @@ def _kept(key: Any, make: Callable[[], Any]) -> Any:
     return _loaded[key]
 
 
-def _load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Any], Array]:
+def _load_shapes(
+    scene: Scene, texel: float
+) -> tuple[dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]], Array, list[tuple[str, str]]]:
+    """Shapes that neither shine nor hold a medium: name -> (shape, object, what it is loaded from); origin; plugins."""
     mi = _mitsuba()
     bounds = np.stack([shape.bounds() for shape in scene.shapes()])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
+    out: dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]] = {}
+    plugins: list[tuple[str, str]] = []
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
-        forms = _shapes(scene, center, texel, Path(folder))
-        return {name: mi.load_dict(form, optimize=False) for name, form in forms}, center
+        for (name, form), owner in zip(_shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True):
+            shape = mi.load_dict(form, optimize=False)
+            plugins += _plugins(name, form)
+            item = scene.spec.objects[owner]
+            again: Callable[[], dict[str, Any]] = dict
+            if item.emission or isinstance(item.material, GlassMaterial):
+                again = functools.partial(dict, form)
+            if again is not dict and form["type"] == "ply":
+                # The file is gone by the time a lamp or a filled glass is made of it.
+                data = Path(form["filename"]).read_bytes()
+                again = functools.partial(_from_memory, dict(form), data)
+            out[name] = (shape, owner, again)
+    return out, center, plugins
 
 
 def _faces(scene: Scene) -> Iterator[Sphere | Rectangle | Mesh]:
@@ -245,7 +407,8 @@ def _owners(scene: Scene) -> list[int]:
 def _shapes(scene: Scene, center: Array, texel: float, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     mi = _mitsuba()
     for index, shape in enumerate(_faces(scene)):
-        texture = scene.spec.objects[shape.object_id].texture
+        item = scene.spec.objects[shape.object_id]
+        texture = item.texture
 
         def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
             color = albedo(texture, points.reshape(-1, 3)).reshape(points.shape).astype(np.float32)
@@ -280,11 +443,31 @@ def _shapes(scene: Scene, center: Array, texel: float, folder: Path) -> Iterator
             _write_ply(file, shape, center, color)
             form = {"type": "ply", "filename": str(file), "face_normals": shape.normals is None}
             reflectance = {"type": "mesh_attribute", "name": "vertex_color"}
-        # Two-sided, since splats and warps know no back faces either.
-        yield (
-            f"shape_{index:06d}",
-            form | {"bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}},
-        )
+        yield f"shape_{index:06d}", form | {"bsdf": _bsdf(item, reflectance)}
+
+
+def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:
+    material = item.material
+    inner: dict[str, Any]
+    match material:
+        case GlassMaterial():
+            kind = "thindielectric" if material.thin else "roughdielectric" if material.roughness else "dielectric"
+            rough = {"alpha": material.roughness, "distribution": "ggx"} if material.roughness else {}
+            tint = {"specular_transmittance": _rgb(1.0, material.tint)}
+            return {"type": kind, "int_ior": material.ior, "ext_ior": 1.0} | tint | rough
+        case MirrorMaterial():
+            inner = {"type": "conductor", "material": "none", "specular_reflectance": _rgb(1.0, material.tint)}
+        case MetalMaterial():
+            inner = {"type": "conductor", "material": material.metal, "specular_reflectance": _rgb(1.0, material.tint)}
+            if material.roughness:
+                inner |= {"type": "roughconductor", "alpha": material.roughness, "distribution": "ggx"}
+        case PlasticMaterial():
+            inner = {"type": "roughplastic", "int_ior": material.ior, "ext_ior": 1.0, "alpha": material.roughness,
+                     "distribution": "ggx", "diffuse_reflectance": reflectance}  # fmt: skip
+        case _:
+            inner = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0} if item.emission else reflectance}
+    # Two-sided, since splats and warps know no back faces either.
+    return {"type": "twosided", "bsdf": inner}
 
 
 def _texel(scene: Scene) -> float:
@@ -295,6 +478,19 @@ def _texel(scene: Scene) -> float:
 
 def _texels(length: float, texel: float) -> int:
     return int(np.clip(math.ceil(length / texel), 2, TEXELS))
+
+
+def _from_memory(form: dict[str, Any], data: bytes) -> dict[str, Any]:
+    """A mesh's form with its file written anew; the file stays until the process ends."""
+    folder = _files()
+    path = Path(folder.name) / f"{content_key(data.hex())}.ply"
+    path.write_bytes(data)
+    return form | {"filename": str(path)}
+
+
+@functools.cache
+def _files() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="attnwarp-")
 
 
 def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
@@ -317,8 +513,7 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
         file.write(faces.tobytes())
 
 
-def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec) -> dict[str, Any]:
-    from attnwarp_eval.optics import PointSpec, SpotSpec
+def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> dict[str, Any]:
     from attnwarp_eval.scene import SunSpec
 
     mi = _mitsuba()
@@ -330,10 +525,23 @@ def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec) -> dict[str, Any]:
             "irradiance": {"type": "rgb", "value": color},
         }
     if isinstance(light, PointSpec | SpotSpec):
-        raise ValueError(f"lights: a {light.type} light cannot be rendered yet")
+        at = (np.array(light.position) - center).tolist()
+        strength = _rgb(light.intensity, light.color)
+        if isinstance(light, PointSpec):
+            return {"type": "point", "position": at, "intensity": strength}
+        toward = (np.array(light.target) - center).tolist()
+        upright = np.cross(np.array(light.target) - np.array(light.position), [0, 0, 1.0])
+        up = [0, 0, 1] if np.linalg.norm(upright) > 1e-6 else [1, 0, 0]
+        return {
+            "type": "spot",
+            "to_world": mi.ScalarTransform4f().look_at(origin=at, target=toward, up=up),
+            "intensity": strength,
+            "cutoff_angle": light.cutoff,
+            "beam_width": 0.75 * light.cutoff if light.beam is None else light.beam,
+        }
     # The colour depends on the elevation only, so that the map's longitude does not matter.
-    up = np.cos((np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * np.pi)
-    directions = np.stack([np.sqrt(1 - up**2), np.zeros(SKY_ROWS), up], axis=-1)
+    height = np.cos((np.arange(SKY_ROWS) + 0.5) / SKY_ROWS * np.pi)
+    directions = np.stack([np.sqrt(1 - height**2), np.zeros(SKY_ROWS), height], axis=-1)
     colors = np.repeat(sky_radiance(light, directions)[:, None].astype(np.float32), 8, axis=1)
     return {
         "type": "envmap",
@@ -343,8 +551,17 @@ def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec) -> dict[str, Any]:
     }
 
 
-def _sensor(camera: Camera, center: Array, sampler: dict[str, Any], world: Any) -> Any:
-    mi = _mitsuba()
+def _sensor(
+    scene: Scene,
+    camera: Camera,
+    center: Array,
+    sampling: dict[str, Any],
+    world: Any,
+    plan: Plan,
+    fog: Any,
+    name: str | None = None,
+) -> Any:
+    mi = _mitsuba(name)
     fx, fy, skew = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
     if abs(fx / fy - 1) > 1e-6 or skew != 0:
         raise ValueError(
@@ -356,24 +573,42 @@ def _sensor(camera: Camera, center: Array, sampler: dict[str, Any], world: Any) 
     box = world.bbox()
     size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
     reach = size + float(np.linalg.norm(moved.position))
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": math.degrees(2 * math.atan(camera.width / 2 / fx)),
-            "fov_axis": "x",
-            "principal_point_offset_x": (camera.width / 2 - camera.K[0, 2]) / camera.width,
-            "principal_point_offset_y": (camera.height / 2 - camera.K[1, 2]) / camera.height,
-            "near_clip": 1e-4 * reach,
-            "far_clip": 10 * reach,
-            "to_world": mi.ScalarTransform4f(pose),
-            "film": {
-                "type": "hdrfilm",
-                "width": camera.width,
-                "height": camera.height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-            "sampler": sampler,
-        }
-    )
+    form: dict[str, Any] = {
+        "type": "perspective",
+        "fov": math.degrees(2 * math.atan(camera.width / 2 / fx)),
+        "fov_axis": "x",
+        "principal_point_offset_x": (camera.width / 2 - camera.K[0, 2]) / camera.width,
+        "principal_point_offset_y": (camera.height / 2 - camera.K[1, 2]) / camera.height,
+        "near_clip": 1e-4 * reach,
+        "far_clip": 10 * reach,
+        "to_world": mi.ScalarTransform4f(pose),
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": sampling,
+    }
+    if plan.lens is not None:
+        off = max(abs(form.pop("principal_point_offset_x")), abs(form.pop("principal_point_offset_y")))
+        if off > 1e-9:
+            raise ValueError(
+                f"camera: got a principal point {off:.3g} image sizes off the middle, but a lens needs it there; "
+                "take away cameras.lens or centre the image"
+            )
+        form |= {"type": "thinlens", "aperture_radius": plan.lens.aperture,
+                 "focus_distance": plan.lens.focus or focus_distance(scene, camera)}  # fmt: skip
+    if fog is not None:
+        low, high = fog_box(scene)
+        if ((camera.position > low) & (camera.position < high)).all():
+            form["medium"] = fog
+    return mi.load_dict(form)
+
+
+def focus_distance(scene: Scene, camera: Camera) -> float:
+    """How far along the optical axis the point lies that the cameras look at; the orbit's radius if it is behind."""
+    depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])
+    return depth if depth > 0 else scene.spec.cameras.radius
