@@ -2,7 +2,8 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 RUN ?= runs/demo
-JOBS ?= $(shell nproc)
+# A worker of the demo needs up to 3 GB.
+JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m < 1 ? 1 : m < n ? m : n }' /proc/meminfo)
 
 .PHONY: demo test test-all bench lint venv clean
 

@@ -13,13 +13,14 @@ if TYPE_CHECKING:
     from attnwarp_eval.ablation.run import Plan, Summary
     from attnwarp_eval.ablation.store import Store
 
-PASS, REGRESSION, USAGE, TOO_LITTLE = 0, 1, 2, 3
-"""Exit codes. 1 is kept for a regression; an unusable input is 2; a run that measured too little is 3."""
+PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH = 0, 1, 2, 3, 70
+"""Exit codes. 1 is kept for a regression; an unusable input is 2; a run that measured too little, or
+with an instrument that is not calibrated, is 3; a fault of this program is 70, as in sysexits."""
 
 app = typer.Typer(
     name="attnwarp-eval",
     help="Check warps, masks and depth of Gaussian scenes against exact truth, and report what accuracy costs in time.",
-    epilog="Exit codes: 0 pass, 1 regression, 2 wrong usage or input, 3 nothing or too little was measured.",
+    epilog="Exit codes: 0 pass, 1 regression, 2 wrong usage or input, 3 nothing or too little was measured; 130 interrupted.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -45,10 +46,15 @@ def clear_errors() -> Iterator[None]:
         yield
     except InputError as error:
         raise fail(str(error)) from None
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        raise fail(
+            f"{where}{error.strerror or error}; check the path, the space on its disk and its permissions"
+        ) from None
 
 
 def _split(text: str | None) -> list[str] | None:
-    return [part.strip() for part in text.split(",") if part.strip()] if text else None
+    return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
 
 
 @app.command()
@@ -68,14 +74,34 @@ def run(
     with clear_errors():
         loaded = load_study(study, scenes=_split(scenes), size=size)
         store = Store(out or Path("runs") / loaded.name)
+        planned = runner.plan(loaded, store)
         with store.lock():
-            planned = runner.plan(loaded, store)
-            summary = _watch(planned, store, jobs, keep_going)
+            if planned.other_code:
+                typer.echo(
+                    f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were computed by other code than "
+                    "this; they are kept, and the report says so. Name another folder with --out to start afresh.",
+                    err=True,
+                )
+            try:
+                summary = _watch(planned, store, jobs, keep_going)
+            except KeyboardInterrupt:
+                kept = len(store.done())
+                raise fail(f"interrupted; {kept} cells are kept, the same command goes on from here", 130) from None
             _write_report(store)
+            uncalibrated = _calibration_problems(store)
     _print_failures(summary)
     if not summary.complete:
         missing = summary.expected - summary.reused - summary.computed
         raise fail(f"{missing} of {summary.expected} cells were not measured; run again to retry them", TOO_LITTLE)
+    if uncalibrated:
+        raise fail("the instrument is not calibrated: " + "; ".join(uncalibrated), TOO_LITTLE)
+
+
+def _calibration_problems(store: Store) -> list[str]:
+    from attnwarp_eval.report.calibration import problems
+    from attnwarp_eval.report.results import Results
+
+    return problems(Results.of(store))
 
 
 def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
@@ -159,10 +185,11 @@ def report(
 @app.command()
 def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:
     """Recompute the hashes of a run's cells and pictures and compare with the list of expected cells."""
+    from attnwarp_eval.ablation import run as runner
     from attnwarp_eval.ablation.store import Store
 
     with clear_errors():
-        problems = Store(run).verify()
+        problems = runner.verify(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),
@@ -288,7 +315,14 @@ def studies() -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    app()
+    import traceback
+
+    try:
+        app()
+    except Exception:
+        # Python's own exit code for a crash is 1, which here means a regression.
+        traceback.print_exc()
+        raise SystemExit(CRASH) from None
 
 
 if __name__ == "__main__":

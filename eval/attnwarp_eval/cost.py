@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import resource
+import statistics
 import subprocess
 import sys
 import time
@@ -65,14 +66,13 @@ class Meter:
 
     def seconds(self) -> dict[str, float | None]:
         """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others' (None without them)."""
-        later = sorted(self._views[1:])
-        steady = later[len(later) // 2] if later else None
+        steady = statistics.median(self._views[1:]) if len(self._views) > 1 else None
         warm = self._views[0] if self._views else None
         return {**self._stages, "warm": warm, "steady": steady, "method": sum(self._views)}
 
 
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process so far, in MiB."""
+    """Peak resident memory of this process so far, in MiB; earlier cells of the process are in it."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
 
@@ -101,6 +101,9 @@ def _git(folder: Path) -> dict[str, Any]:
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
+    # An installed copy may lie inside somebody else's repository, whose revision says nothing about this code.
+    if ask("ls-files", "--error-unmatch", str(Path(__file__).resolve())) is None:
+        return {"sha": None, "dirty": None}
     sha = ask("rev-parse", "HEAD")
     status = ask("status", "--porcelain", "--untracked-files=no")
     return {"sha": sha, "dirty": bool(status) if status is not None else None}

@@ -47,6 +47,9 @@ class Registry(dict[str, Metric]):
 
 
 _SPECS = (
+    Metric(
+        "calibration.mitsuba_agrees", "share", "higher", 1e-3, 0, "pixels whose point Mitsuba finds as the ray caster"
+    ),
     Metric("warp.epe_median", "px", "lower", 1e-4, 1e-3, "median endpoint error, visible pixels"),
     Metric("warp.epe_p95", "px", "lower", 1e-3, 1e-2, "95th percentile of the endpoint error, visible pixels"),
     Metric("warp.epe_mean", "px", "lower", 1e-3, 1e-2, "mean endpoint error, visible pixels"),

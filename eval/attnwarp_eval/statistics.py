@@ -72,6 +72,8 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     if count < 2:
         return Interval(mean, np.nan, np.nan, count, views, undefined, np.nan, np.nan)
     error = float(means.std(ddof=1) / np.sqrt(count))
+    if error <= 1e-13 * abs(mean):
+        error = 0.0  # the rounding of equal means, which is no spread
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
     p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
     return Interval(mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import torch
 
 from attnwarp.fit import FitSettings
+from attnwarp.render import _threads
 from attnwarp.settings import PRESETS, WarpSettings
 from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
 from attnwarp.warp import TAP_SPREAD
@@ -23,34 +25,42 @@ from attnwarp_eval.ablation.store import write_atomic
 from attnwarp_eval.ablation.study import Splats
 from attnwarp_eval.ablation.world import World, splats, world
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
+from attnwarp_eval.errors import InputError
 from attnwarp_eval.truth import TwoView
 
 Figures = dict[str, float]
 View = tuple[str, Figures, dict[str, Any]]
 """A target's name, its figures, and what its pictures are drawn from."""
 
+MITSUBA_TOLERANCE = 1e-4
+"""Of the distance: Mitsuba's positions are float32, so a point 10 m away is known to about 1e-6 of that."""
+
 EXACT = dataclasses.replace(PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)
 """The corrected rules with the tolerances for exact depth: what the instrument is calibrated with."""
 
 
-def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
+def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> dict[str, Any]:
     """Compute a cell.
 
     Args:
         cell: what to compute.
         scene: name or path of its scene.
         root: the run's folder; the cell's pictures go below it.
+        threads: of the renderer; every core this process may use, if left out.
 
     Returns:
         The record for :meth:`attnwarp_eval.ablation.store.Store.write`.
     """
     # Image-sized tensor operations gain little from threads and lose much when other processes want the cores; the
-    # renderer has its own threads.
+    # renderer's own threads are counted apart.
     torch.set_num_threads(1)
+    _threads.choose(threads or len(os.sched_getaffinity(0)))
     meter = Meter()
     spec = cell.spec
     with meter.stage("setup"):
         at = world(scene, spec["size"])
+    if at.content_hash != spec["scene"]:
+        raise InputError(f"scene {scene!r} has changed since the run was planned; start the run again")
     views, pictures = [], []
     curve: list[dict[str, Any]] = []
     rounds: dict[str, list[list[float]]] = {}
@@ -77,7 +87,7 @@ def compute(cell: Cell, scene: str, root: Path) -> dict[str, Any]:
             "seconds": meter.seconds(),
             "counters": dict(sorted(meter.counters.items())),
             "peak_memory_mb": peak_memory_mb(),
-            "threads": torch.get_num_threads(),
+            "threads": _threads.count(),
             **({"rounds": rounds} if rounds else {}),
         },
         "environment": environment(),
@@ -101,10 +111,23 @@ def _calibration(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> I
         with meter.view():
             view = _warp_truth(at, truth, EXACT)
         figures = _warp_figures(at, spec, name, view, meter)
+        figures["calibration.mitsuba_agrees"] = _mitsuba_agrees(at, truth) if name == spec["views"][0] else math.nan
         own = checks.occlusion.mask_error(truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge)
         figures |= {f"{key}.exact": value for key, value in own.items()}
         meter.count(pixels=size * size)
         yield name, figures, {"truth": truth, "view": view, "spp": spec["spp"]}
+
+
+def _mitsuba_agrees(at: World, truth: TwoView) -> float:
+    """Share of a view's pixels where Mitsuba's own ray tracer finds the same surface point, or none where there is none."""
+    from attnwarp_eval.truth.mitsuba import position_and_shape
+
+    position, _ = position_and_shape(at.scene, truth.target)
+    away = np.linalg.norm(position - truth.hits.point, axis=-1)
+    far = np.linalg.norm(truth.hits.point - truth.target.position, axis=-1)
+    empty = ~np.isfinite(position).all(axis=-1) & ~truth.hits.valid
+    with np.errstate(invalid="ignore"):
+        return float((empty | (away < MITSUBA_TOLERANCE * far)).mean())
 
 
 def _depth(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator[View]:
@@ -141,7 +164,7 @@ def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator
         # One source serves every target, so its render is no part of what a target costs.
         with meter.stage("source"):
             source_surface = render_surface(model, at.source, settings)
-        meter.count(**source_surface.counters)
+        meter.count(source_pairs=source_surface.counters["pairs"])
     for name in spec["views"]:
         target = at.targets[name]
         with meter.stage("truth"):
@@ -276,7 +299,7 @@ def _warp_figures(at: World, spec: dict[str, Any], name: str, view: WarpedView, 
             warped = at_layer.warp(torch.from_numpy(features)).numpy()
         meter.count(taps=4 * features.size)
         with meter.stage("checks"):
-            found = checks.warp.feature_error(warped, exact, at_layer.mask, truth.visible)
+            found = checks.warp.feature_error(warped, exact, at_layer.mask, truth.visible, truth.edge)
             if layer != size:
                 xy = at_layer.correspondence.xy
                 found |= checks.warp.endpoint_error(xy, truth.xy, truth.visible, image_px=size / layer)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
+import threading
 import time
 import traceback
 from collections import deque
@@ -12,8 +15,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp_eval.ablation.cell import Cell
-from attnwarp_eval.ablation.store import Store
-from attnwarp_eval.ablation.study import Study
+from attnwarp_eval.ablation.store import Problems, Store, StoreError
+from attnwarp_eval.ablation.study import Study, StudyError
+from attnwarp_eval.cost import environment
+from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene import Scene
@@ -21,12 +26,13 @@ if TYPE_CHECKING:
 
 @dataclass
 class Plan:
-    """A resolved study: its scenes, its cells, and which of them are still to do."""
+    """A resolved study: its scenes, its cells, which are still to do, and how many were done by other code than this."""
 
     study: Study
     scenes: dict[str, Scene]
     cells: list[Cell]
     todo: list[Cell]
+    other_code: int = 0
 
     @property
     def reused(self) -> int:
@@ -61,9 +67,48 @@ def plan(study: Study, store: Store) -> Plan:
     scenes: dict[str, Scene] = {}
     for name in study.scenes:
         scenes[name] = load_scene(name)
+        for other, scene in scenes.items():
+            if other != name and scene.content_hash == scenes[name].content_hash:
+                raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
     cells = study.cells(scenes)
     done = store.done()
-    return Plan(study, scenes, cells, [c for c in cells if c.id not in done])
+    finished: dict[str, dict[str, Any]] = {}
+    for cell in cells:
+        if cell.id in done:
+            with contextlib.suppress(StoreError):  # a damaged record is computed again
+                record = store.read(cell.id)
+                if _has_pictures(cell, record, store):
+                    finished[cell.id] = record
+    here = environment()["git"]
+    other_code = sum(record["environment"]["git"] != here for record in finished.values())
+    return Plan(study, scenes, cells, [c for c in cells if c.id not in finished], other_code)
+
+
+def _has_pictures(cell: Cell, record: dict[str, Any], store: Store) -> bool:
+    """Whether the pictures that the study wants of a cell are there; what they show is no part of its id."""
+    kept = [p for p in record.get("pictures", []) if (store.root / p["path"]).is_file()]
+    return len(kept) == len(record.get("pictures", [])) and set(cell.pictures) <= {p["view"] for p in kept}
+
+
+def verify(store: Store) -> Problems:
+    """Recompute the hashes of a run's cells and pictures, and the list of expected cells from its study.
+
+    Raises:
+        InputError: the folder is no run, or a scene of it is gone.
+    """
+    kept = store.read_study()
+    problems = store.verify()
+    try:
+        study = Study.model_validate(kept["study"])
+        again = {c.id for c in plan(study, store).cells}
+    except InputError as error:
+        problems.damaged.append(f"the study's cells cannot be listed again: {error}")
+        return problems
+    if again != {c["id"] for c in kept["cells"]}:
+        problems.damaged.append(
+            "the study names other cells today: a scene or a protocol has changed since; run it again for the new ones"
+        )
+    return problems
 
 
 def expected(plan: Plan) -> dict[str, Any]:
@@ -122,7 +167,7 @@ def execute(
 Outcome = tuple[Cell, dict[str, str] | None]
 
 
-def compute_and_write(cell: Cell, scene: str, root: str) -> dict[str, str] | None:
+def compute_and_write(cell: Cell, scene: str, root: str, threads: int | None = None) -> dict[str, str] | None:
     """Compute one cell and write its record; return what went wrong, or None.
 
     The cell is written where it was computed, so a lost connection cannot lose a result. Every kind of error is
@@ -131,7 +176,7 @@ def compute_and_write(cell: Cell, scene: str, root: str) -> dict[str, str] | Non
     from attnwarp_eval.ablation.probes import compute
 
     try:
-        Store(root).write(compute(cell, scene, Path(root)))
+        Store(root).write(compute(cell, scene, Path(root), threads))
     except Exception as error:
         return describe(error)
     return None
@@ -170,17 +215,16 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
         **keep_memory,
         "distributed.scheduler.allowed-failures": 1,
         "distributed.worker.memory.terminate": False,
-        "distributed.nanny.pre-spawn-environ.NUMBA_NUM_THREADS": threads,
         "distributed.nanny.pre-spawn-environ.OMP_NUM_THREADS": threads,
         "distributed.nanny.pre-spawn-environ.MKL_NUM_THREADS": threads,
     }
-    with (
-        dask.config.set(settings),
-        LocalCluster(
-            n_workers=jobs, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(dask.config.set(settings))
+        with _deaf_to_interrupts():
+            # No memory limit: near one dask pauses a worker for good, since a world's caches are never given back.
+            how = {"processes": True, "threads_per_worker": 1, "memory_limit": 0, "silence_logs": 50}
+            cluster = stack.enter_context(LocalCluster(n_workers=jobs, dashboard_address=None, **how))
+        client = stack.enter_context(Client(cluster))
         queue = _Queue(plan.todo)
         running: dict[Any, Cell] = {}
         pool = as_completed()
@@ -189,7 +233,7 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
             cell = queue.take(scene)
             if cell is not None:
                 tell("start", {"title": cell.title})
-                future = client.submit(compute_and_write, cell, cell.scene, root, pure=False)
+                future = client.submit(compute_and_write, cell, cell.scene, root, threads, pure=False)
                 running[future.key] = cell
                 pool.add(future)
 
@@ -200,6 +244,19 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
             error = describe(future.exception()) if future.status == "error" else future.result()
             yield cell, error
             submit(cell.scene)
+
+
+@contextlib.contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Let worker processes that start inside ignore Ctrl-C: this process is the one to hear it, and it ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Queue:

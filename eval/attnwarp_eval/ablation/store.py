@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -93,8 +94,13 @@ class Store:
                 f"{self.root}: not a run's folder (no study.json); "
                 f"make one with: attnwarp-eval run quick --out {self.root}"
             )
-        study: dict[str, Any] = json.loads(path.read_text())
-        return study
+        try:
+            study: dict[str, Any] = json.loads(path.read_text())
+            if {"study", "cells"} <= study.keys():
+                return study
+        except (ValueError, AttributeError):
+            pass
+        raise StoreError(f"{path}: damaged; run the study again with --out {self.root}, which writes it anew")
 
     @staticmethod
     def write_json(path: Path, value: Any) -> None:
@@ -124,7 +130,12 @@ class Store:
         """Failures of cells that have no record."""
         done = self.done()
         paths = sorted(self.failed.glob("*.json")) if self.failed.is_dir() else []
-        return [json.loads(p.read_text()) for p in paths if p.stem not in done]
+        found = []
+        for path in paths:
+            if path.stem not in done:
+                with contextlib.suppress(ValueError):
+                    found.append(json.loads(path.read_text()))
+        return found
 
     def read(self, cell_id: str) -> dict[str, Any]:
         """The record of a finished cell.
@@ -153,11 +164,6 @@ class Store:
         if digest(body) != record.get("sha256"):
             return "its checksum does not fit its content"
         return None
-
-    def records(self, ids: Iterable[str]) -> list[dict[str, Any]]:
-        """Records of those of ``ids`` that are done, in the order given."""
-        done = self.done()
-        return [self.read(i) for i in ids if i in done]
 
     def verify(self) -> Problems:
         """Recompute every hash and compare with the list of expected cells."""

@@ -114,7 +114,7 @@ class Pictures(_Model):
 class Study(_Model):
     """A study: scenes x variants x seeds x probes, and what the report shows of them."""
 
-    name: str
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     title: str = ""
     description: str = ""
     size: Annotated[int, Field(ge=16, le=4096)] = 512
@@ -122,7 +122,7 @@ class Study(_Model):
     views: list[str] = Field(default_factory=list, description="target views by name; all of them if empty")
     seeds: Annotated[list[int], Field(min_length=1)] = [0]
     spp: Annotated[int, Field(ge=1)] = 16
-    feature_sizes: Annotated[list[int], Field(min_length=1)] = [512, 64, 32]
+    feature_sizes: list[int] = Field(default_factory=list, description="image size, 1/8 and 1/16 of it if left out")
     feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
     timing_rounds: Annotated[int, Field(ge=3)] = 15
     splats: Splats = Splats()
@@ -133,6 +133,15 @@ class Study(_Model):
     yaw: Yaw = Yaw()
     fronts: list[Front] = Field(default_factory=list)
     pictures: Pictures = Pictures()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _feature_sizes_follow_the_image(cls, data: Any) -> Any:
+        size = data.get("size", 512) if isinstance(data, dict) else None
+        if isinstance(size, int) and not data.get("feature_sizes"):
+            # The latent sizes of a diffusion UNet's first two levels of attention.
+            return {**data, "feature_sizes": sorted({size, max(1, size // 8), max(1, size // 16)}, reverse=True)}
+        return data
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Study:
@@ -146,18 +155,39 @@ class Study(_Model):
                 raise ValueError(f"variants.{name}.splats: {explain(error, Splats)}") from None
             except ValueError as error:
                 raise ValueError(f"variants.{name}: {error}") from None
-        used: list[tuple[str, list[str]]] = [(f"probes.{p}", v) for p, v in self.probes.items()]
-        used += [(f"ablations.{i}", [a.baseline, *a.variants]) for i, a in enumerate(self.ablations)]
-        used += [(f"fronts.{i}", f.variants) for i, f in enumerate(self.fronts)]
-        used += [("pictures.variants", self.pictures.variants), ("yaw.variants", self.yaw.variants)]
-        for where, names in used:
+        used: list[tuple[str, list[str], str | None]] = [(f"probes.{p}", v, None) for p, v in self.probes.items()]
+        used += [(f"ablations.{i}", [a.baseline, *a.variants], a.probe) for i, a in enumerate(self.ablations)]
+        used += [(f"fronts.{i}", f.variants, f.probe) for i, f in enumerate(self.fronts)]
+        used += [("pictures.variants", self.pictures.variants, None), ("yaw.variants", self.yaw.variants, "warp")]
+        for where, names, probe in used:
             for name in names:
                 if name not in self.variants:
                     raise ValueError(f"{where}: no variant {name!r}{_did_you_mean(name, self.variants)}")
+                # A row that is never measured would vanish from its table without a word.
+                if probe is not None and name not in self.probes.get(probe, []):  # type: ignore[call-overload]
+                    raise ValueError(f"{where}: {name!r} is not measured; add it to probes.{probe}")
+        for name in self.probes.get("timing", []):
+            if self.variants[name].geometry != "splats":
+                raise ValueError(f"probes.timing: {name!r} renders nothing, so there is no time to take; leave it out")
+        self._metrics_are_known()
+        for size in self.feature_sizes:
+            if not 1 <= size <= self.size:
+                raise ValueError(f"feature_sizes: got {size}, expected 1 to {self.size}, the image size")
         for name, values in (("scenes", self.scenes), ("seeds", self.seeds), ("views", self.views)):
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: something is named twice in {values}")
         return self
+
+    def _metrics_are_known(self) -> None:
+        from attnwarp_eval.metric import metric
+
+        for i, front in enumerate(self.fronts):
+            try:
+                direction = metric(front.metric).direction
+            except KeyError:
+                raise ValueError(f"fronts.{i}.metric: no metric {front.metric!r}") from None
+            if direction != "lower":
+                raise ValueError(f"fronts.{i}.metric: {front.metric!r} is not one of which less is better")
 
     def splats_of(self, variant: Variant) -> Splats:
         """The study's splats with the variant's own fields."""
@@ -182,7 +212,14 @@ class Study(_Model):
         for scene_name in self.scenes:
             scene = scenes[scene_name]
             views = self._views_of(scene)
+            # The instrument is judged in every run, whatever else it is used for.
+            own = self._spec(scene, views, "calibration", Variant(), self.seeds[0])
+            shown = tuple(v for v in self.pictures.views if v in views)
+            cell = Cell(own, scene_name, "calibration", "calibration", self.seeds[0], ("calibration",), shown)
+            found[cell.id] = cell
             for probe, names in self.probes.items():
+                if probe == "calibration":
+                    continue
                 if probe == "timing":
                     for seed in self.seeds:
                         cell = Cell(
@@ -194,7 +231,7 @@ class Study(_Model):
                     for seed in self.seeds:
                         spec = self._spec(scene, views, probe, self.variants[name], seed)
                         shown = tuple(v for v in self.pictures.views if v in spec["views"])
-                        pictures = shown if name in self.pictures.variants or probe == "calibration" else ()
+                        pictures = shown if name in self.pictures.variants else ()
                         cell = Cell(spec, scene_name, name, probe, seed, (name,), pictures)
                         if cell.id in found:
                             old = found[cell.id]
@@ -304,8 +341,8 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             f"{name_or_path}: no such study{_did_you_mean(name_or_path, shipped)}, or give a YAML file's path"
         )
     try:
-        data = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise StudyError(f"{path}: not YAML: {error}") from None
     if not isinstance(data, dict):
         raise StudyError(f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}")
@@ -314,6 +351,18 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         return Study.model_validate(data)
     except ValidationError as error:
         raise StudyError(f"{path}: {explain(error)}") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that stands twice in one mapping, where YAML lets the last one win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} stands twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def explain(error: ValidationError, model: type[BaseModel] = Study) -> str:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from attnwarp.camera import Camera
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.features import SolidField
 from attnwarp_eval.scene import Scene, load_scene
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
     from attnwarp_eval.ablation.study import Splats
 
 
+SPLATS_PROTOCOL = 1
+"""Raised whenever the same spec would give other splats: those on disk are then made anew."""
+
 Features = npt.NDArray[np.float64]
 
 
@@ -27,16 +32,19 @@ class World:
     """Everything about a scene that is the same for all variants.
 
     Args:
-        scene: with the image size that the study asks for.
+        scene: as it was loaded.
+        size: of the images, in pixels; the study's.
 
     Attributes:
+        content_hash: of the scene's file, which a cell's spec names.
         source: the source camera.
         targets: the target cameras by name.
         yaw: degrees from the source, folded to [0, 180], by the target's name.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, size: int) -> None:
+        self.content_hash = scene.content_hash
+        self.scene = scene = scene.with_size(size, size)
         self.geometry = Geometry(scene)
         self.source = scene.source
         self.targets = {camera.name: camera for camera in scene.targets}
@@ -89,13 +97,22 @@ class World:
 @lru_cache(maxsize=1)
 def world(scene: str, size: int) -> World:
     """The world of a scene (a name or a path) at an image size; the last one is kept."""
-    return World(load_scene(scene).with_size(size, size))
+    return World(load_scene(scene), size)
 
 
 @lru_cache(maxsize=8)
 def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
-    """Gaussians on a scene's surfaces; the last few are kept."""
+    """Gaussians on a scene's surfaces; the last few are kept, and all of them in the cache on disk."""
+    from attnwarp import Gaussians
     from attnwarp_eval.splats import surface_splats
 
     at = world(scene, size)
-    return surface_splats(at.scene, seed=seed, geometry=at.geometry, **spec.model_dump())
+    key = content_key("surface splats", SPLATS_PROTOCOL, at.content_hash, seed, spec.model_dump())
+    stored = read_arrays("splats", key)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    if stored is None:
+        made = surface_splats(at.scene, seed=seed, geometry=at.geometry, **spec.model_dump())
+        write_arrays("splats", key, {**{name: getattr(made, name).numpy() for name in names}, "origin": made.origin})
+        return made
+    means, quats, scales, opacities, sh = (torch.from_numpy(stored[name]) for name in names)
+    return Gaussians(spec.kind, means, quats, scales, opacities, sh, origin=stored["origin"])

@@ -5,81 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from attnwarp_eval.checks import metric as metric_of
 from attnwarp_eval.checks.occlusion import by_yaw
 from attnwarp_eval.report import figures
+from attnwarp_eval.report.ablations import ablations
+from attnwarp_eval.report.calibration import calibration
 from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.report.fits import fits
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics import Interval, benjamini_hochberg, interval, paired, verdict
+from attnwarp_eval.report.words import number, spread
+from attnwarp_eval.statistics import Interval, interval
 
 YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
 """Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""
-
-WARP_COLUMNS = {
-    "EPE, image px": "warp.epe_median",
-    "EPE p95": "warp.epe_p95",
-    "EPE on 64, layer px": "warp.epe_median_layer.64",
-    "within 1 px": "warp.below_1px",
-    "feature error, 64": "warp.feature_all_accepted.64",
-    "precision": "occlusion.precision",
-    "recall": "occlusion.recall",
-    "F1": "occlusion.f1",
-}
-DEPTH_COLUMNS = {
-    "AbsRel": "depth.abs_rel",
-    "AbsRel inside": "depth.abs_rel.interior",
-    "AbsRel at edges": "depth.abs_rel.edge",
-    "RMSE": "depth.rmse",
-    "median bias inside": "depth.bias_median.interior",
-    "delta < 1.01": "depth.delta_1_01",
-    "delta < 1.25": "depth.delta_1_25",
-    "normal, deg": "depth.normal_median",
-}
-FIT_COLUMNS = {
-    "PSNR, dB": "fit.psnr",
-    "SSIM": "fit.ssim",
-    "AbsRel": "depth.abs_rel",
-    "AbsRel inside": "depth.abs_rel.interior",
-    "AbsRel at edges": "depth.abs_rel.edge",
-    "median bias inside": "depth.bias_median.interior",
-    "delta < 1.01": "depth.delta_1_01",
-    "normal, deg": "depth.normal_median",
-    "normal inside, deg": "depth.normal_median.interior",
-}
-COLUMNS = {"warp": WARP_COLUMNS, "depth": DEPTH_COLUMNS, "fit": FIT_COLUMNS}
-CONTRASTS = {
-    "warp": ["warp.epe_median_layer.64", "warp.feature_all_accepted.64", "occlusion.precision", "occlusion.recall"],
-    "depth": ["depth.abs_rel", "depth.abs_rel.interior", "depth.normal_median"],
-    "fit": ["fit.psnr", "fit.ssim", "depth.abs_rel", "depth.abs_rel.interior", "depth.normal_median"],
-}
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """A number to ``digits`` significant digits; a dash where it is undefined."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    if abs(value) >= 10**digits:
-        return f"{value:.0f}"
-    text = f"{value:.{digits}g}"
-    return text if "e" in text else f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
-
-
-def spread(value: Interval) -> str:
-    """Mean and 95 % interval."""
-    if not math.isfinite(value.mean):
-        return "–"
-    lost = f" ({value.undefined} undefined)" if value.undefined else ""
-    if not value.known:
-        return number(value.mean) + lost
-    return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{lost}"
 
 
 def build(results: Results, root: Path, *, timings: bool = True, pictures: bool = True) -> Report:
@@ -103,11 +46,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     ]
     sections = [
         _claims(results),
-        _calibration(results),
-        *_ablations(results),
+        calibration(results),
+        *ablations(results),
         *fits(results, root, number, timings=timings),
         *_yaw(results, root),
-        *(fronts(results, root, number, spread) if timings else []),
+        *(fronts(results, root) if timings else []),
         *(_galleries(results) if pictures else []),
         *_failures(results),
         _how(results, timings),
@@ -118,21 +61,14 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     return Report(study["title"] or study["name"], lead, sections)
 
 
-def _mean(results: Results, probe: str, variant: str, metric: str) -> Interval:
-    table = results.views(probe, variant, metric)
-    return interval({scene: list(values.values()) for scene, values in table.items()})
-
-
 def _claims(results: Results) -> Section:
     rows = []
     for finding in judge(results, load_claims()):
-        if finding.verdict == "not measured":
-            continue
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
         shown = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
         agree, views = finding.agreement
-        rows.append([claim.text, claim.metric, sides, shown, f"{agree} of {views}", finding.here, finding.verdict])
+        rows.append([claim.text, finding.metric, sides, shown, f"{agree} of {views}", finding.here, finding.verdict])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
@@ -146,98 +82,6 @@ def _claims(results: Results) -> Section:
     columns = ["claim", "metric", "measured", "difference", "views that agree", "here", "in general"]
     section.tables = [Table(columns, rows)]
     return section
-
-
-def _calibration(results: Results) -> Section:
-    study = results.study
-    rows = []
-    for cell in results.cells:
-        if cell["probe"] != "calibration" or cell["record"] is None:
-            continue
-
-        def worst(metric: str, pick: Any, record: dict[str, Any] = cell["record"]) -> str:
-            values = [v["metrics"].get(metric) for v in record["views"]]
-            known = [v for v in values if v is not None]
-            undefined = len(values) - len(known)
-            return (number(pick(known)) if known else "–") + (f" ({undefined} undefined)" if undefined else "")
-
-        rows.append(
-            [
-                cell["scene"],
-                worst("warp.epe_median", max),
-                worst("warp.epe_p95", max),
-                worst("occlusion.f1.exact", min),
-                worst("occlusion.f1", min),
-                *(worst(f"warp.feature_accepted.{size}", max) for size in study["feature_sizes"]),
-            ]
-        )
-    columns = [
-        "scene",
-        "EPE median, px",
-        "EPE p95, px",
-        "F1 of the exact mask",
-        "F1 of the rules on exact depth",
-        *(f"feature error, {size}" for size in study["feature_sizes"]),
-    ]
-    text = [
-        "Before the instrument judges anything it judges itself: the truth's own depth goes through the same warp, "
-        "whose endpoint error must be below 1e-3 px in the median, and the exact mask is scored against itself, which "
-        "must give F1 = 1. The worst view of each scene is shown. What the rules lose on exact depth, and what "
-        "bilinear sampling of a feature field costs at each size, are the floor of everything below.",
-    ]
-    return Section("Calibration", text, [Table(columns, rows)])
-
-
-def _ablations(results: Results) -> list[Section]:
-    sections = []
-    for ablation in results.study["ablations"]:
-        probe, baseline = ablation["probe"], ablation["baseline"]
-        names = [baseline, *[v for v in ablation["variants"] if v != baseline]]
-        names = [n for n in names if results.records(probe, n)]
-        if not names:
-            continue
-        columns = COLUMNS[probe]
-        rows = []
-        for name in names:
-            work = results.counters(probe, name)
-            views = sum(len(record["views"]) for _, _, record in results.records(probe, name))
-            steady = results.cost(probe, name, "steady")
-            rows.append(
-                [
-                    name,
-                    *(spread(_mean(results, probe, name, metric)) for metric in columns.values()),
-                    number(work["pairs"] / views / 1e6) if work["pairs"] else "0",
-                    number(1000 * sum(steady.values()) / len(steady)) if steady else "–",
-                ]
-            )
-        main = Table(["variant", *columns, "M splat-pixel pairs a view", "ms a view"], rows, timed=("ms a view",))
-        section = Section(ablation["title"], [ablation["note"]] if ablation["note"] else [], [main])
-        contrasts = _contrasts(results, probe, baseline, names[1:])
-        if contrasts.rows:
-            section.tables.append(contrasts)
-        sections.append(section)
-    return sections
-
-
-def _contrasts(results: Results, probe: str, baseline: str, names: list[str]) -> Table:
-    found = []
-    for name in names:
-        for metric in CONTRASTS[probe]:
-            ours, theirs = results.views(probe, name, metric), results.views(probe, baseline, metric)
-            found.append((name, metric, paired(theirs, ours)))
-    adjusted = benjamini_hochberg([difference.p for _, _, difference in found])
-    rows = []
-    for (name, metric, difference), p in zip(found, adjusted, strict=True):
-        specification = metric_of(metric)
-        direction: Literal["higher", "lower"] = "higher" if specification.direction == "higher" else "lower"
-        judged: str = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
-        if difference.mean == difference.low == difference.high == 0:
-            judged = "same values"
-        rows.append(
-            [name, metric, spread(difference), judged, number(difference.detectable), number(p), str(difference.views)]
-        )
-    columns = ["variant", "metric", "difference", "verdict", "smallest that would be seen", "adjusted p", "views"]
-    return Table(columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True)
 
 
 def _yaw(results: Results, root: Path) -> list[Section]:
@@ -349,13 +193,7 @@ def _how(results: Results, timings: bool) -> Section:
     ]
     records = [c["record"] for c in results.cells if c["record"]]
     if records:
-        environment = records[-1]["environment"]
-        versions = ", ".join(f"{k} {v}" for k, v in environment["versions"].items())
-        machine = environment["machine"]
-        text.append(f"Versions: {versions}. Machine: {machine['system']} {machine['arch']}, {machine['cores']} cores.")
-        git = environment["git"]
-        if git["sha"]:
-            text.append(f"Source revision `{git['sha'][:12]}`{' with local changes' if git['dirty'] else ''}.")
+        text += _environments(records)
         if timings:
             total = {k: 0.0 for k in ("setup", "truth", "splats", "method", "sample", "checks", "pictures")}
             for record in records:
@@ -368,3 +206,24 @@ def _how(results: Results, timings: bool) -> Section:
                 + f". Peak memory {peak:.0f} MiB."
             )
     return Section("How it was measured", text, [Table(["metric", "unit", "better", "version", "meaning"], rows)])
+
+
+def _environments(records: list[dict[str, Any]]) -> list[str]:
+    """Every state of code, versions and machine that cells of this run were computed with, and how many."""
+    counted: dict[str, int] = {}
+    for record in records:
+        environment = record["environment"]
+        git, machine = environment["git"], environment["machine"]
+        revision = f"revision `{git['sha'][:12]}`" if git["sha"] else "an installed copy"
+        if git["dirty"]:
+            revision += " with local changes"
+        versions = ", ".join(f"{name} {version}" for name, version in environment["versions"].items())
+        where = f"{machine['system']} {machine['arch']}, {machine['cores']} cores"
+        described = f"{revision}; {versions}; {where}"
+        counted[described] = counted.get(described, 0) + 1
+    if len(counted) == 1:
+        return [f"Computed with {next(iter(counted))}."]
+    lines = [f"{count} cells with {described}" for described, count in sorted(counted.items(), key=lambda x: -x[1])]
+    return [
+        "**The cells of this run were computed with more than one state of code or machine:** " + "; ".join(lines) + "."
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any, Literal
@@ -11,7 +12,7 @@ import yaml
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.statistics import ByView, Interval, agreement, benjamini_hochberg, interval, paired
 
-Verdict = Literal["holds", "does not hold", "can't tell", "not measured"]
+Verdict = Literal["holds", "does not hold", "can't tell"]
 
 
 @dataclass(frozen=True)
@@ -22,9 +23,9 @@ class Claim:
     text: str
     probe: str
     metric: str
-    a: str
+    a: Mapping[str, Any]
     expect: Literal["higher", "lower"]
-    b: str | None = None
+    b: Mapping[str, Any] | None = None
     yaw: tuple[float, float] | None = None
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
@@ -34,28 +35,34 @@ class Claim:
         """The sign that the contrast is expected to have."""
         return 1 if self.expect == "higher" else -1
 
-    def measure(self, results: Results) -> Measured:
-        """What the claim speaks of."""
+    def measure(self, results: Results) -> Measured | None:
+        """What the claim speaks of; None where the run has no variant of that content."""
+        metric = self.metric.replace("{layer}", str(results.layer))
+        a = results.variant_like(self.a, self.probe)
+        b = None if self.b is None else results.variant_like(self.b, self.probe)
+        if a is None or (self.b is not None and b is None):
+            return None
         if self.compare_yaw is not None:
             tables = {
-                f"yaw {low:g} to {high:g}": results.views(self.probe, self.a, self.metric, (low, high))
+                f"yaw {low:g} to {high:g}": results.views(self.probe, a, metric, (low, high))
                 for low, high in self.compare_yaw
             }
             # Different views cannot be paired; their means can, scene by scene.
             means = [{s: {"mean": _interval({s: v}).mean} for s, v in table.items()} for table in tables.values()]
-            return Measured({name: _interval(t) for name, t in tables.items()}, means[0], means[1])
-        a = results.views(self.probe, self.a, self.metric, self.yaw)
-        if self.b is None:
-            zero = {scene: dict.fromkeys(views, 0.0) for scene, views in a.items()}
-            return Measured({self.a: _interval(a)}, zero, a)
-        b = results.views(self.probe, self.b, self.metric, self.yaw)
-        return Measured({self.a: _interval(a), self.b: _interval(b)}, a, b)
+            return Measured(metric, {name: _interval(t) for name, t in tables.items()}, means[0], means[1])
+        first = results.views(self.probe, a, metric, self.yaw)
+        if b is None:
+            zero = {scene: dict.fromkeys(views, 0.0) for scene, views in first.items()}
+            return Measured(metric, {a: _interval(first)}, zero, first)
+        second = results.views(self.probe, b, metric, self.yaw)
+        return Measured(metric, {a: _interval(first), b: _interval(second)}, first, second)
 
 
 @dataclass(frozen=True)
 class Measured:
     """The sides of a claim by name, and the two tables whose difference it speaks of."""
 
+    metric: str
     sides: dict[str, Interval]
     a: ByView
     b: ByView
@@ -70,6 +77,7 @@ class Finding:
     """A claim, what was measured, and what follows."""
 
     claim: Claim
+    metric: str
     sides: dict[str, Interval]
     contrast: Interval
     agreement: tuple[int, int]
@@ -88,36 +96,36 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def judge(results: Results, claims: list[Claim]) -> list[Finding]:
-    """Every claim with its verdict; p-values are adjusted over the claims (Benjamini-Hochberg)."""
-    measured = [claim.measure(results) for claim in claims]
-    contrasts = [paired(m.a, m.b) for m in measured]
+    """Every claim that something was measured for, with its verdict.
+
+    p-values are adjusted over the claims (Benjamini-Hochberg).
+    """
+    measured = [(claim, m) for claim in claims if (m := claim.measure(results)) is not None]
+    contrasts = [paired(m.a, m.b) for _, m in measured]
     adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
     return [
         Finding(
             claim,
+            m.metric,
             m.sides,
             contrast,
             agreement(m.a, m.b, claim.sign),
             _here(claim, m),
             _in_general(claim, contrast, p),
         )
-        for claim, m, contrast, p in zip(claims, measured, contrasts, adjusted, strict=True)
+        for (claim, m), contrast, p in zip(measured, contrasts, adjusted, strict=True)
+        if contrast.views
     ]
 
 
 def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not seen"]:
-    """Whether each scene's mean difference has the expected sign."""
-    signs = [
-        paired({scene: measured.a[scene]}, {scene: measured.b[scene]}).mean * claim.sign > 0
-        for scene in measured.a
-        if scene in measured.b
-    ]
+    """Whether the mean difference has the expected sign in every scene that has one."""
+    scenes = [paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b]
+    signs = [difference.mean * claim.sign > 0 for difference in scenes if difference.views]
     return "seen" if all(signs) else "mixed" if any(signs) else "not seen"
 
 
 def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
-    if contrast.views == 0:
-        return "not measured"
     if not contrast.known or not adjusted_p <= 0.05:
         return "can't tell"
     return "holds" if claim.sign * contrast.mean > 0 else "does not hold"

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from attnwarp_eval.ablation.cell import canonical_json
-from attnwarp_eval.ablation.store import Store
+from attnwarp_eval.ablation.store import Store, StoreError
+from attnwarp_eval.ablation.study import Splats, Variant
 from attnwarp_eval.checks import metric as metric_of
 from attnwarp_eval.checks.occlusion import COUNTS
 
@@ -27,15 +29,48 @@ class Results:
     study: dict[str, Any]
     cells: list[dict[str, Any]]
     failures: list[dict[str, Any]]
-    titles: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, store: Store) -> Results:
         """Read a run's folder."""
         kept = store.read_study()
         done = store.done()
-        cells = [{**c, "record": store.read(c["id"]) if c["id"] in done else None} for c in kept["cells"]]
-        return cls(kept["study"], cells, store.failures(), {n: s["title"] for n, s in kept["scenes"].items()})
+        cells, failures = [], store.failures()
+        for cell in kept["cells"]:
+            record = None
+            if cell["id"] in done:
+                try:
+                    record = store.read(cell["id"])
+                except StoreError as error:
+                    # One damaged file must not cost the report of the others.
+                    labels = {"scene": cell["scene"], "variant": cell["variants"][0], "probe": cell["probe"]}
+                    failures.append({**labels, "error": str(error)})
+            cells.append({**cell, "record": record})
+        return cls(kept["study"], cells, failures)
+
+    @cached_property
+    def _variants(self) -> dict[str, Variant]:
+        return {name: Variant.model_validate(said) for name, said in self.study["variants"].items()}
+
+    def variant_like(self, said: Mapping[str, Any], probe: str) -> str | None:
+        """The name of the measured variant that means what ``said`` means, written as a study writes a variant."""
+        wanted = Variant.model_validate(dict(said))
+        for name, variant in self._variants.items():
+            same = variant.settings() == wanted.settings() and variant.geometry == wanted.geometry
+            # Splats are sampled or fitted; each probe knows one of the two.
+            same &= variant.fit == wanted.fit if probe == "fit" else self._splats(variant) == self._splats(wanted)
+            if same and self.records(probe, name):
+                return name
+        return None
+
+    def _splats(self, variant: Variant) -> Splats:
+        return Splats.model_validate({**self.study["splats"], **variant.splats})
+
+    @property
+    def layer(self) -> int:
+        """The feature grid that tables show: an eighth of the image, as in a diffusion UNet, or the next there is."""
+        size, sizes = self.study["size"], self.study["feature_sizes"]
+        return size // 8 if size // 8 in sizes else max((s for s in sizes if s < size), default=max(sizes))
 
     @property
     def measured(self) -> int:

@@ -6,6 +6,7 @@ Oracles: the file system (which cells were there before), byte equality of repor
 import json
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import time
 
 import pytest
 import yaml
+
+from attnwarp_eval.ablation.store import Store
 
 SMALL = {
     "name": "small",
@@ -30,7 +33,6 @@ SMALL = {
         "released": {"preset": "released"},
     },
     "probes": {
-        "calibration": ["corrected"],
         "depth": ["corrected", "released"],
         "warp": ["corrected", "bounds only", "released"],
         "timing": ["corrected", "released"],
@@ -42,6 +44,9 @@ SMALL = {
     "pictures": {"variants": ["corrected"], "views": ["yaw030"]},
 }
 CELLS = 7
+
+# A commit made while the tests run would change the revision that reports name.
+WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +61,7 @@ def command(*arguments):
 
 
 def call(folder, *arguments):
-    return subprocess.run(command(*arguments), cwd=folder, capture_output=True, text=True, timeout=600)
+    return subprocess.run(command(*arguments), cwd=folder, env=WITHOUT_GIT, capture_output=True, text=True, timeout=600)
 
 
 def without_timings(run, folder):
@@ -86,8 +91,51 @@ def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finishe
     assert {line["probe"] for line in lines} == {"calibration", "depth", "warp"}
 
 
+def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, folder):
+    run = folder / "damaged"
+    shutil.copytree(finished, run)
+    victim = next(p for p in (run / "cells").iterdir() if '"depth"' in p.read_text())
+    victim.write_bytes(victim.read_bytes()[:100])
+    assert call(folder, "verify", run).returncode == 3
+    assert call(folder, "report", run).returncode == 0
+    assert "not JSON" in (run / "report.md").read_text()
+    mended = call(folder, "run", "study.yaml", "--out", run)
+    assert mended.returncode == 0, mended.stderr
+    assert f"{CELLS - 1} already done" in mended.stderr
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
+    run = folder / "interrupted"
+    arguments = command("run", "study.yaml", "--out", run)
+    process = subprocess.Popen(arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 300
+    while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "the same command goes on from here" in said
+    assert "Traceback" not in said
+
+
+def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, folder):
+    run = folder / "uncalibrated"
+    shutil.copytree(finished, run)
+    store = Store(run)
+    record = next(r for r in map(store.read, store.done()) if r["spec"]["probe"] == "calibration")
+    record["views"][0]["metrics"]["warp.epe_median"] = 0.5
+    store.write({k: v for k, v in record.items() if k != "sha256"})
+    done = call(folder, "run", "study.yaml", "--out", run)
+    assert done.returncode == 3
+    assert "not calibrated" in done.stderr
+    assert "FAILED" in (run / "report.md").read_text()
+
+
 def test_the_instrument_is_calibrated_in_every_run(finished):
-    (cell,) = (json.loads(p.read_text()) for p in (finished / "cells").iterdir() if "calibration" in p.read_text())
+    (cell,) = (
+        json.loads(p.read_text()) for p in (finished / "cells").iterdir() if '"probe": "calibration"' in p.read_text()
+    )
     for view in cell["views"]:
         median, own = view["metrics"]["warp.epe_median"], view["metrics"]["occlusion.f1.exact"]
         # A view in which the source shows nothing has neither; here yaw 30 has both.
@@ -98,7 +146,9 @@ def test_the_instrument_is_calibrated_in_every_run(finished):
 
 def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder):
     run = folder / "killed"
-    process = subprocess.Popen(command("run", "study.yaml", "--out", run), cwd=folder, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        command("run", "study.yaml", "--out", run), cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 300
     while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -148,7 +198,7 @@ def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
 def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, folder):
     run = folder / "bereft"
     arguments = command("run", "study.yaml", "--out", run, "--jobs", "2")
-    process = subprocess.Popen(arguments, cwd=folder, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
     while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -171,6 +221,7 @@ def children(pid):
         (("run", "quik"), "did you mean 'quick'"),
         (("run", "study.yaml", "--scenes", "sphere"), "did you mean 'spheres'"),
         (("run", "study.yaml", "--jobs", "0"), "jobs"),
+        (("run", "study.yaml", "--out", "study.yaml"), "study.yaml: File exists"),
         (("verify", "nowhere"), "attnwarp-eval run"),
         (("report", "nowhere"), "attnwarp-eval run"),
         (("scenes", "show", "nothing.yaml"), "no such scene file"),

@@ -1,0 +1,240 @@
+"""Hand-made records with known numbers; the expected tables, verdicts and warnings follow by hand."""
+
+import copy
+
+import pytest
+
+from attnwarp_eval.ablation.study import Study
+from attnwarp_eval.checks.occlusion import COUNTS
+from attnwarp_eval.report import calibration
+from attnwarp_eval.report.ablations import ablations
+from attnwarp_eval.report.build import build
+from attnwarp_eval.report.claims import Claim, judge
+from attnwarp_eval.report.fronts import fronts
+from attnwarp_eval.report.results import Results
+from attnwarp_eval.report.words import number, spread
+from attnwarp_eval.report.write import inline, markdown
+from attnwarp_eval.statistics import interval
+
+SCENES = ("one", "two", "three")
+SLIP = "warp.epe_median_layer.64"
+
+
+def study(**changes):
+    return Study.model_validate(
+        {
+            "name": "hand-made",
+            "scenes": list(SCENES),
+            "variants": {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
+            "probes": {"warp": ["good", "slipped"]},
+            "ablations": [{"title": "Slip", "baseline": "good", "variants": ["slipped"]}],
+            **changes,
+        }
+    ).model_dump(mode="json")
+
+
+ENVIRONMENT = {
+    "versions": {"python": "3"},
+    "machine": {"system": "Linux", "arch": "x", "cores": 2},
+    "git": {"sha": "a" * 40, "dirty": False},
+}
+
+
+def record(values, counters=None, **cost):
+    """A warp cell whose views show ``values`` of the slip's metric (None: undefined)."""
+    return {
+        "views": [{"view": f"v{i}", "yaw": 30.0 * i, "metrics": {SLIP: v}} for i, v in enumerate(values)],
+        "pictures": [],
+        "cost": {
+            "seconds": {"steady": 0.1},
+            "counters": counters or {"pairs": 2_000_000},
+            "peak_memory_mb": 1.0,
+            **cost,
+        },
+        "environment": copy.deepcopy(ENVIRONMENT),
+    }
+
+
+def results(table, **changes):
+    """``table``: variant -> one list of view values a scene, or None where the cell was not measured."""
+    cells = [
+        {
+            "id": f"{variant}-{scene}",
+            "title": variant,
+            "scene": scene,
+            "variants": [variant],
+            "probe": "warp",
+            "seed": 0,
+            "record": None if values is None else record(values),
+        }
+        for variant, rows in table.items()
+        for scene, values in zip(SCENES, rows, strict=True)
+    ]
+    return Results(study(**changes), cells, [])
+
+
+CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]]}
+
+SLIP_CLAIM = Claim(
+    "slip", "It slips", "warp", "warp.epe_median_layer.{layer}", {}, "higher", {"set": {"pixel_centers": "integer"}}
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (1234.6, "1235"),
+        (0.012345, "0.0123"),
+        (-2.5, "-2.50"),
+        (float("nan"), "–"),
+        (None, "–"),
+        (1e-9, "1e-09"),
+    ],
+)
+def test_numbers_have_three_significant_digits(value, text):
+    assert number(value) == text
+
+
+def test_a_mean_says_what_was_undefined_and_which_scenes_are_missing():
+    value = interval({"a": [1.0, float("nan")], "b": [3.0]})
+    # Two scene means 1 and 3: half width is t(0.975, 1 degree of freedom) * 1 = 12.7.
+    assert spread(value, 3) == "2.00 ± 13 (1 undefined, 2 of 3 scenes)"
+    assert spread(interval({"a": []})) == "–"
+
+
+def test_an_ablation_table_shows_means_differences_and_verdicts():
+    (section,) = ablations(results(CLEAR))
+    main, _, contrasts = section.tables
+    column = main.columns.index("EPE on 64, layer px")
+    assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0"]
+    assert [row[main.columns.index("M splat-pixel pairs a view")] for row in main.rows] == ["1.00", "1.00"]
+    row = next(row for row in contrasts.rows if row[1] == SLIP)
+    assert row[0] == "slipped"
+    assert row[2] == "0.500 ± 0"
+    assert row[3] == "worse"
+    assert row[6] == "3, 6"
+
+
+def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
+    (section,) = ablations(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
+    assert section.text == ["**Not measured:** good."]
+    assert [row[0] for row in section.tables[0].rows] == ["good", "slipped"]
+    contrasts = section.tables[-1]
+    assert {row[3] for row in contrasts.rows} <= {"not measured", "–"}
+
+
+def test_a_variant_measured_on_fewer_scenes_says_so():
+    (section,) = ablations(results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]}))
+    column = section.tables[0].columns.index("EPE on 64, layer px")
+    assert section.tables[0].rows[1][column] == "0.600 ± 0 (2 of 3 scenes)"
+
+
+def test_differences_that_vanish_in_every_view_are_called_the_same_values_and_never_equal():
+    (section,) = ablations(results({"good": CLEAR["good"], "slipped": CLEAR["good"]}))
+    row = next(row for row in section.tables[-1].rows if row[1] == SLIP)
+    assert row[3] == "same values"
+
+
+def test_a_claim_is_seen_here_and_holds_in_general_when_every_scene_agrees():
+    (finding,) = judge(results(CLEAR), [SLIP_CLAIM])
+    assert (finding.here, finding.verdict, finding.agreement) == ("seen", "holds", (6, 6))
+    assert finding.metric == SLIP
+    assert set(finding.sides) == {"good", "slipped"}
+
+
+def test_a_claim_finds_its_sides_by_content_and_not_by_name():
+    renamed = results(CLEAR, variants={"good": {"set": {"pixel_centers": "integer"}}, "slipped": {}})
+    (finding,) = judge(renamed, [SLIP_CLAIM])
+    # The variant called "good" is the slipped one here, so the difference turns round.
+    assert finding.contrast.mean == pytest.approx(-0.5)
+    assert finding.verdict == "does not hold"
+    assert (
+        judge(
+            results({"good": CLEAR["good"]}, variants={"good": {}}, probes={"warp": ["good"]}, ablations=[]),
+            [SLIP_CLAIM],
+        )
+        == []
+    )
+
+
+def test_a_claim_that_only_some_scenes_show_is_mixed_and_cannot_be_told():
+    (finding,) = judge(results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]}), [SLIP_CLAIM])
+    assert (finding.here, finding.verdict, finding.agreement) == ("mixed", "can't tell", (2, 3))
+
+
+def test_an_undefined_scene_neither_agrees_nor_disagrees():
+    (finding,) = judge(results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM])
+    assert (finding.here, finding.agreement, finding.contrast.scenes) == ("seen", (2, 2), 2)
+    assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
+
+
+def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
+    mixed = results(CLEAR, ablations=[])
+    for cell in mixed.cells:
+        for view in cell["record"]["views"]:
+            view["metrics"].update({f"occlusion.{name}": 0 for name in COUNTS})
+    mixed.cells[0]["record"]["environment"]["git"] = {"sha": "b" * 40, "dirty": True}
+    text = markdown(build(mixed, tmp_path))
+    assert "more than one state of code" in text
+    assert "5 cells with revision `aaaaaaaaaaaa`" in text
+    assert "1 cells with revision `bbbbbbbbbbbb` with local changes" in text
+
+
+def calibrated(**changes):
+    figures = {"warp.epe_median": 1e-13, "occlusion.f1.exact": 1.0, "calibration.mitsuba_agrees": 0.999, **changes}
+    cell = {"id": "c", "title": "c", "scene": "one", "variants": ["calibration"], "probe": "calibration", "seed": 0}
+    return Results(
+        study(), [{**cell, "record": {**record([]), "views": [{"view": "v", "yaw": 0.0, "metrics": figures}]}}], []
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"warp.epe_median": 2e-3}, "warp.epe_median is 0.00200, expected below 0.001 px"),
+        ({"occlusion.f1.exact": 0.9999}, "expected 1"),
+        ({"calibration.mitsuba_agrees": 0.9}, "expected at least 0.99"),
+        ({"occlusion.f1.exact": None}, "undefined in every view"),
+    ],
+)
+def test_an_instrument_that_is_off_is_said_to_be(changes, says):
+    assert calibration.problems(calibrated()) == []
+    (problem,) = calibration.problems(calibrated(**changes))
+    assert says in problem
+    section = calibration.calibration(calibrated(**changes))
+    assert section.tables[0].rows[0][1] == "FAILED"
+    assert "not calibrated" in section.text[0]
+
+
+def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
+    front = [{"title": "Cost", "metric": SLIP, "variants": ["good", "slipped"]}]
+    timed = results(CLEAR, fronts=front)
+    spec = {"rounds": 3, "views": ["v0"]}
+    rounds = {"render": [[1.0] * 3] * 2, "pair": [[1.0, 2.0, 4.0], [1.0, 2.0, 4.0]]}
+    timed.cells.append(
+        {
+            "id": "t",
+            "title": "t",
+            "scene": "one",
+            "variants": ["good"],
+            "probe": "timing",
+            "seed": 0,
+            "record": {**record([], rounds=rounds, threads=1), "spec": spec},
+        }
+    )
+    (section,) = fronts(timed, tmp_path)
+    rows = {row[0]: row for row in section.tables[0].rows}
+    assert rows["good"][2:] == ["2000", "1", "baseline", "yes"]
+    assert rows["slipped"][2:] == ["–", "not timed", "–", "–"]
+    assert rows["again"][3] == "1.00 [1.00, 1.00]"
+    once = results(CLEAR, fronts=front)
+    (section,) = fronts(once, tmp_path)
+    assert "one pass" in section.text[1]
+    assert {row[3] for row in section.tables[0].rows} == {"one pass"}
+
+
+def test_text_of_a_page_is_escaped_before_it_is_set():
+    assert inline("a < b `c<d` **e** `#ff0000`") == (
+        'a &lt; b <code>c&lt;d</code> <strong>e</strong> <span class="swatch" style="background:#ff0000"></span>'
+    )
