@@ -1,4 +1,10 @@
+import sys
+from pathlib import Path
+
 import pytest
+
+# With --import-mode=importlib a folder's own modules (effect_scenes.py) are not found otherwise.
+sys.path.append(str(Path(__file__).parent))
 
 
 @pytest.fixture(autouse=True, scope="session")
