@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
-import json
 import os
 import tempfile
 import zipfile
@@ -14,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from attnwarp_eval.content import digest
 
 
 def cache_dir() -> Path:
@@ -30,8 +30,7 @@ def cache_dir() -> Path:
 
 def content_key(*parts: Any) -> str:
     """SHA-256 (hex) of the canonical JSON of ``parts``: sorted keys, no spaces, NaN refused."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return digest(list(parts))
 
 
 def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from attnwarp_eval import checks
-from attnwarp_eval.checks.occlusion import AMBIGUOUS, COUNTS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.checks.occlusion import COUNTS
+from attnwarp_eval.labels import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 
 def case(seed=0, shape=(40, 50)):

@@ -20,10 +20,11 @@ from attnwarp.settings import PRESETS, WarpSettings
 from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
 from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval import checks, fitting
-from attnwarp_eval.ablation.cell import Cell, digest
+from attnwarp_eval.ablation.cell import Cell
 from attnwarp_eval.ablation.store import write_atomic
 from attnwarp_eval.ablation.study import Splats
 from attnwarp_eval.ablation.world import World, splats, world
+from attnwarp_eval.content import digest
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.errors import InputError
 from attnwarp_eval.truth import TwoView

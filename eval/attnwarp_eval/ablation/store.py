@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from attnwarp_eval.ablation.cell import digest
+from attnwarp_eval.content import digest
 from attnwarp_eval.errors import InputError
 
 FORMAT = 1

@@ -15,10 +15,7 @@ import numpy as np
 
 from attnwarp import _check
 from attnwarp_eval.checks._arrays import mask, regions, share
-
-NONE, VISIBLE, HIDDEN, AMBIGUOUS = 0, 1, 2, 3
-"""Labels of a pixel, as :class:`attnwarp_eval.truth.two_view.TwoView` gives them. NONE: no surface, or its point is
-outside the source image."""
+from attnwarp_eval.labels import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 COUNTS = (
     "visible_accepted",

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from attnwarp_eval.ablation.cell import canonical_json
+from attnwarp_eval.content import canonical_json
 from attnwarp_eval.report import figures
 from attnwarp_eval.report.model import Picture, Section, Table
 from attnwarp_eval.report.results import Results

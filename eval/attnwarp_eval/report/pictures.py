@@ -10,7 +10,7 @@ import torch
 
 from attnwarp.visibility import Surface, WarpedView
 from attnwarp.warp import sample
-from attnwarp_eval.checks.occlusion import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.labels import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 from attnwarp_eval.truth import Hits, TwoView
 
 if TYPE_CHECKING:

@@ -8,13 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval.labels import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 from attnwarp_eval.truth.raycast import Geometry, Hits
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-NONE, VISIBLE, HIDDEN, AMBIGUOUS = 0, 1, 2, 3
-"""The labels of a target pixel, see :class:`TwoView`."""
 
 GRAZING_COSINE = 1e-3
 """Below this cosine of incidence, in either view, a pixel's answer is called ambiguous."""

@@ -9,8 +9,9 @@ import time
 
 import pytest
 
-from attnwarp_eval.ablation.cell import Cell, canonical_json
+from attnwarp_eval.ablation.cell import Cell
 from attnwarp_eval.ablation.store import Store, StoreError, write_atomic
+from attnwarp_eval.content import canonical_json
 
 SPEC = {"probe": "depth", "scene": "abc", "seed": 0}
 
