@@ -195,6 +195,66 @@ class AppearanceSpec(Spec):
     spp: int = Field(default=16, ge=1, le=65536)
 
 
+class ObjectChange(Spec):
+    """What an edit does to one object. Its shape stays.
+
+    ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its colours shades of
+    one, but for those of its parts that ``keep`` lists.
+    """
+
+    object: str
+    texture: Texture | None = None
+    material: Material | None = None
+    recolor: dict[Color, Color] = Field(default_factory=dict)
+    paint: Color | None = None
+    keep: tuple[Color, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_way_of_colouring(self) -> ObjectChange:
+        said = [name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)]
+        if not said:
+            raise ValueError("got a change that changes nothing; add a texture, a material, recolor or paint")
+        if self.paint and (self.recolor or self.texture):
+            raise ValueError("got paint beside recolor or texture; keep one of them")
+        return self
+
+
+class AnswerSpec(Spec):
+    """One right answer to an ambiguous instruction."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    target: str
+    changes: tuple[ObjectChange, ...] = ()
+    lights: tuple[LightSpec, ...] | None = None
+
+
+class EditSpec(Spec):
+    """An edit whose result is known: what is asked for, the prompts, and what it does to the scene.
+
+    An ambiguous instruction has several ``answers``, each as right as the others.
+    """
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    instruction: str
+    source: str
+    target: str
+    changes: tuple[ObjectChange, ...] = ()
+    lights: tuple[LightSpec, ...] | None = None
+    answers: tuple[AnswerSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _does_something(self) -> EditSpec:
+        own = bool(self.changes) or self.lights is not None
+        if own == bool(self.answers):
+            raise ValueError("got an edit with both or neither of its own changes (or lights) and answers; keep one")
+        return self
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether more than one result is right."""
+        return bool(self.answers)
+
+
 class SceneSpec(Spec):
     """A whole file."""
 
@@ -208,6 +268,7 @@ class SceneSpec(Spec):
     appearance: AppearanceSpec = Field(default_factory=AppearanceSpec)
     medium: MediumSpec | None = Field(None, json_schema_extra=LATER)
     effects: EffectsSpec = Field(EffectsSpec(), json_schema_extra=LATER)
+    edits: tuple[EditSpec, ...] = ()
 
 
 # The scene -----------------------------------------------------------------------------------------------------------
@@ -280,6 +341,43 @@ class Scene:
                 return camera
         raise SceneError(f"no camera {name!r}{_suggest(name, [c.name for c in self.cameras])}", self.path)
 
+    @property
+    def edits(self) -> tuple[EditSpec, ...]:
+        """The edits whose results are known."""
+        return self.spec.edits
+
+    def edit(self, name: str) -> EditSpec:
+        """The edit of that name.
+
+        Raises:
+            SceneError: there is none.
+        """
+        for edit in self.edits:
+            if edit.name == name:
+                return edit
+        known = [edit.name for edit in self.edits]
+        raise SceneError(
+            f"no edit {name!r}{_suggest(name, known)}; {self.name} has {', '.join(known) or 'none'}", self.path
+        )
+
+    def edited(self, name: str, answer: str | None = None) -> Scene:
+        """The scene after an edit: the same shapes and cameras, other surfaces or lights.
+
+        Args:
+            name: an edit of :attr:`edits`.
+            answer: which of an ambiguous edit's answers; its first if left out.
+
+        Raises:
+            SceneError: there is no such edit or answer.
+        """
+        from attnwarp_eval.edits import apply, pick
+
+        edit = self.edit(name)
+        try:
+            return Scene(apply(self.spec, edit, pick(edit, answer)), self.path)
+        except ValueError as error:
+            raise SceneError(str(error), self.path) from error
+
     def with_size(self, width: int, height: int) -> Scene:
         """The same scene with images of ``width`` x ``height``; the vertical field of view stays."""
         cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
@@ -349,8 +447,11 @@ class Scene:
 
     @functools.cached_property
     def content_hash(self) -> str:
-        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the protocol versions."""
-        return content_key("scene", self.world_hash, self.spec.model_dump(mode="json"))
+        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the protocol versions.
+
+        Edits are left out: they are other scenes, with hashes of their own.
+        """
+        return content_key("scene", self.world_hash, self.spec.model_dump(mode="json", exclude={"edits"}))
 
 
 def _turn_z(degrees: float) -> Array:
@@ -549,6 +650,7 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 def _check(scene: Scene, root: yaml.Node) -> None:
     """What no single field can say: names that clash, files that are missing, cameras that cannot be."""
+    from attnwarp_eval import edits
 
     def refuse(message: str, *loc: int | str) -> None:
         raise SceneError(message, scene.path, _line(root, loc))
@@ -587,6 +689,8 @@ def _check(scene: Scene, root: yaml.Node) -> None:
         refuse("lights: there is none, and no object has an 'emission'; add a sun, a sky, a point or a spot", "lights")
     for message, at_fault in contradictions(scene.spec):
         refuse(message, *at_fault)
+    for message, spot in edits.problems(scene.spec):
+        refuse(message, *spot)
     cameras = _check_cameras(scene, refuse)
     for item in scene.spec.objects:
         inside = _inside(scene, item)
