@@ -274,6 +274,22 @@ def export(
 
 
 @scenes_app.command()
+def edits(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    as_json: Annotated[bool, typer.Option("--json", help="JSON, with the content hash of each result.")] = False,
+) -> None:
+    """The edits that a scene names, with what each one asks for and does."""
+    import json
+
+    with clear_errors():
+        from attnwarp_eval import edits as known
+        from attnwarp_eval.scene import load_scene
+
+        loaded = load_scene(scene)
+        typer.echo(json.dumps(known.to_dict(loaded), indent=2) if as_json else known.describe(loaded))
+
+
+@scenes_app.command()
 def effects(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
     as_json: Annotated[bool, typer.Option("--json", help="JSON with the keys effects and plan.")] = False,

@@ -204,6 +204,49 @@ class Geometry:
             valid=hits.valid.reshape(shape),
         )
 
+    def ties(self, camera: Camera) -> tuple[Mask, npt.NDArray[np.int32]]:
+        """Pixels whose first hit lies on surfaces of several objects at once, so that whose it is cannot be told.
+
+        Depth, points and correspondences of such pixels are as exact as any; their ``object_id`` is that of one of the
+        objects.
+
+        Returns:
+            tied: (H, W) bool: another object's surface lies within ``REACH_TOLERANCE`` of the way.
+            lowest: (H, W) int32 the lowest object id there, the same whatever order the objects are traced in; -1 on a
+                miss.
+        """
+        hits = self.trace(camera)
+        directions = (camera.directions() @ camera.rotation).reshape(-1, 3)
+        origins = np.ascontiguousarray(np.broadcast_to(self._local(camera.position), directions.shape))
+        local = np.ascontiguousarray(directions / self.extent)
+        first, owner = hits.depth.ravel(), hits.object_id.ravel()
+        tied, lowest = np.zeros(len(first), dtype=bool), owner.copy()
+
+        def meet(ray: npt.NDArray[np.int64], t: Array, objects: npt.NDArray[np.int32]) -> None:
+            with np.errstate(invalid="ignore"):
+                here = np.abs(t / first[ray] - 1) < REACH_TOLERANCE
+            tied[ray[here & (objects != owner[ray])]] = True
+            np.minimum.at(lowest, ray[here], objects[here])
+
+        every = np.arange(len(first))
+        closed = [(self._spheres[k : k + 1], self._rectangles[:0]) for k in range(len(self._spheres))]
+        closed += [(self._spheres[:0], self._rectangles[k : k + 1]) for k in range(len(self._rectangles))]
+        for k, (sphere, rectangle) in enumerate(closed):
+            t, _ = nearest_hit(origins, local, sphere, rectangle)
+            meet(every, t, np.full(len(t), self._object[len(self._faces) + k]))
+        if self._embree is not None:
+            rays = self._o3d.core.Tensor(np.concatenate([origins, local], axis=1, dtype=np.float32))
+            found = self._embree.list_intersections(rays)
+            ray = found["ray_ids"].numpy().astype(np.int64)
+            face = found["primitive_ids"].numpy().astype(np.int64)
+            normal = self._face_normal[face]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                t = np.einsum("ij,ij->i", normal, self._face_corner[face] - origins[ray]) / np.einsum(
+                    "ij,ij->i", normal, local[ray]
+                )
+            meet(ray, t, self._object[face])
+        return tied.reshape(hits.depth.shape), lowest.reshape(hits.depth.shape)
+
     def trace_rays(self, origins: npt.ArrayLike, directions: npt.ArrayLike) -> RayHits:
         """First hits of rays.
 
