@@ -20,7 +20,6 @@ from attnwarp_eval.optics import EFFECTS, NOT_SIMULATED, Effect
 from attnwarp_eval.shapes import Box, Rectangle, Sphere
 
 if TYPE_CHECKING:
-    from attnwarp.camera import Camera
     from attnwarp_eval.scene import Scene
 
 Array = npt.NDArray[np.float64]
@@ -579,12 +578,3 @@ def _words(scene: Scene, step: dict[str, Any]) -> str:
         f"{step['integrator']}: {step['spp']} {kind} a pixel ({sampler(step['spp'])}), "
         f"light from {', '.join(shining)}, {depth}{roulette}{only}"
     )
-
-
-def smooth_first(scene: Scene, camera: Camera) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: pixel centres whose ray first meets something smooth, a lamp, or nothing."""
-    from attnwarp_eval.truth.raycast import Geometry
-
-    lamps = [k for k, item in enumerate(scene.spec.objects) if item.emission]
-    object_id = Geometry(scene).trace(camera).object_id
-    return np.isin(object_id, [-1, *smooth_objects(scene), *lamps])

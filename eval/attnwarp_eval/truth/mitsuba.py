@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
-from attnwarp_eval.effects import Plan, plan, sampler, smooth_first
+from attnwarp_eval.effects import Plan, plan, sampler, smooth_objects
 from attnwarp_eval.optics import (
     GlassMaterial,
     InteriorSpec,
@@ -98,7 +98,8 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
 
 def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
     """A picture as ``plan`` says: (H, W, 3) float32, linear RGB. Nothing is kept; the same seed gives the same bits."""
-    mi = _mitsuba()
+    # Which number a shape has is known for scalar_rgb only.
+    mi = _mitsuba("scalar_rgb" if any(step.first == "smooth" for step in plan.passes) else variant())
     total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
     for number, step in enumerate(plan.passes):
         options: dict[str, Any] = {"type": step.integrator}
@@ -136,27 +137,24 @@ def _smooth_part(
 ) -> Image:
     """What is seen in mirrors, through glass, of lamps and of the sky; zero where another surface is seen first.
 
-    Camera rays go through the middles of a grid of k x k cells a pixel, one or more a cell, since for those the first
-    surface is known by ray casting. The rest of the picture is made of paths from the light.
+    The rest of the picture is made of paths from the light. Each camera ray gets a pixel of its own in a picture of
+    k x k cells a pixel, so that the index of the shape it met first tells which of the two it belongs to.
     """
     mi = _mitsuba()
     world, center, fog = loaded
     k = max(1, math.isqrt(spp))
     fine = camera.resize(camera.width * k, camera.height * k)
+    lamps = [number for number, item in enumerate(scene.spec.objects) if item.emission]
+    smooth = np.isin([-1, *_owners(scene)], [-1, *smooth_objects(scene), *lamps])
+    integrator = mi.load_dict({"type": "aov", "aovs": "first:shape_index", "seen": options})
+    total = np.zeros((fine.height, fine.width, 3), dtype=np.float64)
     each = math.ceil(spp / k**2)
-    if each > 1:
-        each = 4 ** math.ceil(math.log(each, 4))
-    keep = smooth_first(scene, fine)
-    total = np.zeros((*keep.shape, 3), dtype=np.float64)
-    if not keep.any():
-        return total[::k, ::k].astype(np.float32)
     for number in range(each):
-        middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-        sensor = _sensor(scene, fine, center, middles, world, plan, fog)
-        picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=seed * 64 + number, spp=1)
-        total += np.array(picture, dtype=np.float64)[..., :3]
-    total *= keep[..., None] / each
-    return total.reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
+        sensor = _sensor(scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog)
+        picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1))
+        keep = smooth[np.round(picture[..., 3]).astype(np.int64)]  # 1 + place among the shapes, 0 for none
+        total += np.where(keep[..., None], picture[..., :3], 0.0)
+    return (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -167,11 +165,11 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
     mi = _mitsuba("scalar_rgb")
-    world, center, _ = _world(scene, (), False, False, "scalar_rgb")
+    world, center, _ = _world(scene, (), False, False)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would lie nowhere.
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-    sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None, "scalar_rgb")
+    sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None)
     picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64)
     shape = np.round(picture[..., 3]).astype(np.int64)  # 1 + place among the shapes, 0 for none
     owners = np.array([-1, *_owners(scene)])
@@ -208,10 +206,11 @@ def variant() -> str:
 
 
 def _mitsuba(name: str | None = None) -> Any:
+    """The library, with the variant ``name``; without a name as the caller's caller has set it."""
     import mitsuba
 
     mi: Any = mitsuba
-    wanted = name or variant()
+    wanted = name or mi.variant() or variant()
     if mi.variant() != wanted:
         mi.set_variant(wanted)
         mi.set_log_level(mi.LogLevel.Warn)
@@ -220,11 +219,9 @@ def _mitsuba(name: str | None = None) -> Any:
     return mi
 
 
-def _world(
-    scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, name: str | None = None
-) -> tuple[Any, Array, Any]:
+def _world(scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and the fog or None."""
-    mi = _mitsuba(name)
+    mi = _mitsuba()
     texel = _texel(scene)
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
@@ -302,7 +299,7 @@ def _rgb(scale: float, color: str) -> dict[str, Any]:
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as loaded."""
-    mi = _mitsuba()
+    mi = _mitsuba(variant())
     everything = tuple(range(len(scene.spec.lights)))
     world, center, fog = _world(scene, everything, True, True)
     forms, _, plugins = _kept(
@@ -559,9 +556,8 @@ def _sensor(
     world: Any,
     plan: Plan,
     fog: Any,
-    name: str | None = None,
 ) -> Any:
-    mi = _mitsuba(name)
+    mi = _mitsuba()
     fx, fy, skew = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
     if abs(fx / fy - 1) > 1e-6 or skew != 0:
         raise ValueError(
