@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.raycast import Geometry
-from attnwarp_eval.truth.shading import buried, frames, irradiance, object_albedo
+from attnwarp_eval.truth.shading import buried, emitted, frames, irradiance, object_albedo
 
 if TYPE_CHECKING:
     from attnwarp.gaussians import Gaussians
@@ -98,6 +98,7 @@ def surface_splats(
     samples = sample_surface(geometry, count, center=scene.center, focus=focus, seed=seed)
     light = irradiance(scene, geometry, samples.point, samples.normal, samples.primitive_id)
     color = object_albedo(scene, geometry, samples.point, samples.primitive_id) / np.pi * light
+    color += emitted(scene, geometry, samples.primitive_id)
 
     noise = np.random.default_rng([seed, 1])
     position, normal = samples.point - scene.center, samples.normal

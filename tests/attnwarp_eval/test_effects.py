@@ -17,6 +17,7 @@ from attnwarp_eval.scene import Scene, SceneError, SceneSpec, load_scene
 from attnwarp_eval.textures import linear_rgb
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth import mitsuba as renderer
+from attnwarp_eval.truth.shading import emitted, irradiance, object_albedo
 
 EXPECTED = {
     "diffuse": ("direct", "perspective"),
@@ -348,6 +349,31 @@ def test_light_paths_and_camera_paths_agree_on_a_caustic_that_both_can_find():
     )
     assert not any(level.differs for level in proof.levels(a, b, alpha=0.001))
     assert proof.equivalence(a, b, margin=0.02).equal
+
+
+@pytest.mark.parametrize("name", ["point", "spot", "square", "globe"])
+def test_pictures_lit_by_lamps_converge_to_the_light_that_ray_casting_finds(name):
+    globe = {
+        "name": "globe",
+        "shape": {"type": "sphere", "center": [1, 1, 2.5], "radius": 0.4},
+        "emission": {"radiance": 9.0},
+    }
+    spot = {"type": "spot", "position": [1, 1, 3], "target": [0, 0, 0], "intensity": 8.0, "cutoff": 40, "beam": 10}
+    objects, lights = {
+        "point": ([], [POINT]), "spot": ([], [spot]), "square": ([LAMP], []), "globe": ([globe], []),
+    }[name]  # fmt: skip
+    scene = make([FLOOR, ball(), *objects], lights, size=32)
+    geometry, camera = Geometry(scene), scene.source
+    image = renderer.render_plan(scene, camera, plan(scene, 64), 0)
+    hits = geometry.trace(camera)
+    flat = [a.reshape(-1, *a.shape[2:])[hits.valid.ravel()] for a in (hits.point, hits.normal, hits.primitive_id)]
+    light = irradiance(scene, geometry, *flat, rays=64)
+    expected = np.zeros_like(image, dtype=np.float64)
+    expected[hits.valid] = object_albedo(scene, geometry, flat[0], flat[2]) / np.pi * light
+    expected[hits.valid] += emitted(scene, geometry, flat[2])
+    # Rays go through the middles of pixels only and 64 points stand for a lamp: edges of shadows differ, means do not.
+    assert image.mean() == pytest.approx(expected.mean(), rel=0.02)
+    assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.98
 
 
 def test_geometry_of_glass_is_its_first_surface():
