@@ -112,7 +112,8 @@ def _calibration(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> I
         with meter.view():
             view = _warp_truth(at, truth, EXACT)
         figures = _warp_figures(at, spec, name, view, meter)
-        figures["calibration.mitsuba_agrees"] = _mitsuba_agrees(at, truth) if name == spec["views"][0] else math.nan
+        if name == spec["views"][0]:
+            figures["calibration.mitsuba_agrees"] = _mitsuba_agrees(at, truth)
         own = checks.occlusion.mask_error(truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge)
         figures |= {f"{key}.exact": value for key, value in own.items()}
         meter.count(pixels=size * size)

@@ -68,7 +68,7 @@ def _claims(results: Results) -> Section:
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
         shown = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
         agree, views = finding.agreement
-        rows.append([claim.text, finding.metric, sides, shown, f"{agree} of {views}", finding.here, finding.verdict])
+        rows.append([claim.text, finding.here, finding.verdict, f"{agree} of {views}", shown, sides, finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
@@ -79,7 +79,7 @@ def _claims(results: Results) -> Section:
         "general** speaks of scenes like these, of which a few were drawn, and says `can't tell` when so few cannot "
         "settle it.",
     ]
-    columns = ["claim", "metric", "measured", "difference", "views that agree", "here", "in general"]
+    columns = ["claim", "here", "in general", "views that agree", "difference", "measured", "metric"]
     section.tables = [Table(columns, rows)]
     return section
 
