@@ -53,8 +53,10 @@ class Pass:
         rr_depth: edges after which paths are ended at random; above ``max_depth`` never.
         emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit ("direct" only).
         spp: samples a pixel; for "ptracer" light paths a pixel.
-        first: which camera rays count. "any"; or "smooth", those whose first surface is smooth glass, metal or a
-            mirror, a lamp, or none at all: the rest is what a ptracer pass makes.
+        first: which camera rays count. "any"; "smooth", those whose first surface is smooth glass, metal or a mirror, a
+            lamp, or none at all; or "rough", the others, which are also those that a ptracer pass makes.
+        beam: light only what lies in the direction of the smooth objects (a point light becomes a spot upon them).
+        sign: -1 for a pass that is taken away.
     """
 
     lights: tuple[int, ...]
@@ -65,7 +67,9 @@ class Pass:
     spp: int
     lamps: bool = False
     rr_depth: int = ROULETTE
-    first: Literal["any", "smooth"] = "any"
+    first: Literal["any", "smooth", "rough"] = "any"
+    beam: bool = False
+    sign: Literal[1, -1] = 1
 
 
 @dataclass(frozen=True)
@@ -190,11 +194,24 @@ def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "g
         )
         reasons.append("camera paths still make what is seen in mirrors and through glass, lamps, and the sky's light")
         skies = tuple(k for k in everything if isinstance(lights[k], SkySpec))
-        rest = tuple(k for k in everything if k not in skies)
-        passes = [
-            Pass(rest, "path", depth, 1, 1, spp, lamps, roulette, "smooth"),
-            Pass(rest, "ptracer", depth, 1, 1, LIGHT_PATHS * spp, lamps, roulette),
-        ]
+        points = tuple(k for k in everything if beam(scene, k) is not None)
+        rest = tuple(k for k in everything if k not in skies and k not in points)
+        passes = []
+        if rest or lamps:
+            passes += [
+                Pass(rest, "path", depth, 1, 1, spp, lamps, roulette, "smooth"),
+                Pass(rest, "ptracer", depth, 1, 1, LIGHT_PATHS * spp, lamps, roulette),
+            ]
+        for k in points:
+            # Outside the beam no light meets anything smooth first, so that camera paths find all of it; inside, paths
+            # from the light do. Light adds up: all - beam (both by camera paths) + beam (by light paths).
+            passes += [
+                Pass((k,), "path", depth, 1, 1, spp, False, roulette),
+                Pass((k,), "path", depth, 1, 1, spp, False, roulette, "rough", True, -1),
+                Pass((k,), "ptracer", depth, 1, 1, LIGHT_PATHS * spp, False, roulette, "any", True),
+            ]
+        if points:
+            reasons.append("of a point light only the beam upon the smooth objects is followed from the light")
         if skies:
             passes.append(Pass(skies, "path", depth, 1, 1, spp, False, roulette))
         return finish(*passes)
@@ -271,7 +288,8 @@ def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
             passes = tuple(replace(s, integrator="path" if s.integrator == "volpath" else s.integrator) for s in passes)
             return replace(ours, passes=passes, media=False)
         case "caustics":
-            passes = tuple(replace(step, first="any") for step in passes if step.integrator != "ptracer")
+            kept = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
+            passes = tuple(replace(step, first="any") for step in kept)
         case "environment":
             skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
             passes = tuple(replace(step, lights=tuple(k for k in step.lights if k not in skies)) for step in passes)
@@ -305,6 +323,28 @@ def small_lights(scene: Scene) -> str | None:
             if float(np.linalg.norm(high - low)) / 2 < SMALL * away:
                 names.append(f"object {scene.spec.objects[k].name!r}")
     return ", ".join(names) or None
+
+
+BEAM_MARGIN = 1.05
+"""How much wider than the sphere about the smooth objects a beam upon them is; Mitsuba's spots fall off at their rim."""
+
+
+def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
+    """The cone in which a point light sees all smooth objects: its axis (not unit) and half angle in degrees.
+
+    None for other lights, or where the cone would be wider than 60 degrees: then it saves little.
+    """
+    said = scene.spec.lights[light]
+    smooth = smooth_objects(scene)
+    if said.type != "point" or not smooth:
+        return None
+    bounds = [shape.bounds() for shape in scene.shapes() if shape.object_id in smooth]
+    low, high = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+    axis = (low + high) / 2 - np.array(said.position)
+    reach = BEAM_MARGIN * float(np.linalg.norm(high - low)) / 2 / float(np.linalg.norm(axis))
+    if reach >= 1 or np.degrees(np.arcsin(reach)) > 60:
+        return None
+    return axis, float(np.degrees(np.arcsin(reach)))
 
 
 def smooth_objects(scene: Scene) -> list[int]:
@@ -572,7 +612,10 @@ def _words(scene: Scene, step: dict[str, Any]) -> str:
     shining = [scene.spec.lights[k].type for k in step["lights"]] + (["lamps"] if step["lamps"] else [])
     depth = "no end" if step["max_depth"] < 0 else f"{step['max_depth']} edges"
     roulette = "" if 0 <= step["max_depth"] < step["rr_depth"] else f", roulette from {step['rr_depth']}"
-    only = "; where glass, mirror, lamp or nothing is seen first" if step["first"] == "smooth" else ""
+    only = {"any": "", "smooth": "; where glass, mirror, lamp or nothing is seen first",
+            "rough": "; where something else is seen first"}[step["first"]]  # fmt: skip
+    only += "; only the beam upon what is smooth" if step["beam"] else ""
+    only += "; taken away" if step["sign"] < 0 else ""
     kind = "light paths" if step["integrator"] == "ptracer" else "samples"
     return (
         f"{step['integrator']}: {step['spp']} {kind} a pixel ({sampler(step['spp'])}), "

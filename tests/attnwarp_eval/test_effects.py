@@ -351,6 +351,36 @@ def test_light_paths_and_camera_paths_agree_on_a_caustic_that_both_can_find():
     assert proof.equivalence(a, b, margin=0.02).equal
 
 
+def test_following_only_the_beam_upon_the_glass_shows_the_same_caustic_with_less_noise():
+    scene = SCENES["caustics"]().with_size(16, 16)
+    narrow = plan(scene, 64)
+    assert [(p.integrator, p.first, p.beam, p.sign) for p in narrow.passes] == [
+        ("path", "any", False, 1), ("path", "rough", True, -1), ("ptracer", "any", True, 1),
+    ]  # fmt: skip
+    whole = Plan(
+        (Pass((0,), "path", 9, 1, 1, 64, False, 10, "smooth"), Pass((0,), "ptracer", 9, 1, 1, 1024, False, 10)), ()
+    )
+    a, b = (
+        np.stack([renderer.render_plan(scene, scene.source, made, first + k) for k in range(12)])
+        for made, first in ((narrow, 0), (whole, 100))
+    )
+    assert not any(level.differs for level in proof.levels(a, b, alpha=0.001))
+    assert proof.equivalence(a, b, margin=0.02).equal
+    # A quarter of the light paths, and still less noise.
+    assert a.var(0).mean() < 0.6 * b.var(0).mean()
+
+
+def test_a_cone_upon_the_smooth_objects_holds_them():
+    axis, angle = effects.beam(SCENES["caustics"](), 0)
+    position, center, radius = np.array(POINT["position"]), np.array([0, 0, 0.7]), 0.6
+    distance = np.linalg.norm(center - position)
+    assert np.allclose(axis, center - position)
+    assert angle > np.degrees(np.arcsin(radius / distance))
+    assert effects.beam(make([FLOOR, ball(GLASS)], [SUN], 8), 0) is None
+    inside = POINT | {"position": [0.5, 0, 1.3]}
+    assert effects.beam(make([FLOOR, ball(GLASS)], [inside], 8), 0) is None
+
+
 @pytest.mark.parametrize("name", ["point", "spot", "square", "globe"])
 def test_pictures_lit_by_lamps_converge_to_the_light_that_ray_casting_finds(name):
     globe = {

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
-from attnwarp_eval.effects import Plan, plan, sampler, smooth_objects
+from attnwarp_eval.effects import Pass, Plan, beam, plan, sampler, smooth_objects
 from attnwarp_eval.optics import (
     GlassMaterial,
     InteriorSpec,
@@ -99,7 +99,7 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
 def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
     """A picture as ``plan`` says: (H, W, 3) float32, linear RGB. Nothing is kept; the same seed gives the same bits."""
     # Which number a shape has is known for scalar_rgb only.
-    mi = _mitsuba("scalar_rgb" if any(step.first == "smooth" for step in plan.passes) else variant())
+    mi = _mitsuba("scalar_rgb" if any(step.first != "any" for step in plan.passes) else variant())
     total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
     for number, step in enumerate(plan.passes):
         options: dict[str, Any] = {"type": step.integrator}
@@ -111,10 +111,10 @@ def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
         if step.integrator == "ptracer":
             # Lamps, seen directly, are the other pass's.
             options |= {"hide_emitters": True}
-        world, center, fog = _world(scene, step.lights, step.lamps, plan.media)
+        world, center, fog = _world(scene, step.lights, step.lamps, plan.media, step.beam)
         pass_seed = len(plan.passes) * int(seed) + number
-        if step.first == "smooth":
-            total += _smooth_part(scene, camera, plan, options, step.spp, pass_seed, (world, center, fog))
+        if step.first != "any":
+            total += step.sign * _part(scene, camera, plan, step, options, pass_seed, (world, center, fog))
             continue
         # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to stratify.
         kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
@@ -122,33 +122,35 @@ def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
             scene, camera, center, {"type": kind, "sample_count": step.spp}, world, plan, fog if plan.media else None
         )
         picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=pass_seed)
-        total += np.array(picture, dtype=np.float32)[..., :3]
+        total += step.sign * np.array(picture, dtype=np.float32)[..., :3]
     return total
 
 
-def _smooth_part(
+def _part(
     scene: Scene,
     camera: Camera,
     plan: Plan,
+    step: Pass,
     options: dict[str, Any],
-    spp: int,
     seed: int,
     loaded: tuple[Any, Array, Any],
 ) -> Image:
-    """What is seen in mirrors, through glass, of lamps and of the sky; zero where another surface is seen first.
+    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the others; zero elsewhere.
 
-    The rest of the picture is made of paths from the light. Each camera ray gets a pixel of its own in a picture of
+    Each camera ray gets a pixel of its own in a picture of
     k x k cells a pixel, so that the index of the shape it met first tells which of the two it belongs to.
     """
     mi = _mitsuba()
     world, center, fog = loaded
-    k = max(1, math.isqrt(spp))
+    k = max(1, math.isqrt(step.spp))
     fine = camera.resize(camera.width * k, camera.height * k)
     lamps = [number for number, item in enumerate(scene.spec.objects) if item.emission]
     smooth = np.isin([-1, *_owners(scene)], [-1, *smooth_objects(scene), *lamps])
+    if step.first == "rough":
+        smooth = ~smooth
     integrator = mi.load_dict({"type": "aov", "aovs": "first:shape_index", "seen": options})
     total = np.zeros((fine.height, fine.width, 3), dtype=np.float64)
-    each = math.ceil(spp / k**2)
+    each = math.ceil(step.spp / k**2)
     for number in range(each):
         sensor = _sensor(scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog)
         picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1))
@@ -219,13 +221,15 @@ def _mitsuba(name: str | None = None) -> Any:
     return mi
 
 
-def _world(scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool) -> tuple[Any, Array, Any]:
+def _world(
+    scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, narrow: bool = False
+) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and the fog or None."""
     mi = _mitsuba()
     texel = _texel(scene)
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
-    shone = {f"light_{k}": _light(scene.spec.lights[k], center) for k in lights}
+    shone = {f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center) for k in lights}
     media = media and (scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects))
 
     def make() -> tuple[Any, Array, Any]:
@@ -255,7 +259,7 @@ def _world(scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool) -> t
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
     cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
-    return _kept((*base, lights, lamps, media, cameras), make)
+    return _kept((*base, lights, lamps, media, narrow, cameras), make)
 
 
 def _interior(item: ObjectSpec) -> InteriorSpec | None:
@@ -546,6 +550,17 @@ def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> di
         # An envmap's pole is +y; scenes have z up.
         "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
     }
+
+
+def _beam(scene: Scene, light: int, center: Array) -> dict[str, Any]:
+    """A point light as a spot upon what is smooth: the same light within the cone, none outside."""
+    cone, said = beam(scene, light), scene.spec.lights[light]
+    if cone is None or not isinstance(said, PointSpec):
+        raise ValueError(f"lights[{light}]: got a {said.type} without a beam upon smooth objects")
+    axis, angle = cone
+    spot = SpotSpec(type="spot", position=said.position, target=tuple(np.array(said.position) + axis),
+                    intensity=said.intensity, color=said.color, cutoff=angle, beam=0.999 * angle)  # fmt: skip
+    return _light(spot, center)
 
 
 def _sensor(
