@@ -14,10 +14,11 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import ir
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from attnwarp.render import _lanes as L
 from attnwarp.render import constants as K
 
 # NaN and infinity are left to IEEE rules: the selects below rely on comparisons with them.
@@ -42,8 +43,18 @@ UX, UY, U0, VX, VY, V0, WX, WY, W0 = 2, 3, 4, 5, 6, 7, 8, 9, 10  # 2D: u = U / W
 CA, CB, CC, LX, LY, RXX, RXY, RYY = 2, 3, 4, 5, 6, 7, 8, 9  # 3D: conic; z = Z0 l / (l^2 + r)
 Z0, ZLO, ZHI, OPACITY = 11, 12, 13, 14
 GRADIENTS = 15  # columns up to here carry gradients
-FILTER, WMAX, CUT, BOUNDED, PEAK = 15, 16, 17, 18, 19
-COLUMNS = 20
+FILTER, SHUT, WMAX, CUT, BOUNDED = 15, 16, 17, 18, 19  # screen rho = FILTER |x - centre|^2 + SHUT
+IZ0, IZLO, IZHI = 20, 21, 22  # 1 over Z0, ZLO, ZHI
+COLUMNS = 24
+
+# A block of splats as the forward pass works on them: for each a row of float32, with the table's columns, 6 features
+# and its place among the tile's; then its weights at the 16 pixels of all squares, and of the square at hand.
+BLOCK = 32
+AHEAD = 32
+ROW = 32
+WEIGHTS = BLOCK * ROW
+SHARES = WEIGHTS + BLOCK * 16
+WORK = SHARES + BLOCK * 16
 
 # Slots of a tile's buffer, each 64 floats.
 (XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, ZREF, IREF, WW, NX, NY, NZ, C_0, C_1,
@@ -52,8 +63,12 @@ SLOTS = 23  # and one more for each channel from the fourth on
 
 HUGE = 1e30
 LOG2E_HALF = f32(0.5 * math.log2(math.e))
-# exp2(x) on [-0.5, 0.5], the Taylor coefficients ln(2)^k / k!; relative error 2e-8.
-E1, E2, E3, E4, E5, E6 = (f32(math.log(2.0) ** k / math.factorial(k)) for k in range(1, 7))
+# exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error, 9.1e-8.
+E1, E2, E3, E4, E5 = (
+    f32(c)
+    for c in (0.6931469775373009, 0.24022242044016756, 0.05550733832514562, 0.009671514536030823, 0.0013264700286626865)
+)
+ROUND = f32(1.5 * 2**23)
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -66,16 +81,6 @@ C20, C21, C22, C23, C24 = (
 )
 C30, C31, C32, C33 = -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154
 C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
-
-
-@intrinsic
-def _float_of_bits(typing: Any, bits: Any) -> Any:
-    """The float32 whose bits an int32 holds."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.bitcast(args[0], ir.FloatType())
-
-    return nb.float32(nb.int32), codegen
 
 
 @intrinsic
@@ -96,12 +101,11 @@ def _prefetch(typing: Any, array: Any, item: Any) -> Any:
 
 @inlined
 def _gauss(rho):
-    """exp(-rho / 2) in float32 for rho >= 0, relative error 1.5e-7; about 1e-19 from rho = 88 on."""
-    y = -min(rho, f32(88.0)) * LOG2E_HALF
-    k = np.int32(y - f32(0.5))
-    f = y - f32(k)
-    p = f32(1.0) + f * (E1 + f * (E2 + f * (E3 + f * (E4 + f * (E5 + f * E6)))))
-    return p * _float_of_bits(np.int32((k + np.int32(127)) << np.int32(23)))
+    """exp(-rho / 2), relative error 1.5e-7, for rho from 0 to 88; beyond, anything."""
+    # Adding 1.5 2^23 rounds to an integer and leaves it in the lowest bits.
+    shifted = rho * -LOG2E_HALF + ROUND
+    f = rho * -LOG2E_HALF - (shifted - ROUND)
+    return L.times_power(f * (f * (f * (f * (f * E5 + E4) + E3) + E2) + E1) + f32(1.0), shifted)
 
 
 @inlined
@@ -204,7 +208,7 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
             table[i, WX] = scale * n0 * kx
             table[i, WY] = scale * (n1 * ky + n0 * kxy)
             table[i, W0] = 1.0 if ahead else scale * n2
-            table[i, FILTER] = 1.0 if ahead else 0.0
+            table[i, FILTER], table[i, SHUT] = (2.0, 0.0) if ahead else (0.0, HUGE)
             table[i, WMAX] = depth / near
         else:
             limit = K.JACOBIAN_MARGIN * view[WIDTH] / 2 / fx
@@ -228,7 +232,6 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
                 if opacity < K.ALPHA_MIN:
                     continue
             if not center:
-                table[i, PEAK] = 1.0
                 q0 = 0.0
                 for r in range(3):
                     for k in range(3):
@@ -258,6 +261,7 @@ def project(first, last, view, m, q, s, o, values, channels, table, features, ke
         else:
             table[i, ZLO] = max(c2 - K.EXTENT_SIGMAS * spread, near)
             table[i, ZHI] = max(c2 + K.EXTENT_SIGMAS * spread, near)
+        table[i, IZ0], table[i, IZLO], table[i, IZHI] = 1 / table[i, Z0], 1 / table[i, ZLO], 1 / table[i, ZHI]
         table[i, OPACITY] = opacity
         cut = 2 * math.log(opacity / K.ALPHA_MIN)
         table[i, CUT] = cut
@@ -447,6 +451,7 @@ def scatter(first, last, order, base, begins, counts, spans, live, before, fill,
     before each; ``cursor`` counts per tile, or holds the place in
     ``entries`` of the next one.
     """
+    every = before[-1] == len(live)
     for place in range(first, last):
         i = order[place]
         # In the order of depth, every access is a cache miss: ask early, for the runs' place first, then for the runs.
@@ -456,12 +461,12 @@ def scatter(first, last, order, base, begins, counts, spans, live, before, fill,
         _prefetch(spans, 2 * (base[soon // CHUNK] + begins[soon]))
         begin = base[i // CHUNK] + begins[i]
         for k in range(begin, begin + counts[i]):
-            if before[spans[k, 0]] == before[spans[k, 0] + spans[k, 1]]:
+            if not every and before[spans[k, 0]] == before[spans[k, 0] + spans[k, 1]]:
                 continue
-            for t in range(spans[k, 0], spans[k, 0] + spans[k, 1]):
-                if live[t]:
+            for t in range(u64(spans[k, 0]), u64(spans[k, 0] + spans[k, 1])):
+                if every or live[t]:
                     if fill:
-                        entries[cursor[t]] = i
+                        entries[u64(cursor[t])] = i
                     cursor[t] += 1
 
 
@@ -480,212 +485,260 @@ def place_cursors(counts, starts):
 
 
 @inlined
-def _shade_flat(buf, table, i, ox, oy):
-    """alpha, z and 1 / z of a 2D splat at the 64 pixels of the tile at (ox, oy)."""
+def _place(work, at, table, i, ox, oy, flat):
+    """Row i of the table as float32 to ``work`` from ``at`` on, its coefficients moved to the tile's middle (ox,
+    oy)."""
+    i, b = u64(i), u64(at)
+    L.narrow(work, at, table, i * u64(COLUMNS))
+    L.narrow(work, at + 8, table, i * u64(COLUMNS) + u64(8))
+    L.narrow(work, at + 16, table, i * u64(COLUMNS) + u64(16))
     sx, sy = ox - table[i, X0], oy - table[i, Y0]
-    ux, uy, u0 = f32(table[i, UX]), f32(table[i, UY]), f32(table[i, U0] + table[i, UX] * sx + table[i, UY] * sy)
-    vx, vy, v0 = f32(table[i, VX]), f32(table[i, VY]), f32(table[i, V0] + table[i, VX] * sx + table[i, VY] * sy)
-    wx, wy, w0 = f32(table[i, WX]), f32(table[i, WY]), f32(table[i, W0] + table[i, WX] * sx + table[i, WY] * sy)
-    dx, dy = f32(sx), f32(sy)
-    z0, iz0, zlo, zhi, ilo, ihi = (
-        f32(table[i, Z0]),
-        f32(1 / table[i, Z0]),
-        f32(table[i, ZLO]),
-        f32(table[i, ZHI]),
-        f32(1 / table[i, ZHI]),
-        f32(1 / table[i, ZLO]),
-    )
-    opacity, wmax = f32(table[i, OPACITY]), f32(table[i, WMAX])
-    filtered = f32(2.0) if table[i, FILTER] > 0 else f32(0.0)
-    unfiltered = f32(0.0) if table[i, FILTER] > 0 else f32(HUGE)
-    for p in range(PIXELS):
-        x = buf[XS * 64 + p]
-        y = buf[YS * 64 + p]
-        w = w0 + wx * x + wy * y
-        r = f32(1.0) / w
-        u = (u0 + ux * x + uy * y) * r
-        v = (v0 + vx * x + vy * y) * r
-        rho = u * u + v * v
-        rho = rho if (w > f32(0.0)) & (w <= wmax) else f32(HUGE)
-        ex = x + dx
-        ey = y + dy
-        rho = min(rho, filtered * (ex * ex + ey * ey) + unfiltered)
-        a = opacity * _gauss(rho)
-        a = a if a >= f32(K.ALPHA_MIN) else f32(0.0)
-        buf[AL * 64 + p] = min(a, f32(K.ALPHA_MAX))
-        z = min(max(z0 * r, zlo), zhi)
-        buf[ZZ * 64 + p] = z if w > f32(0.0) else zhi
-        buf[IZ * 64 + p] = min(max(w * iz0, ilo), ihi)
+    work[b + u64(X0)], work[b + u64(Y0)] = sx, sy
+    if flat:
+        work[b + u64(U0)] = table[i, U0] + table[i, UX] * sx + table[i, UY] * sy
+        work[b + u64(V0)] = table[i, V0] + table[i, VX] * sx + table[i, VY] * sy
+        work[b + u64(W0)] = table[i, W0] + table[i, WX] * sx + table[i, WY] * sy
 
 
 @inlined
-def _shade_round(buf, table, i, ox, oy):
-    """alpha, z and 1 / z of a 3D splat at the 64 pixels of the tile at (ox, oy)."""
-    dx, dy = f32(ox - table[i, X0]), f32(oy - table[i, Y0])
-    ca, cb, cc = f32(table[i, CA]), f32(2 * table[i, CB]), f32(table[i, CC])
-    opacity = f32(table[i, OPACITY])
-    for p in range(PIXELS):
-        x = buf[XS * 64 + p] + dx
-        y = buf[YS * 64 + p] + dy
-        rho = max(ca * x * x + cb * x * y + cc * y * y, f32(0.0))
-        a = opacity * _gauss(rho)
-        a = a if a >= f32(K.ALPHA_MIN) else f32(0.0)
-        buf[AL * 64 + p] = min(a, f32(K.ALPHA_MAX))
-    if table[i, PEAK] > 0:
-        lx, ly, rxx, rxy, ryy = (
-            f32(table[i, LX]),
-            f32(table[i, LY]),
-            f32(table[i, RXX]),
-            f32(2 * table[i, RXY]),
-            f32(table[i, RYY]),
-        )
-        z0, zlo, zhi = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI])
-        for p in range(PIXELS):
-            x = buf[XS * 64 + p] + dx
-            y = buf[YS * 64 + p] + dy
-            along = f32(1.0) + lx * x + ly * y
-            across = along * along + max(rxx * x * x + rxy * x * y + ryy * y * y, f32(0.0))
-            z = min(max(z0 * along / max(across, f32(1e-30)), zlo), zhi)
-            buf[ZZ * 64 + p] = z
-            buf[IZ * 64 + p] = f32(1.0) / z
+def _meet_flat(work, at, x, y):
+    """Of a 2D splat at 16 pixels: where its outline holds them, where its plane is met, w, (u^2 + v^2) w^2, screen
+    rho."""
+    w = L.spread(work, at + W0) + L.spread(work, at + WX) * x + L.spread(work, at + WY) * y
+    u = L.spread(work, at + U0) + L.spread(work, at + UX) * x + L.spread(work, at + UY) * y
+    v = L.spread(work, at + V0) + L.spread(work, at + VX) * x + L.spread(work, at + VY) * y
+    ex, ey = x + L.spread(work, at + X0), y + L.spread(work, at + Y0)
+    cut = L.spread(work, at + CUT)
+    square = u * u + v * v
+    screen = (ex * ex + ey * ey) * L.spread(work, at + FILTER) + L.spread(work, at + SHUT)
+    meets = (f32(0.0) < w) & (w <= L.spread(work, at + WMAX))
+    # No division: this is asked of many more pixels than are drawn.
+    inside = (meets & (square <= cut * (w * w))) | (screen <= cut)
+    return inside, meets, w, square, screen
+
+
+@inlined
+def _meet_round(work, at, x, y):
+    """Of a 3D splat at 16 pixels: where its outline holds them, and rho."""
+    ex, ey = x + L.spread(work, at + X0), y + L.spread(work, at + Y0)
+    rho = (L.spread(work, at + CA) * ex + L.spread(work, at + CB) * ey * f32(2.0)) * ex
+    rho = L.most(rho + L.spread(work, at + CC) * ey * ey, f32(0.0))
+    return rho <= L.spread(work, at + CUT), rho
+
+
+@inlined
+def _shade(work, at, x, y, flat, peak):
+    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere), z and 1 / z."""
+    low, high = L.spread(work, at + ZLO), L.spread(work, at + ZHI)
+    if flat:
+        inside, meets, w, square, screen = _meet_flat(work, at, x, y)
+        r = f32(1.0) / w
+        rho = L.least(L.where(meets, square * (r * r), f32(HUGE)), screen)
+        z = L.where(f32(0.0) < w, L.least(L.most(L.spread(work, at + Z0) * r, low), high), high)
+        iz = L.least(L.most(w * L.spread(work, at + IZ0), L.spread(work, at + IZHI)), L.spread(work, at + IZLO))
     else:
-        z, iz = f32(table[i, ZLO]), f32(1 / table[i, ZLO])
-        for p in range(PIXELS):
-            buf[ZZ * 64 + p] = z
-            buf[IZ * 64 + p] = iz
+        inside, rho = _meet_round(work, at, x, y)
+        z, iz = low, L.spread(work, at + IZLO)
+        if peak:
+            ex, ey = x + L.spread(work, at + X0), y + L.spread(work, at + Y0)
+            along = L.spread(work, at + LX) * ex + L.spread(work, at + LY) * ey + f32(1.0)
+            form = (L.spread(work, at + RXX) * ex + L.spread(work, at + RXY) * ey * f32(2.0)) * ex
+            across = along * along + L.most(form + L.spread(work, at + RYY) * ey * ey, f32(0.0))
+            z = L.least(L.most(L.spread(work, at + Z0) * along / L.most(across, f32(1e-30)), low), high)
+            iz = f32(1.0) / z
+    alpha = L.least(L.spread(work, at + OPACITY) * _gauss(rho), f32(K.ALPHA_MAX))
+    return inside, alpha, z, iz
 
 
 @bare
 def forward(first, last, view, tiles_x, live, starts, entries, table, features, background, ndc_scale, color, alpha,
-            depth, median, normal, l1, l2, state, done, drawn_in, full, seen, buf):  # fmt: skip
+            depth, median, normal, l1, l2, state, done, tested_in, shaded_in, drawn_in, full, seen, buf, work,
+            picks):  # fmt: skip
     """Composite those of the tiles first..last that are live.
 
+    A tile's 64 pixels are four squares of 16. Splats come in blocks: their coefficients are laid out once for the tile;
+    each square then picks those whose outline holds a pixel of it, and composites them with its sums in registers.
+
     ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry, mean and spread of
-    1 / z. Per tile, ``done`` is the number of entries worked off, ``drawn_in`` that of contributing pairs, ``full``
-    whether every pixel has ended; ``seen`` is the sum of weights of each entry.
+    1 / z; of no height if there will be none. Per tile, ``done`` is the number of entries worked off, ``tested_in``
+    that of pairs whose intersection was computed, ``shaded_in`` of those in a square that the splat draws to,
+    ``drawn_in`` of contributing pairs, ``full`` whether every
+    pixel has ended; ``seen`` is the sum of weights of each entry.
     """
-    flat = view[FLAT] > 0
+    flat, peak = view[FLAT] > 0, view[CENTER] == 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     channels = background.shape[0]
+    keep = state.shape[1] > 0
     for p in range(PIXELS):
         # From the tile's middle: offsets are small, and so is what they round.
-        buf[XS * 64 + p] = f32(p % TILE) - f32(3.5)
-        buf[YS * 64 + p] = f32(p // TILE) - f32(3.5)
+        buf[XS * 64 + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
+        buf[YS * 64 + p] = f32(p // 32 * 4 + p // 4 % 4) - f32(3.5)
     stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
     for t in range(first, last):
         if not live[t]:
             continue
         begin, end = starts[t], starts[t + 1]
-        contributing = 0
+        tested, shaded, contributing = 0, 0, 0
         ty, tx = t // tiles_x, t % tiles_x
         ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
-        cols, rows = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
         for p in range(PIXELS):
+            x, y = buf[XS * 64 + p] + ox, buf[YS * 64 + p] + oy
             # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
-            buf[TT * 64 + p] = f32(1.0) if (p % TILE < cols) & (p // TILE < rows) else f32(0.0)
-        for p in range(AA * 64, buf.shape[0]):
-            buf[p] = f32(0.0)
+            buf[TT * 64 + p] = f32(1.0) if (x < width) & (y < height) else f32(0.0)
+        for p in range(AA * 64, buf.shape[0], 16):
+            L.store(buf, p, f32(0.0))
+        ended, reached = 0, 0
+        for q in range(4):
+            if not L.some(stop < L.load(buf, TT * 64 + q * 16)):
+                ended |= 1 << q
         e = begin
-        left = f32(1.0)
-        while e < end:
-            i = entries[e]
-            # The next rows are anywhere in a table larger than the cache.
-            ahead = entries[min(e + 2, end - 1)]
-            _prefetch(table, ahead * COLUMNS)
-            _prefetch(table, ahead * COLUMNS + 8)
-            _prefetch(table, ahead * COLUMNS + 16)
-            _prefetch(features, ahead * features.shape[1])
-            if flat:
-                _shade_flat(buf, table, i, ox, oy)
-            else:
-                _shade_round(buf, table, i, ox, oy)
-            step = f32(e - begin + 1)
-            if left > half:
-                for p in range(PIXELS):
-                    # Blends with a factor of 0 or 1, exact: a select becomes a masked store, which stalls the next
-                    # load.
-                    T, z = buf[TT * 64 + p], buf[ZZ * 64 + p]
-                    opens = f32(1.0) if (half < T) & (buf[AL * 64 + p] > f32(0.0)) else f32(0.0)
-                    first_hit = opens if f32(1.0) <= T else f32(0.0)
-                    buf[MED * 64 + p] = buf[MED * 64 + p] * (f32(1.0) - opens) + z * opens
-                    buf[MEDK * 64 + p] = buf[MEDK * 64 + p] * (f32(1.0) - opens) + step * opens
+        while e < end and ended < 15:
+            size = min(BLOCK, end - e)
+            for k in range(size):
+                # The rows are anywhere in a table larger than the cache.
+                ahead = entries[min(e + k + AHEAD, end - 1)]
+                _prefetch(table, ahead * COLUMNS)
+                _prefetch(table, ahead * COLUMNS + 8)
+                _prefetch(table, ahead * COLUMNS + 16)
+                _prefetch(features, ahead * features.shape[1])
+                i = entries[e + k]
+                _place(work, k * ROW, table, i, ox, oy, flat)
+                for c in range(6):
+                    work[u64(k * ROW + COLUMNS + c)] = features[u64(i), u64(c)]
+                work[u64(k * ROW + COLUMNS + 6)] = f32(e - begin + k + 1)
+                L.store(work, WEIGHTS + k * 16, f32(0.0))
+            for q in range(4):
+                if ended >> q & 1:
+                    continue
+                s = q * 16
+                x, y = L.load(buf, XS * 64 + s), L.load(buf, YS * 64 + s)
+                picked = 0
+                for k in range(size):
+                    picks[u64(picked)] = k
+                    if flat:
+                        picked += L.some(_meet_flat(work, k * ROW, x, y)[0])
+                    else:
+                        picked += L.some(_meet_round(work, k * ROW, x, y)[0])
+                tested += 16 * size
+                T, A, D = L.load(buf, TT * 64 + s), L.load(buf, AA * 64 + s), L.load(buf, DD * 64 + s)
+                sum1, sum2, pairs = L.load(buf, M1 * 64 + s), L.load(buf, M2 * 64 + s), L.load(buf, L1 * 64 + s)
+                n0, n1, n2 = L.load(buf, NX * 64 + s), L.load(buf, NY * 64 + s), L.load(buf, NZ * 64 + s)
+                c0, c1, c2 = L.load(buf, C_0 * 64 + s), L.load(buf, C_1 * 64 + s), L.load(buf, C_2 * 64 + s)
+                zref, iref = L.load(buf, ZREF * 64 + s), L.load(buf, IREF * 64 + s)
+                med, medk, final = L.load(buf, MED * 64 + s), L.load(buf, MEDK * 64 + s), L.load(buf, LAST * 64 + s)
+                used = 0
+                while used < picked:
+                    k = picks[u64(used)]
+                    b = k * ROW
+                    inside, a, z, iz = _shade(work, b, x, y, flat, peak)
+                    hit = inside & (stop < T)
+                    w = L.where(hit, a * T, f32(0.0))
+                    step = L.spread(work, b + COLUMNS + 6)
+                    opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
+                    med, medk = L.where(opens, z, med), L.where(opens, step, medk)
+                    final = L.where(hit, step, final)
                     # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far away.
-                    buf[ZREF * 64 + p] = buf[ZREF * 64 + p] * (f32(1.0) - first_hit) + z * first_hit
-                    buf[IREF * 64 + p] = buf[IREF * 64 + p] * (f32(1.0) - first_hit) + buf[IZ * 64 + p] * first_hit
-            f0, f1, f2, f3, f4, f5 = (
-                features[i, 0], features[i, 1], features[i, 2], features[i, 3], features[i, 4], features[i, 5],
-            )  # fmt: skip
-            total = f32(0.0)
-            drawn = f32(0.0)
-            for p in range(PIXELS):
-                T = buf[TT * 64 + p]
-                a = buf[AL * 64 + p] * (f32(1.0) if stop < T else f32(0.0))
-                z = buf[ZZ * 64 + p] - buf[ZREF * 64 + p]
-                m = buf[IZ * 64 + p] - buf[IREF * 64 + p]
-                w = a * T
-                A = buf[AA * 64 + p]
-                D = buf[DD * 64 + p]
-                wz = w * z
-                wm = w * m
-                buf[L1 * 64 + p] += wz * A - w * D
-                buf[AA * 64 + p] = A + w
-                buf[DD * 64 + p] = D + wz
-                buf[M1 * 64 + p] += wm
-                buf[M2 * 64 + p] += wm * m
-                buf[NX * 64 + p] += w * f0
-                buf[NY * 64 + p] += w * f1
-                buf[NZ * 64 + p] += w * f2
-                buf[C_0 * 64 + p] += w * f3
-                buf[C_1 * 64 + p] += w * f4
-                buf[C_2 * 64 + p] += w * f5
-                hit = f32(1.0) if a > f32(0.0) else f32(0.0)
-                buf[LAST * 64 + p] = buf[LAST * 64 + p] * (f32(1.0) - hit) + step * hit
-                buf[TT * 64 + p] = T - w
-                buf[WW * 64 + p] = w
-                total += w
-                drawn += hit
-            seen[e] = total
-            contributing += int(drawn)
-            for c in range(3, channels):
-                f = features[i, 3 + c]
-                # Unsigned, so that no index can be meant from the end: that test alone stops vectorisation.
-                row = u64((C_0 + c) * 64)
-                for p in range(PIXELS):
-                    buf[row + u64(p)] += buf[WW * 64 + p] * f
-            e += 1
-            if (e - begin) % 4 == 0:
-                left = f32(0.0)
-                for p in range(PIXELS):
-                    left = max(left, buf[TT * 64 + p])
-                if left <= stop:
-                    break
-        left = f32(0.0)
-        for p in range(PIXELS):
-            left = max(left, buf[TT * 64 + p])
-        full[t] = left <= stop
-        done[t] = e - begin
+                    zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
+                    z, m = z - zref, iz - iref
+                    wz, wm = w * z, w * m
+                    pairs = pairs + wz * A - w * D
+                    A, D = A + w, D + wz
+                    sum1, sum2 = sum1 + wm, sum2 + wm * m
+                    n0 = n0 + w * L.spread(work, b + COLUMNS)
+                    n1 = n1 + w * L.spread(work, b + COLUMNS + 1)
+                    n2 = n2 + w * L.spread(work, b + COLUMNS + 2)
+                    c0 = c0 + w * L.spread(work, b + COLUMNS + 3)
+                    c1 = c1 + w * L.spread(work, b + COLUMNS + 4)
+                    c2 = c2 + w * L.spread(work, b + COLUMNS + 5)
+                    T = T - w
+                    L.store(work, WEIGHTS + k * 16, L.load(work, WEIGHTS + k * 16) + w)
+                    if channels > 3:
+                        L.store(work, SHARES + used * 16, w)
+                    contributing += L.count(hit)
+                    used += 1
+                    if not L.some(stop < T):
+                        ended |= 1 << q
+                        reached = max(reached, e - begin + k + 1)
+                        break
+                L.store(buf, TT * 64 + s, T)
+                L.store(buf, AA * 64 + s, A)
+                L.store(buf, DD * 64 + s, D)
+                L.store(buf, M1 * 64 + s, sum1)
+                L.store(buf, M2 * 64 + s, sum2)
+                L.store(buf, L1 * 64 + s, pairs)
+                L.store(buf, NX * 64 + s, n0)
+                L.store(buf, NY * 64 + s, n1)
+                L.store(buf, NZ * 64 + s, n2)
+                L.store(buf, C_0 * 64 + s, c0)
+                L.store(buf, C_1 * 64 + s, c1)
+                L.store(buf, C_2 * 64 + s, c2)
+                L.store(buf, ZREF * 64 + s, zref)
+                L.store(buf, IREF * 64 + s, iref)
+                L.store(buf, MED * 64 + s, med)
+                L.store(buf, MEDK * 64 + s, medk)
+                L.store(buf, LAST * 64 + s, final)
+                shaded += 16 * used
+                for c in range(3, channels):
+                    sums = L.load(buf, (C_0 + c) * 64 + s)
+                    for k in range(used):
+                        f = features[u64(entries[e + picks[u64(k)]]), u64(3 + c)]
+                        sums = sums + L.load(work, SHARES + k * 16) * f
+                    L.store(buf, (C_0 + c) * 64 + s, sums)
+            for k in range(size):
+                seen[e + k] = L.total(L.load(work, WEIGHTS + k * 16))
+            e += size
+        full[t] = ended == 15
+        done[t] = reached if ended == 15 else end - begin
+        tested_in[t] = tested
+        shaded_in[t] = shaded
         drawn_in[t] = contributing
+        for p in range(PIXELS):
+            A, a1 = buf[AA * 64 + p], buf[M1 * 64 + p]
+            covered = buf[LAST * 64 + p] > 0
+            inverse = f32(1.0) / A if covered else f32(0.0)
+            spread = max(buf[M2 * 64 + p] - a1 * a1 * inverse, f32(0.0))
+            buf[AL * 64 + p] = spread
+            buf[M2 * 64 + p] = f32(ndc_scale) * A * spread
+            buf[M1 * 64 + p] = buf[IREF * 64 + p] + a1 * inverse
+            buf[DD * 64 + p] = buf[ZREF * 64 + p] + buf[DD * 64 + p] * inverse if covered else f32(np.nan)
+            buf[MED * 64 + p] = buf[MED * 64 + p] if covered else f32(np.nan)
+            buf[L1 * 64 + p] *= f32(2.0)
+        for c in range(channels):
+            for p in range(PIXELS):
+                buf[u64((C_0 + c) * 64 + p)] += (f32(1.0) - buf[AA * 64 + p]) * background[c]
+        rows, cols = min(TILE, height - ty * TILE), min(TILE, width - tx * TILE)
+        if rows == TILE and cols == TILE and channels == 3:
+            for k in range(16):
+                p = k // 8 * 32 + k % 2 * 16 + k // 2 % 4 * 4
+                to = (ty * TILE + k // 2) * width + tx * TILE + k % 2 * 4
+                L.copy4(alpha, to, buf, AA * 64 + p)
+                L.copy4(depth, to, buf, DD * 64 + p)
+                L.copy4(median, to, buf, MED * 64 + p)
+                L.copy4(l1, to, buf, L1 * 64 + p)
+                L.copy4(l2, to, buf, M2 * 64 + p)
+                L.interleave4(color, 3 * to, buf, C_0 * 64 + p, 64)
+                L.interleave4(normal, 3 * to, buf, NX * 64 + p, 64)
+                if keep:
+                    L.copy4(state, to, buf, TT * 64 + p)
+                    L.copy4(state, to + height * width, buf, LAST * 64 + p)
+                    L.copy4(state, to + 2 * height * width, buf, MEDK * 64 + p)
+                    L.copy4(state, to + 3 * height * width, buf, M1 * 64 + p)
+                    L.copy4(state, to + 4 * height * width, buf, AL * 64 + p)
+            continue
         for r in range(rows):
             for k in range(cols):
-                p = r * TILE + k
-                y, x = ty * TILE + r, tx * TILE + k
-                A, D, a1, a2 = buf[AA * 64 + p], buf[DD * 64 + p], buf[M1 * 64 + p], buf[M2 * 64 + p]
-                covered = buf[LAST * 64 + p] > 0
-                alpha[y, x] = A
-                spread = max(a2 - a1 * a1 / A, f32(0.0)) if covered else f32(0.0)
-                depth[y, x] = buf[ZREF * 64 + p] + D / A if covered else f32(np.nan)
-                median[y, x] = buf[MED * 64 + p] if covered else f32(np.nan)
-                l1[y, x] = f32(2.0) * buf[L1 * 64 + p]
-                l2[y, x] = f32(ndc_scale) * A * spread
+                p = u64(r // 4 * 32 + k // 4 * 16 + r % 4 * 4 + k % 4)
+                y, x = u64(ty * TILE + r), u64(tx * TILE + k)
+                alpha[y, x], depth[y, x], median[y, x] = buf[AA * 64 + p], buf[DD * 64 + p], buf[MED * 64 + p]
+                l1[y, x], l2[y, x] = buf[L1 * 64 + p], buf[M2 * 64 + p]
                 for c in range(channels):
-                    color[y, x, c] = buf[(C_0 + c) * 64 + p] + (f32(1.0) - A) * background[c]
+                    color[y, x, u64(c)] = buf[u64((C_0 + c) * 64) + p]
                 for c in range(3):
-                    normal[y, x, c] = buf[(NX + c) * 64 + p]
-                state[0, y, x] = buf[TT * 64 + p]
-                state[1, y, x] = buf[LAST * 64 + p]
-                state[2, y, x] = buf[MEDK * 64 + p]
-                state[3, y, x] = buf[IREF * 64 + p] + a1 / A if covered else f32(0.0)
-                state[4, y, x] = spread
+                    normal[y, x, u64(c)] = buf[u64((NX + c) * 64) + p]
+                if keep:
+                    state[0, y, x], state[1, y, x] = buf[TT * 64 + p], buf[LAST * 64 + p]
+                    state[2, y, x] = buf[MEDK * 64 + p]
+                    state[3, y, x], state[4, y, x] = buf[M1 * 64 + p], buf[AL * 64 + p]
 
 
 @bare
@@ -712,8 +765,7 @@ def _blame_flat(buf, table, i, ox, oy, rows, row):
     wx, wy, w0 = f32(table[i, WX]), f32(table[i, WY]), f32(table[i, W0] + table[i, WX] * sx + table[i, WY] * sy)
     dx, dy = f32(sx), f32(sy)
     z0, zlo, zhi, wmax = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI]), f32(table[i, WMAX])
-    filtered = f32(2.0) if table[i, FILTER] > 0 else f32(0.0)
-    unfiltered = f32(0.0) if table[i, FILTER] > 0 else f32(HUGE)
+    filtered, unfiltered = f32(table[i, FILTER]), f32(table[i, SHUT])
     o1 = o2 = o3 = o4 = o5 = o6 = f32(0.0)
     tu = tux = tuy = tv = tvx = tvy = tw = twx = twy = f32(0.0)
     for p in range(PIXELS):
@@ -771,7 +823,7 @@ def _blame_flat(buf, table, i, ox, oy, rows, row):
 
 
 @inlined
-def _blame_round(buf, table, i, ox, oy, rows, row):
+def _blame_round(buf, table, i, ox, oy, rows, row, peak):
     """Gradients in a 3D splat's table row from those in alpha, z and 1 / z at the 64 pixels."""
     dx, dy = f32(ox - table[i, X0]), f32(oy - table[i, Y0])
     ca, cb, cc = f32(table[i, CA]), f32(table[i, CB]), f32(table[i, CC])
@@ -792,7 +844,7 @@ def _blame_round(buf, table, i, ox, oy, rows, row):
     rows[row, CA], rows[row, CB], rows[row, CC] = f32(-0.5) * o4, -o5, f32(-0.5) * o6
     o1 = o2 = o3 = o4 = o5 = o6 = f32(0.0)
     s1 = s2 = s3 = f32(0.0)
-    if table[i, PEAK] > 0:
+    if peak:
         lx, ly = f32(table[i, LX]), f32(table[i, LY])
         rxx, rxy, ryy = f32(table[i, RXX]), f32(table[i, RXY]), f32(table[i, RYY])
         z0, zlo, zhi = f32(table[i, Z0]), f32(table[i, ZLO]), f32(table[i, ZHI])
@@ -832,14 +884,14 @@ def _blame_round(buf, table, i, ox, oy, rows, row):
 @bare
 def backward(first, last, view, tiles_x, starts, done, entries, table, features, background, ndc_scale, alpha, depth,
 state,
-             g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows, buf):  # fmt: skip
+             g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows, buf, work):  # fmt: skip
     """Gradients of the tiles first..last, one row of ``rows`` for each entry worked off, from place[tile] on.
 
     A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in its ``features``.
     Splats are visited back to front: the transmittance before each is recovered by division from what the forward pass
     left.
     """
-    flat = view[FLAT] > 0
+    flat, peak = view[FLAT] > 0, view[CENTER] == 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     channels = background.shape[0]
     scale = f32(ndc_scale)
@@ -890,10 +942,12 @@ state,
             _prefetch(table, ahead * COLUMNS + 8)
             _prefetch(table, ahead * COLUMNS + 16)
             _prefetch(features, ahead * features.shape[1])
-            if flat:
-                _shade_flat(buf, table, i, ox, oy)
-            else:
-                _shade_round(buf, table, i, ox, oy)
+            _place(work, 0, table, i, ox, oy, flat)
+            for p in range(0, PIXELS, 16):
+                drawn, a, z, iz = _shade(work, 0, L.load(buf, BXS * 64 + p), L.load(buf, BYS * 64 + p), flat, peak)
+                L.store(buf, BAL * 64 + p, L.where(drawn, a, f32(0.0)))
+                L.store(buf, BZZ * 64 + p, z)
+                L.store(buf, BIZ * 64 + p, iz)
             row = place[t] + count - 1 - back
             step = f32(e - begin + 1)
             gi = g_weight[i]
@@ -951,7 +1005,7 @@ state,
             if flat:
                 _blame_flat(buf, table, i, ox, oy, rows, row)
             else:
-                _blame_round(buf, table, i, ox, oy, rows, row)
+                _blame_round(buf, table, i, ox, oy, rows, row, peak)
 
 
 @jit

@@ -41,7 +41,8 @@ class Render:
             planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is not seen.
         counters: how much work it was: "splats" (in), "visible" (can show in the picture), "tile_pairs" (splats over
-            8 x 8 tiles), "pairs" (splats over pixels evaluated), "contributing" (those drawn), "tiles".
+            8 x 8 tiles), "pairs" (splats over pixels whose intersection was computed), "composited" (those of them in a
+            4 x 4 square that the splat draws to), "contributing" (those drawn), "tiles".
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
     """

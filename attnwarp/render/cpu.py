@@ -47,6 +47,10 @@ def _aligned(size: int) -> np.ndarray:
     return raw[skip : skip + size]
 
 
+def _join(parts: list[np.ndarray]) -> np.ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
 class _Scene:
     """One view's splats, projected, ordered and binned: what the forward pass leaves to the backward pass."""
 
@@ -149,12 +153,12 @@ class _Composite(torch.autograd.Function):
         color = np.empty((h, w, scene.channels), np.float32)
         normal = np.empty((h, w, 3), np.float32)
         alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
-        state = np.empty((5, h, w), np.float32)
-        done, drawn = np.zeros(scene.tiles, np.int64), np.zeros(scene.tiles, np.int64)
+        state = np.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
+        done, tested, shaded, drawn = (np.zeros(scene.tiles, np.int64) for _ in range(4))
         full = np.zeros(scene.tiles, np.bool_)
         slots = kernels.SLOTS + max(0, scene.channels - 3)
         live = np.ones(scene.tiles, np.bool_)
-        count, worked_off = scene.front(), 0
+        count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
         weights: list[np.ndarray] = []
         # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
@@ -165,8 +169,9 @@ class _Composite(torch.autograd.Function):
                 kernels.forward,
                 [
                     (*job, scene.view, scene.tiles_x, live, starts, entries, scene.table, scene.features,
-                     scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, drawn, full,
-                     seen, _aligned(slots * kernels.PIXELS))
+                     scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, tested,
+                     shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS), _aligned(kernels.WORK),
+                     np.empty(kernels.BLOCK, np.int64))
                     for job in scene.tile_ranges(starts)
                 ],
             )  # fmt: skip
@@ -174,19 +179,22 @@ class _Composite(torch.autograd.Function):
             lists.append(entries)
             weights.append(seen)
             worked_off += int(done[live].sum())
+            pairs += int(tested[live].sum())
+            composited += int(shaded[live].sum())
             live = live & ~full
             if count == len(scene.order) or not live.any():
                 break
             count = len(scene.order)
-        scene.entries = np.concatenate(lists)
+        scene.entries = _join(lists)
         weight = np.zeros(len(scene.means), np.float32)
-        kernels.gather_weights(scene.starts, done, scene.entries, np.concatenate(weights), weight)
+        kernels.gather_weights(scene.starts, done, scene.entries, _join(weights), weight)
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
             tiles=scene.tiles,
             tile_pairs=worked_off,
-            pairs=worked_off * kernels.PIXELS,
+            pairs=pairs,
+            composited=composited,
             contributing=int(drawn.sum()),
         )
         ctx.scene, ctx.state, ctx.alpha, ctx.depth, ctx.done, ctx.scale = scene, state, alpha, depth, done, scale
@@ -273,7 +281,7 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
             [
                 (begin, end, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table, scene.features,
                  scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream, place, rows,
-                 _aligned(slots * kernels.PIXELS))
+                 _aligned(slots * kernels.PIXELS), _aligned(kernels.ROW))
                 for begin, end in itertools.pairwise(edges)
             ],
         )  # fmt: skip
