@@ -55,6 +55,11 @@ class TerrainSpec(Spec):
         noise = 2 * fractal_noise(np.ascontiguousarray(places), self.octaves, self.seed) - 1
         return self.center[2] + self.height * rise * noise
 
+    def below(self, point: Array) -> bool:
+        """Whether a (3,) point lies under the ground."""
+        here = (np.abs(point[:2] - np.array(self.center[:2])) <= np.array(self.size) / 2).all()
+        return bool(here and point[2] < self.height_at(point[None, :2])[0])
+
     def mesh(self) -> Mesh:
         """The ground as triangles facing up, with the normals of the height field."""
         n = self.resolution

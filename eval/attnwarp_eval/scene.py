@@ -727,5 +727,9 @@ def _inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
     if isinstance(spec, BodySpec):
         R, offset = _turn_z(spec.yaw), np.array(spec.position)
         return lambda point: spec.contains((point - offset) @ R / spec.scale)
+    if isinstance(spec, TerrainSpec):
+        return spec.below
+    if isinstance(spec, ScatterSpec):
+        return lambda point: False  # blades and leaves have no inside, and stones are small
     solids = list(scene._build(item, 0))
     return lambda point: any(solid.contains(point) for solid in solids)
