@@ -103,8 +103,8 @@ def _prefetch(typing: Any, array: Any, item: Any) -> Any:
 def _gauss(rho):
     """exp(-rho / 2), relative error 1.5e-7, for rho from 0 to 88; beyond, anything."""
     # Adding 1.5 2^23 rounds to an integer and leaves it in the lowest bits.
-    shifted = rho * -LOG2E_HALF + ROUND
-    f = rho * -LOG2E_HALF - (shifted - ROUND)
+    shifted = L.fma(rho, -LOG2E_HALF, ROUND)
+    f = L.fma(rho, -LOG2E_HALF, ROUND - shifted)
     return L.times_power(f * (f * (f * (f * (f * E5 + E4) + E3) + E2) + E1) + f32(1.0), shifted)
 
 
@@ -409,6 +409,7 @@ def outline(first, last, key, table, view, tiles_x, tiles_y, spans, begins, coun
         top = math.sqrt(h * A / det)
         wide = math.sqrt(h * C / det)
         at = -B * wide / C
+        inverse = 1 / A
         low, high = y0 - 0.5 - slack + min(ey - top, -radius), y0 - 0.5 + slack + max(ey + top, radius)
         if high < 0 or low > height - 1:
             continue
@@ -422,8 +423,8 @@ def outline(first, last, key, table, view, tiles_x, tiles_y, spans, begins, coun
             if e1 <= e2:
                 s1 = math.sqrt(max(A * h - det * e1 * e1, 0.0))
                 s2 = math.sqrt(max(A * h - det * e2 * e2, 0.0))
-                right = ex + (wide if e1 <= at <= e2 else max(-B * e1 + s1, -B * e2 + s2) / A)
-                left = ex + (-wide if e1 <= -at <= e2 else min(-B * e1 - s1, -B * e2 - s2) / A)
+                right = ex + (wide if e1 <= at <= e2 else max(s1 - B * e1, s2 - B * e2) * inverse)
+                left = ex + (-wide if e1 <= -at <= e2 else min(-B * e1 - s1, -B * e2 - s2) * inverse)
             near = max(max(y1, -y2), 0.0)
             if near < radius:
                 chord = math.sqrt(radius * radius - near * near)
@@ -461,13 +462,20 @@ def scatter(first, last, order, base, begins, counts, spans, live, before, fill,
         _prefetch(spans, 2 * (base[soon // CHUNK] + begins[soon]))
         begin = base[i // CHUNK] + begins[i]
         for k in range(begin, begin + counts[i]):
-            if not every and before[spans[k, 0]] == before[spans[k, 0] + spans[k, 1]]:
-                continue
-            for t in range(u64(spans[k, 0]), u64(spans[k, 0] + spans[k, 1])):
-                if every or live[t]:
-                    if fill:
-                        entries[u64(cursor[t])] = i
-                    cursor[t] += 1
+            left, right = u64(spans[k, 0]), u64(spans[k, 0] + spans[k, 1])
+            if every and not fill:
+                # Only where the run begins and ends; summed up below.
+                cursor[left] += 1
+                cursor[right] -= 1
+            elif every or before[left] != before[right]:
+                for t in range(left, right):
+                    if every or live[t]:
+                        if fill:
+                            entries[u64(cursor[t])] = i
+                        cursor[t] += 1
+    if every and not fill:
+        for t in range(1, cursor.shape[0]):
+            cursor[t] += cursor[t - 1]
 
 
 @bare
@@ -475,13 +483,13 @@ def place_cursors(counts, starts):
     """Turn counts (chunk, tile) into the place of each chunk's first entry in each tile; fill ``starts`` (tiles +
     1)."""
     total = 0
-    for t in range(counts.shape[1]):
+    for t in range(starts.shape[0] - 1):
         starts[t] = total
         for c in range(counts.shape[0]):
             here = counts[c, t]
             counts[c, t] = total
             total += here
-    starts[counts.shape[1]] = total
+    starts[-1] = total
 
 
 @inlined

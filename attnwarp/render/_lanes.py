@@ -158,6 +158,17 @@ def most(typing: Any, x: Any, y: Any) -> Any:
 
 
 @intrinsic
+def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
+    """x y + z, rounded once where the machine can."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.v16f32"), args)
+
+    return lanes(lanes, lanes, lanes), codegen
+
+
+@intrinsic
 def times_power(typing: Any, x: Any, shifted: Any) -> Any:
     """x 2^k, where ``shifted`` is k + 1.5 2^23, so that k is its lowest bits; no range is checked."""
 

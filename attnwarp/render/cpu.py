@@ -70,7 +70,7 @@ class _Scene:
             inputs.kind == "2d", inputs.depth == "center", inputs.antialiased, inputs.harmonic,
         )  # fmt: skip
         self.view = view
-        self.table = np.empty((n, kernels.COLUMNS))
+        self.table = _aligned(2 * n * kernels.COLUMNS).view(np.float64).reshape(n, kernels.COLUMNS)
         self.features = np.empty((n, 3 + max(3, self.channels)), np.float32)
         key = np.empty(n, np.float32)
         self.tiles_x = -(-inputs.width // kernels.TILE)
@@ -116,7 +116,7 @@ class _Scene:
         """Lists of the nearest ``count`` splats in the tiles that are ``live``: (tiles + 1) starts, and entries."""
         size = max(256, -(-count // BIN_CHUNKS))
         pieces = _threads.ranges(count, size)
-        cursors = np.zeros((max(1, len(pieces)), self.tiles), np.int64)
+        cursors = np.zeros((max(1, len(pieces)), self.tiles + 1), np.int64)
         starts = np.zeros(self.tiles + 1, np.int64)
         entries = np.empty(0, np.int32)
         before = np.concatenate([[0], np.cumsum(live, dtype=np.int64)])
