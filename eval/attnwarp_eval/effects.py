@@ -516,6 +516,7 @@ class Cost:
         seconds: (plan, everything on) medians.
         variance: (plan, everything on), mean over pixels and channels, relative to the squared mean.
         rounds: pictures of each, taken in turn.
+        interval: 95 % of :attr:`at_equal_error`, by resampling the rounds; None where the plan has no noise.
     """
 
     size: int
@@ -523,6 +524,7 @@ class Cost:
     rounds: int
     seconds: tuple[float, float]
     variance: tuple[float, float]
+    interval: tuple[float, float] | None
 
     @property
     def faster(self) -> float:
@@ -535,7 +537,7 @@ class Cost:
         return self.faster * self.variance[1] / self.variance[0] if self.variance[0] > 0 else float("inf")
 
 
-def measure(scene: Scene, *, size: int = 48, spp: int = 16, rounds: int = 5, seed: int = 7000) -> Cost:
+def measure(scene: Scene, *, size: int = 48, spp: int = 16, rounds: int = 7, seed: int = 7000) -> Cost:
     """Render plan and everything on in turn and time both, after one unmeasured picture each."""
     import time
 
@@ -553,9 +555,28 @@ def measure(scene: Scene, *, size: int = 48, spp: int = 16, rounds: int = 5, see
                 seconds[k].append(time.perf_counter() - start)
                 pictures[k].append(picture)
     scale = float(np.mean(pictures[1])) ** 2
-    variance = tuple(float(np.var(np.array(p, np.float64), axis=0, ddof=1).mean()) / scale for p in pictures)
-    medians = tuple(float(np.median(s)) for s in seconds)
-    return Cost(size, spp, rounds, (medians[0], medians[1]), (variance[0], variance[1]))
+    taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
+    variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
+    medians = [float(np.median(s)) for s in seconds]
+    interval = None
+    if variance[0] > 0:
+        # Two rounds are paired in time, since what else the machine does slows both.
+        ratio = np.array(seconds[1]) / np.array(seconds[0])
+        # Squared distances between rounds: the variance of a resample is the mean over its pairs of different rounds.
+        apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in taken]
+        draws = np.random.default_rng(0).integers(0, rounds, (1000, rounds))
+        spread = [np.array([_between(a, d) for d in draws]) for a in apart]
+        known = (spread[0] > 0) & (spread[1] > 0)
+        values = np.median(ratio[draws], axis=1)[known] * spread[1][known] / spread[0][known]
+        low, high = np.percentile(values, [2.5, 97.5])
+        interval = (float(low), float(high))
+    return Cost(size, spp, rounds, (medians[0], medians[1]), (variance[0], variance[1]), interval)
+
+
+def _between(apart: Array, drawn: npt.NDArray[np.int64]) -> float:
+    """Mean of ``apart`` over the pairs of different rounds among those drawn."""
+    different = drawn[:, None] != drawn[None]
+    return float(apart[np.ix_(drawn, drawn)][different].mean()) if different.any() else 0.0
 
 
 def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
@@ -604,7 +625,11 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
             f"cost of a {cost['size']} x {cost['size']} picture, {cost['spp']} samples: "
             f"plan {cost['seconds'][0]:.3f} s, everything on {cost['seconds'][1]:.3f} s ({cost['faster']:.1f} times); "
             f"for the same noise "
-            + ("the plan needs one sample, since it has none" if equal is None else f"{equal:.1f} times")
+            + (
+                "the plan needs one sample, since it has none"
+                if equal is None
+                else f"{equal:.1f} times ({cost['interval'][0]:.1f} to {cost['interval'][1]:.1f})"
+            )
         )
 
 
