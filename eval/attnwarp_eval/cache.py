@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.content import digest
+from attnwarp_eval.errors import InputError
 
 
 def cache_dir() -> Path:
@@ -60,7 +61,63 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
         with os.fdopen(handle, "wb") as file:
             np.savez(file, **arrays)
         temporary.replace(folder / f"{key}.npz")
+        trim(limit_bytes())
     except OSError:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+DEFAULT_LIMIT_GB = 10.0
+"""A study of all scenes at 512 px keeps about 1 GB."""
+
+
+def limit_bytes() -> int:
+    """How large the folder may grow: ``$ATTNWARP_CACHE_GB``, else :data:`DEFAULT_LIMIT_GB`.
+
+    Raises:
+        InputError: the variable is not a number of gigabytes.
+    """
+    said = os.environ.get("ATTNWARP_CACHE_GB", "")
+    try:
+        limit = float(said) if said else DEFAULT_LIMIT_GB
+    except ValueError:
+        limit = -1.0
+    if not limit >= 0:
+        raise InputError(f"ATTNWARP_CACHE_GB: got {said!r}, expected a number of gigabytes such as 10")
+    return int(limit * 1e9)
+
+
+def _files() -> list[tuple[Path, os.stat_result]]:
+    """Every stored file with its state; one that another process removes meanwhile is left out."""
+    found = []
+    for path in cache_dir().glob("*/*.npz"):
+        with contextlib.suppress(OSError):
+            found.append((path, path.stat()))
+    return found
+
+
+def usage() -> dict[str, tuple[int, int]]:
+    """Files and bytes by kind."""
+    table: dict[str, tuple[int, int]] = {}
+    for path, state in _files():
+        count, size = table.get(path.parent.name, (0, 0))
+        table[path.parent.name] = (count + 1, size + state.st_size)
+    return dict(sorted(table.items()))
+
+
+def trim(limit: int) -> int:
+    """Remove the files written longest ago until at most ``limit`` bytes are left; how many bytes went.
+
+    Safe beside other processes: a reader that has a file open keeps it, and one that comes later computes it again.
+    """
+    files = sorted(_files(), key=lambda item: item[1].st_mtime)
+    excess = sum(state.st_size for _, state in files) - limit
+    removed = 0
+    for path, state in files:
+        if removed >= excess:
+            break
+        with contextlib.suppress(OSError):
+            path.unlink()
+            removed += state.st_size
+    return removed

@@ -29,6 +29,8 @@ scenes_app = typer.Typer(
     help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
 )
 app.add_typer(scenes_app, name="scenes")
+cache_app = typer.Typer(help="Derived files (meshes, true pictures, splats), kept to save time.", no_args_is_help=True)
+app.add_typer(cache_app, name="cache")
 
 
 def fail(message: str, code: int = USAGE) -> typer.Exit:
@@ -317,6 +319,30 @@ def effects(
     typer.echo("\n".join(lines))
     if proof is not None and proof.verdict != "certified":
         raise fail(f"{loaded.name}: the plan is not certified: {proof.verdict}", TOO_LITTLE)
+
+
+@cache_app.command()
+def info() -> None:
+    """Where the derived files lie, how many, how large."""
+    from attnwarp_eval import cache
+
+    with clear_errors():
+        typer.echo(f"{cache.cache_dir()} (limit {cache.limit_bytes() / 1e9:g} GB, ATTNWARP_CACHE_GB changes it)")
+        table = cache.usage()
+    for kind, (count, size) in table.items():
+        typer.echo(f"{kind:12} {count:6} files {size / 1e6:10.1f} MB")
+    typer.echo(
+        f"{'all':12} {sum(c for c, _ in table.values()):6} files {sum(s for _, s in table.values()) / 1e6:10.1f} MB"
+    )
+
+
+@cache_app.command()
+def clear() -> None:
+    """Remove them all; everything is computed again when it is needed."""
+    from attnwarp_eval import cache
+
+    with clear_errors():
+        typer.echo(f"{cache.cache_dir()}: {cache.trim(0) / 1e6:.1f} MB removed")
 
 
 @app.command()

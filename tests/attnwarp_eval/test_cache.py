@@ -1,0 +1,64 @@
+"""Oracles: the file system, NumPy's own reader, two real processes."""
+
+import multiprocessing
+import os
+
+import numpy as np
+import pytest
+
+from attnwarp_eval import cache
+from attnwarp_eval.errors import InputError
+
+
+def test_arrays_read_back_bit_for_bit_and_a_damaged_file_is_no_file(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    x = np.random.default_rng(0).normal(size=(7, 3))
+    cache.write_arrays("kind", "key", {"x": x})
+    assert np.array_equal(np.load(tmp_path / "kind" / "key.npz")["x"], x)
+    assert np.array_equal(cache.read_arrays("kind", "key")["x"], x)
+    assert cache.read_arrays("kind", "other") is None
+    (tmp_path / "kind" / "key.npz").write_bytes(b"PK half a file")
+    assert cache.read_arrays("kind", "key") is None
+
+
+def _write(folder, value):
+    os.environ["ATTNWARP_CACHE"] = folder
+    for _ in range(30):
+        cache.write_arrays("kind", "key", {"x": np.full(20_000, value)})
+
+
+def test_two_processes_that_write_at_once_leave_one_whole_file(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write, args=(str(tmp_path), value)) for value in (1.0, 2.0)]
+    for writer in writers:
+        writer.start()
+    while any(writer.is_alive() for writer in writers):
+        found = cache.read_arrays("kind", "key")
+        assert found is None or len(set(found["x"])) == 1
+    for writer in writers:
+        writer.join()
+        assert writer.exitcode == 0
+    assert [p.name for p in (tmp_path / "kind").iterdir()] == ["key.npz"]
+
+
+def test_the_oldest_files_go_when_the_folder_is_over_its_limit(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    for age, key in enumerate(("new", "middle", "old")):
+        cache.write_arrays("kind", key, {"x": np.zeros(1000)})
+        then = 1_000_000_000 - age
+        os.utime(tmp_path / "kind" / f"{key}.npz", (then, then))
+    size = (tmp_path / "kind" / "new.npz").stat().st_size
+    assert cache.usage() == {"kind": (3, 3 * size)}
+    assert cache.trim(2 * size) == size
+    assert {p.stem for p in (tmp_path / "kind").glob("*.npz")} == {"new", "middle"}
+    # A limit below one file still keeps nothing half-written: the write itself succeeds, then everything goes.
+    monkeypatch.setenv("ATTNWARP_CACHE_GB", "0")
+    cache.write_arrays("kind", "last", {"x": np.zeros(10)})
+    assert cache.usage() == {}
+
+
+def test_a_limit_that_is_no_number_is_refused(monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE_GB", "ten")
+    with pytest.raises(InputError, match="got 'ten', expected a number of gigabytes"):
+        cache.limit_bytes()
