@@ -1,9 +1,10 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """The numba kernels of the CPU backend; :mod:`attnwarp.render.cpu` calls them, and says how they fit together.
 
-Written so that LLVM vectorises them: the innermost loop runs over the 64 pixels of a tile, holds no branch and no
-call, and touches one flat buffer at constant offsets, so that no alias check is needed. exp is a polynomial, since
-LLVM has no vector exp here. Every sum that crosses tiles is formed in a fixed order, so the bits never depend on the
+The forward pass is written in vectors of 16 pixels (``_lanes.py``) with its sums in registers. The backward pass is
+written so that LLVM vectorises it: the innermost loop runs over the 64 pixels of a tile, holds no branch and no call,
+and touches one flat buffer at constant offsets, so that no alias check is needed. exp is a polynomial, since LLVM has
+no vector exp here. Every sum that crosses tiles is formed in a fixed order, so the bits never depend on the
 number of threads. No kernel starts threads: they release the GIL and are handed ranges of work.
 """
 

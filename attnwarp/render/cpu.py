@@ -2,11 +2,10 @@
 
 1. ``project``: each splat's outline, depth and colour as seen by the camera, in float64.
 2. ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back.
-3. ``bin_tiles``: the splats of each tile, in that order; exact outlines, no bounding circles.
-4. ``forward``: composite tile by tile until every pixel of it is opaque.
+3. ``outline`` and ``scatter``: the splats of each tile, in that order; exact outlines, no bounding circles.
+4. ``forward``: composite tile by tile, in squares of 4 x 4 pixels, until every pixel is opaque.
 5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
-rows
-   of each splat, and ``project_backward`` takes them to the parameters and the pose.
+   rows of each splat, and ``project_backward`` takes them to the parameters and the pose.
 
 Threads follow ``torch.set_num_threads``; the result has the same bits for any number of them.
 """
