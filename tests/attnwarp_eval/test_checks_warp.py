@@ -193,7 +193,9 @@ def test_every_figure_is_registered_and_named_whatever_stands_behind_it():
             np.ones((2, 2)), np.ones((2, 2)), normal=np.ones((2, 2, 3)), true_normal=np.ones((2, 2, 3))
         )
     )
-    assert {".".join(name.split(".")[:2]) for name in figures} == set(METRICS)
+    # Calibration and fits have figures of their own, which no check gives.
+    registered = {name for name in METRICS if name.split(".")[0] in ("warp", "occlusion", "depth")}
+    assert {".".join(name.split(".")[:2]) for name in figures} == registered
     for name, value in checks.at_size(figures, 64).items():
         assert name.endswith(".64")
         spec = metric(name)
