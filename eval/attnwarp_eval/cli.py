@@ -209,11 +209,17 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
 @scenes_app.command("list")
 def list_() -> None:
     """The scenes that can be named."""
+    from attnwarp_eval.errors import InputError
     from attnwarp_eval.scene import list_scenes, load_scene
 
-    with clear_errors():
-        for name in list_scenes():
+    broken = []
+    for name in list_scenes():
+        try:
             typer.echo(f"{name:12} {load_scene(name).title}")
+        except InputError as error:
+            broken.append(str(error))
+    if broken:
+        raise fail("; ".join(broken))
 
 
 @scenes_app.command()

@@ -165,7 +165,7 @@ LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discrimina
 class ViewSpec(Spec):
     """One camera on the orbit; what it leaves out comes from ``cameras``."""
 
-    name: str | None = Field(None, min_length=1)
+    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")  # it becomes part of file names
     yaw: float
     height: float
     radius: Positive | None = None

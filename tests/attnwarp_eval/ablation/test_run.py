@@ -242,3 +242,22 @@ def test_help_imports_nothing_heavy():
     loaded = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in listed.stderr.splitlines() if "|" in line}
     assert "typer" in loaded
     assert not loaded & {"torch", "numpy", "open3d", "mitsuba", "numba", "scipy", "matplotlib", "pyvista", "cv2"}
+
+
+def test_one_broken_scene_does_not_hide_the_others(tmp_path):
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "aaa.yaml").write_text("nam: x\n")
+    done = call(tmp_path, "scenes", "list")
+    assert done.returncode == 2
+    assert "bear " in done.stdout
+    assert "aaa.yaml" in done.stderr
+
+
+def test_a_view_whose_name_would_leave_the_folder_is_refused(tmp_path):
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    text = shipped.read_text().replace("{yaw: 10, height: 1.9}", "{name: ../../evil, yaw: 10, height: 1.9}")
+    (tmp_path / "evil.yaml").write_text(text)
+    done = call(tmp_path, "scenes", "render", "evil.yaml", "--out", "out")
+    assert done.returncode == 2
+    assert "../../evil" in done.stderr
+    assert not (tmp_path / "out").exists()
