@@ -60,12 +60,30 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
         temporary = Path(name)
         with os.fdopen(handle, "wb") as file:
             np.savez(file, **arrays)
+        size = temporary.stat().st_size
         temporary.replace(folder / f"{key}.npz")
-        trim(limit_bytes())
+        _keep_within_limit(size)
     except OSError:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+_unseen: float = float("inf")
+"""Bytes that this process has written since it last looked at the whole folder; it looks at its first write."""
+
+
+def _keep_within_limit(written: int) -> None:
+    """Trim the folder, but look at all of it only after every hundredth of the limit.
+
+    To look costs a call for each file: done at every write, keeping thousands of small meshes took longer than making them.
+    """
+    global _unseen
+    _unseen += written
+    limit = limit_bytes()
+    if _unseen > limit / 100:
+        _unseen = 0.0
+        trim(limit)
 
 
 DEFAULT_LIMIT_GB = 10.0

@@ -62,3 +62,26 @@ def test_a_limit_that_is_no_number_is_refused(monkeypatch):
     monkeypatch.setenv("ATTNWARP_CACHE_GB", "ten")
     with pytest.raises(InputError, match="got 'ten', expected a number of gigabytes"):
         cache.limit_bytes()
+
+
+def test_many_small_writes_do_not_each_look_at_every_file_and_stay_within_a_hundredth_of_the_limit(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    monkeypatch.setenv("ATTNWARP_CACHE_GB", "0.001")
+    looks = 0
+    trim = cache.trim
+
+    def counted(limit):
+        nonlocal looks
+        looks += 1
+        return trim(limit)
+
+    monkeypatch.setattr(cache, "trim", counted)
+    sizes = []
+    for k in range(600):
+        cache.write_arrays("kind", f"{k:04}", {"x": np.full(400, float(k))})
+        sizes.append(sum(path.stat().st_size for path in (tmp_path / "kind").iterdir()))
+    assert all((tmp_path / "kind" / f"{k:04}.npz").exists() for k in range(590, 600))
+    assert max(sizes) > 0.9e6 and max(sizes) <= 1.01e6 + 4000
+    assert looks < 250
