@@ -77,17 +77,18 @@ def kind_of(name: str) -> Kind:
         return _SCHEMES[scheme]
     known = [*BUNDLED, *_SCHEMES]
     close = difflib.get_close_matches((scheme if colon else name).lower(), known, n=1, cutoff=0.5)
-    guess = f"; did you mean {_pattern(close[0])!r}?" if close else ""
+    guess = f"; did you mean {_pattern(close[0])!r}?" if close else "."
     raise InputError(f"encoder {name!r}: unknown{guess} Known are {', '.join([*BUNDLED, *REAL])}")
 
 
-def load_encoder(name: str, kind: Kind | None = None) -> Any:
+def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") -> Any:
     """Load an encoder by name.
 
     Args:
         name: a bundled one (``clip-small``, ``dino-small``, ``perceptual-small``), or ``clip:FOLDER``,
             ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
         kind: what is needed; an encoder of another kind is refused before it is loaded.
+        device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.
 
     Returns:
         A :class:`TextImageEncoder` ("clip"), a :class:`TokenEncoder` ("dino") or a :class:`PerceptualDistance`
@@ -112,10 +113,11 @@ def load_encoder(name: str, kind: Kind | None = None) -> Any:
     if scheme == "lpips":
         from attnwarp_eval.encoders.lpips import load_lpips
 
-        return load_lpips(path, name=name)
+        return load_lpips(path, name=name, device=device)
     from attnwarp_eval.encoders import pretrained
 
-    return pretrained.load_clip(path, name=name) if scheme == "clip" else pretrained.load_dinov2(path, name=name)
+    load = pretrained.load_clip if scheme == "clip" else pretrained.load_dinov2
+    return load(path, name=name, device=device)
 
 
 def _pattern(name: str) -> str:
