@@ -18,8 +18,8 @@ class Metric:
     Attributes:
         name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
-        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "share" (of 1), "ratio" or "pixels"
-            (a count).
+        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "share" (of 1), "ratio", "cosine" (of
+            embeddings, -1 to 1), "pixels" or "views" (counts).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -97,6 +97,13 @@ _SPECS = (
     Metric("depth.coverage", "share", "higher", 1e-4, 0, "pixels with a surface that have a depth"),
     Metric("depth.pixels", "pixels", "none", 0, 0, "pixels with a surface"),
     Metric("depth.phantom", "pixels", "none", 0, 0, "pixels with a depth and no surface"),
+    # Float32 networks on other processors agree to 1e-6; the rest of atol is for pictures that differ by rounding.
+    Metric("embedding.clip_similarity", "cosine", "higher", 1e-3, 0, "CLIP: render against the target prompt"),
+    Metric("embedding.clip_directional", "cosine", "higher", 2e-3, 0, "CLIP: change of the view against the prompt's"),
+    Metric("embedding.clip_image", "cosine", "higher", 1e-3, 0, "CLIP: render against the edited source view"),
+    Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
+    Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
+    Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
 )
 
 METRICS = Registry({metric.name: metric for metric in _SPECS})
