@@ -174,9 +174,11 @@ def measure(
     views = {figure: _views(figure, folders) for figure in wanted}
     _check_sizes(folders, views)
     _compare_names(folders, views, done)
+    source = None
     if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
-        _header(inputs.source_edit, whole=True)  # before the long part
-    _rows(inputs, views, loaded, _gather(inputs, folders, views, loaded, progress), done)
+        source = read_picture(inputs.source_edit, inputs.background)  # before the long part
+    kept = _gather(inputs, folders, views, loaded, progress)
+    _rows(inputs, source, views, loaded, kept, done)
     return done
 
 
@@ -269,11 +271,8 @@ def _possible(
         elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
             done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
         elif not _views(figure, folders):
-            a, b = (name for name in figure.needs if name in folders)
-            done.missing[figure.title] = (
-                f"no picture of {_option(b)} has the name of one of {_option(a)} "
-                f"({_some(folders[b])} against {_some(folders[a])})"
-            )
+            used = " and ".join(f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders))
+            done.missing[figure.title] = f"no name stands in all of {used}"
         else:
             wanted.append(figure)
     return wanted
@@ -304,10 +303,14 @@ def _load(
 
 
 def _views(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+    first, *others = _groups(figure, folders)
+    return [name for name in folders[first] if all(name in folders[other] for other in others)]
+
+
+def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+    """The folders that a figure is computed from."""
     used = [name for name in figure.needs if name in folders]
-    if figure is _EDIT and "masks" in folders:
-        used.append("masks")
-    return [name for name in folders[used[0]] if all(name in folders[other] for other in used[1:])]
+    return [*used, "masks"] if figure is _EDIT and "masks" in folders else used
 
 
 def _compare_names(
@@ -393,8 +396,9 @@ def _gather(
 
 
 def _rows(
-    inputs: Inputs, views: Mapping[_Figure, Sequence[str]], loaded: Mapping[Kind, Any], kept: _Gathered, done: Measured
-) -> None:
+    inputs: Inputs, source: Picture | None, views: Mapping[_Figure, Sequence[str]], loaded: Mapping[Kind, Any],
+    kept: _Gathered, done: Measured,
+) -> None:  # fmt: skip
     """The figures of what was gathered, in the order of the paper's table."""
     texts = {name: _text(loaded["clip"], getattr(inputs, name), _option(name), done) for name in _texts_needed(views)}
     for figure, names in views.items():
@@ -412,9 +416,9 @@ def _rows(
             found = metrics.directional_similarity(before, after, texts["source_prompt"], texts["prompt"])
         else:
             kind: Kind = "dino" if figure is _DINO else "clip"
-            assert inputs.source_edit is not None  # the figure needs it, see _possible
-            source = loaded[kind].images([read_picture(inputs.source_edit, inputs.background)])
-            found = metrics.image_similarity(source, _stack(kept.dino if figure is _DINO else kept.clip, names))
+            assert source is not None  # the figure needs it, see _possible
+            edit = loaded[kind].images([source])
+            found = metrics.image_similarity(edit, _stack(kept.dino if figure is _DINO else kept.clip, names))
         values = dict(zip(names, map(float, found.values), strict=True))
         done.rows.append(Row(figure.key, figure.title, found.mean, values, figure.encoder))
 

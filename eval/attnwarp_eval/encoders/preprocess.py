@@ -88,11 +88,15 @@ def resize(image: npt.NDArray[np.float32], size: tuple[int, int], resample: int 
 
     if image.shape[:2] == size:
         return image
-    channels = [
-        np.asarray(Image.fromarray(np.ascontiguousarray(image[..., c])).resize((size[1], size[0]), resample))
-        for c in range(3)
-    ]
-    return np.clip(np.stack(channels, axis=2), 0, 1)
+    channels = []
+    for c in range(3):
+        channel = np.ascontiguousarray(image[..., c])
+        # One axis, then the other, as in 8 bits, where the overshoot is cut off after each. Which axis comes first is
+        # Pillow's affair where a picture is squeezed to another shape; the cut-off values differ there, and no others.
+        for shape in ((size[1], image.shape[0]), (size[1], size[0])):
+            channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
+        channels.append(channel)
+    return np.stack(channels, axis=2)
 
 
 def center_crop(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
