@@ -145,16 +145,19 @@ def _sheet(source: Any, target: Any, exact: Any, flow: Any) -> Any:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Markdown: mean DeltaE of the edited object, exact and along the flow, and the flow's own errors."""
+    """Markdown: mean DeltaE of the edited object, exact, along the flow, and along it at the exact figure's pixels; and the
+    flow's own errors in the whole picture.
+    """
     shown = ("truth", "one answer", f"{SLIP} px slip", "two answers")
-    head = ["scene", "yaw", "object px", *(f"{kind}: exact, flow" for kind in shown)]
+    head = ["scene", "yaw", "object px", *shown]
     head += ["EPE median, p95 (px)", "check passes", "not in source"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for row in rows:
         cells = [row.scene, f"{row.yaw:g}", f"{row.figures['truth']['consistency.pixels']:g}"]
         for kind in PAIRS:
             found = row.figures[kind]
-            cells.append(f"{found['consistency.delta_e']:.1f}, {found['consistency.flow_delta_e']:.1f}")
+            names = ("delta_e", "flow_delta_e", "flow_same_delta_e")
+            cells.append(" / ".join(f"{found[f'consistency.{name}']:.1f}" for name in names))
         cells.append(f"{row.flow['consistency.flow_epe_median']:.2f}, {row.flow['consistency.flow_epe_p95']:.1f}")
         cells += [f"{row.flow['consistency.flow_recall']:.0%}", f"{row.flow['consistency.flow_false']:.0%}"]
         lines.append("| " + " | ".join(cells) + " |")
