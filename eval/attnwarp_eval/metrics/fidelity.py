@@ -10,7 +10,7 @@ import numpy as np
 
 from attnwarp_eval.arrays import Array, Mask, share
 from attnwarp_eval.metrics._pictures import picture, region
-from attnwarp_eval.metrics.image import edit_psnr, ms_ssim, psnr, ssim
+from attnwarp_eval.metrics.image import edit_psnr, ms_ssim, mse, psnr_of_mse, ssim
 
 Distance = Callable[[Array, Array], float]
 """A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""
@@ -22,9 +22,10 @@ def fidelity(
     """The ``fidelity.*`` figures of an edited view against the truth of the edit.
 
     Whole, ``.inside`` the edited object and ``.outside`` of it: a method that paints the object well and the rest of
-    the picture too shows it in the last alone. ``preserved_*`` is outside too, but against the picture before the edit:
-    what the truth itself gets there is less than perfect where an edited object throws another light, so compare it with
-    ``preserved_*`` of the truth.
+    the picture too shows it in the last alone. Pixels on the object's outline, one on each side, count in neither: the
+    mask is of pixel centres and a pixel shows the mean of its area, so the truth itself changes there. ``preserved_*``
+    is outside too, but against the picture before the edit: what the truth gets there is the best to be had, less than
+    perfect where an edited object throws another light, so put ``preserved_*`` of the truth beside it.
 
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
@@ -36,12 +37,12 @@ def fidelity(
         distance: a perceptual distance; without it there is none. Inside, the rest of the picture is made equal to the
             truth first, and the distance divided by the share of the picture that is inside; outside, the other way round.
             For a distance that is a mean over places it then is the mean over those of the region, apart from what
-            spills over the region's rim.
+            spills over the region's border.
 
     Returns:
-        ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and ``.outside``, ``ms_ssim`` whole, the
+        ``mse``, ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and ``.outside``, ``ms_ssim`` whole, the
         ``preserved_*`` figures, and the counts of pixels. PSNR divides by the region's pixels; SSIM counts windows
-        wholly inside the region, so windows on the rim count in neither. NaN where a region is empty.
+        wholly inside the region. NaN where a region is empty, such as the inside of an object two pixels wide.
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1], pictures of different sizes, a mask that is not bool.
@@ -49,21 +50,26 @@ def fidelity(
     image = picture(image_srgb, "image_srgb")
     truth = picture(truth_srgb, "truth_srgb", shape=image.shape)
     inside = region(mask, image.shape)
-    parts = {"": np.ones_like(inside), ".inside": inside, ".outside": ~inside}
+    parts = {"": np.ones_like(inside), ".inside": _shrunk(inside), ".outside": _shrunk(~inside)}
     figures: dict[str, float] = {}
     for suffix, part in parts.items():
-        figures[f"fidelity.psnr{suffix}"] = psnr(image, truth, part)
+        error = mse(image, truth, part)
+        figures[f"fidelity.mse{suffix}"] = error
+        figures[f"fidelity.psnr{suffix}"] = psnr_of_mse(error)
         figures[f"fidelity.ssim{suffix}"] = ssim(image, truth, part)
         figures[f"fidelity.pixels{suffix}"] = int(part.sum())
         if distance is not None:
             figures[f"fidelity.distance{suffix}"] = _distance(distance, image, truth, part)
     figures["fidelity.ms_ssim"] = ms_ssim(image, truth)
     if original_srgb is not None:
+        outside = parts[".outside"]
         original = picture(original_srgb, "original_srgb", shape=image.shape)
-        figures["fidelity.preserved_psnr"] = psnr(image, original, ~inside)
-        figures["fidelity.preserved_ssim"] = ssim(image, original, ~inside)
+        error = mse(image, original, outside)
+        figures["fidelity.preserved_mse"] = error
+        figures["fidelity.preserved_psnr"] = psnr_of_mse(error)
+        figures["fidelity.preserved_ssim"] = ssim(image, original, outside)
         if distance is not None:
-            figures["fidelity.preserved_distance"] = _distance(distance, image, original, ~inside)
+            figures["fidelity.preserved_distance"] = _distance(distance, image, original, outside)
     return figures
 
 
@@ -95,6 +101,14 @@ def nearest_answer(
     found = {name: edit_psnr(images, truth, masks).pooled for name, truth in answers.items()}
     defined = {name: value for name, value in found.items() if not math.isnan(value)}
     return (max(defined, key=defined.__getitem__) if defined else None), found
+
+
+def _shrunk(part: Mask) -> Mask:
+    """Without the pixels that have one of the eight around them outside; the picture's border is no outline."""
+    from scipy.ndimage import binary_erosion
+
+    kept: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)
+    return kept
 
 
 def _distance(distance: Distance, image: Array, truth: Array, part: Mask) -> float:

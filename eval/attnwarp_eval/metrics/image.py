@@ -48,7 +48,7 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
     The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to 0, gains
     -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see :func:`edit_psnr`.
     """
-    return _psnr(mse(image, target, mask))
+    return psnr_of_mse(mse(image, target, mask))
 
 
 def ssim(image: Any, target: Any, mask: Any = None) -> float:
@@ -127,9 +127,9 @@ def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str
     error, linear = _mse(first, second, inside), _mse(to_linear(first), to_linear(second), inside)
     return {
         "image.mse": error,
-        "image.psnr": _psnr(error),
+        "image.psnr": psnr_of_mse(error),
         "image.mse_linear": linear,
-        "image.psnr_linear": _psnr(linear),
+        "image.psnr_linear": psnr_of_mse(linear),
         "image.ssim": ssim(first, second, inside),
         "image.ms_ssim": ms_ssim(first, second, inside),
         "image.pixels": int(inside.sum()),
@@ -154,7 +154,7 @@ class EditPsnr:
     @property
     def pooled(self) -> float:
         """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of them are equal."""
-        return _psnr(mean(np.array([error for error in self.mse if not math.isnan(error)])))
+        return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
 
     @property
     def mean_finite(self) -> float:
@@ -172,7 +172,7 @@ class EditPsnr:
         return sum(math.isnan(value) for value in self.psnr)
 
     def figures(self) -> dict[str, float]:
-        """The ``edit.*`` figures; each view's own as ``edit.psnr.NAME``."""
+        """The ``edit.*`` figures; each view's own as ``edit.psnr.NAME`` and ``edit.mse.NAME``."""
         return {
             "edit.psnr_pooled": self.pooled,
             "edit.psnr_mean": self.mean_finite,
@@ -180,6 +180,7 @@ class EditPsnr:
             "edit.views_identical": self.identical,
             "edit.views_undefined": self.undefined,
             **{f"edit.psnr.{view}": value for view, value in zip(self.views, self.psnr, strict=True)},
+            **{f"edit.mse.{view}": value for view, value in zip(self.views, self.mse, strict=True)},
         }
 
 
@@ -206,17 +207,18 @@ def edit_psnr(
     for view, image in edited.items():
         mask = None if masks is None else masks[view]
         errors.append(_mse(*pair(image, rendered[view], mask, (f"edited[{view!r}]", f"rendered[{view!r}]"))))
-    return EditPsnr(tuple(edited), tuple(errors), tuple(_psnr(error) for error in errors))
+    return EditPsnr(tuple(edited), tuple(errors), tuple(psnr_of_mse(error) for error in errors))
 
 
 def _mse(image: Array, target: Array, inside: Mask) -> float:
     return mean((image[inside] - target[inside]) ** 2)
 
 
-def _psnr(error: float) -> float:
-    from attnwarp.losses import psnr_of_mse
+def psnr_of_mse(error: float) -> float:
+    """:func:`attnwarp.losses.psnr_of_mse`, +inf for 0, and NaN for NaN. To average views, average the error."""
+    from attnwarp import losses
 
-    return math.nan if math.isnan(error) else psnr_of_mse(error)
+    return math.nan if math.isnan(error) else losses.psnr_of_mse(error)
 
 
 def _terms(image: Array, target: Array) -> tuple[Array, Array]:
