@@ -422,6 +422,8 @@ def metrics(
         typer.echo(userimages_report.to_json(measured), nl=False)
     else:
         Console().print(userimages_report.table(measured))
+        for kind, about in measured.encoders.items():
+            typer.echo(f"{kind}: {about.name}, weights {about.weights_sha256[:12]}")
     for what, why in measured.missing.items():
         typer.echo(f"not computed: {what}: {why}", err=True)
     for line in (*measured.unpaired, *measured.notes):

@@ -191,7 +191,7 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
     if not folder.is_dir():
         raise InputError(f"{option}: {folder} is no folder; name the folder that holds the pictures")
     found: dict[str, Path] = {}
-    for path in sorted(folder.iterdir(), key=lambda p: _natural(p.name)):
+    for path in sorted(folder.iterdir(), key=lambda p: natural(p.name)):
         if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
         if path.stem in found:
@@ -452,7 +452,7 @@ def _stack(rows: Mapping[str, Embedding], names: Sequence[str]) -> Embedding:
     return np.stack([rows[name] for name in names])
 
 
-def _natural(name: str) -> list[tuple[int, int, str]]:
+def natural(name: str) -> list[tuple[int, int, str]]:
     """So that view2 comes before view10."""
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", name) if p]
 

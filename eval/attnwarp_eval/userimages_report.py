@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from attnwarp_eval.ablation.store import write_atomic
 from attnwarp_eval.metric import Metric, metric
-from attnwarp_eval.userimages import Measured, Row
+from attnwarp_eval.userimages import Measured, Row, natural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -90,7 +90,7 @@ def to_markdown(measured: Measured) -> str:
         lines += ["", "## Encoders", "", *_grid(["name", "kind", "source", "SHA-256 of the weights", "pictures"], rows)]
     shown = [row for row in measured.rows if row.key != "edit.psnr_pooled"]
     if shown:
-        names = list(dict.fromkeys(name for row in shown for name in row.views))
+        names = sorted({name for row in shown for name in row.views}, key=natural)
         rows = [[name, *(_value(row, row.views[name]) if name in row.views else "" for row in shown)] for name in names]
         heads = [row.title.removesuffix(", mean of the views") for row in shown]
         lines += ["", "## View by view", "", *_grid(["view", *heads], rows)]
@@ -98,13 +98,13 @@ def to_markdown(measured: Measured) -> str:
 
 
 def table(measured: Measured) -> Table:
-    """The figures, for a terminal."""
+    """The figures, for a terminal; encoders by their kind, since the names of real ones are long."""
     from rich.table import Table
     from rich.text import Text
 
-    grid = Table("figure", "value", "views", "undefined", "better", "encoder", title="Metrics of the edited scene")
+    grid = Table("figure", "value", "views", "undefined", "better", title="Metrics of the edited scene")
     for cells in _overview(measured):
-        grid.add_row(*map(Text, cells))
+        grid.add_row(*map(Text, cells[:5]))
     return grid
 
 

@@ -24,7 +24,7 @@ from attnwarp_eval.encoders.preprocess import Preprocessing, read_json, read_pre
 from attnwarp_eval.errors import InputError
 
 BATCH = 8
-"""Pictures or texts that go through a network together: 8 of 336 x 336 through ViT-L take 0.6 GB beside the weights."""
+"""Pictures that go through a network together: enough to keep it busy, few enough to fit beside ViT-L's weights."""
 
 _ASK = {
     "clip": "openai/clip-vit-large-patch14-336 (the paper's) or openai/clip-vit-base-patch32 (small)",
@@ -341,7 +341,7 @@ def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> 
 
 
 def _pooled(output: Any) -> torch.Tensor:
-    """Transformers 5 gives an object where 4 gave the tensor itself."""
+    """Versions of transformers differ: an object with a pooled part, or that part itself."""
     return output if isinstance(output, torch.Tensor) else output.pooler_output
 
 
