@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 
 def shape(value: torch.Tensor | np.ndarray, expected: Sequence[int | str | None], name: str) -> None:
@@ -24,7 +27,8 @@ def shape(value: torch.Tensor | np.ndarray, expected: Sequence[int | str | None]
 
 def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
     """Raise ValueError naming the first row of ``value`` that holds a NaN or an infinity."""
-    array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    # torch is not imported for the question: what checks arrays alone should be there at once.
+    array = value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
     bad = ~np.isfinite(array)
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])

@@ -65,6 +65,26 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`."""
+    _windowed(image, target)
+    result: Tensor = _Ssim.apply(image, target)
+    return result
+
+
+def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and contrast and structure.
+
+    Returns:
+        Two (H - 10, W - 10, C) tensors without gradients.
+
+    Raises:
+        ValueError: as :func:`ssim`.
+    """
+    _windowed(image, target)
+    _, _, a1, a2, b1, b2 = _moments(image.detach(), target.detach())
+    return a1 / b1, a2 / b2
+
+
+def _windowed(image: Tensor, target: Tensor) -> None:
     _same(image, target)
     if image.ndim != 3:
         raise ValueError(f"image: got shape {tuple(image.shape)}, expected (H, W, C)")
@@ -72,8 +92,17 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
         raise ValueError(
             f"image: got {image.shape[1]} x {image.shape[0]} px; SSIM is undefined below {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
-    result: Tensor = _Ssim.apply(image, target)
-    return result
+
+
+def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """mu_x, mu_y and the a1, a2, b1, b2 of similarity = a1 a2 / (b1 b2), for each window."""
+    mu_x, mu_y = _blur(x), _blur(y)
+    var_x = _blur(x * x) - mu_x * mu_x
+    var_y = _blur(y * y) - mu_y * mu_y
+    cov = _blur(x * y) - mu_x * mu_y
+    a1, a2 = 2 * mu_x * mu_y + SSIM_C1, 2 * cov + SSIM_C2
+    b1, b2 = mu_x * mu_x + mu_y * mu_y + SSIM_C1, var_x + var_y + SSIM_C2
+    return mu_x, mu_y, a1, a2, b1, b2
 
 
 class _Ssim(torch.autograd.Function):
@@ -85,13 +114,7 @@ class _Ssim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        x, y = image.detach(), target.detach()
-        mu_x, mu_y = _blur(x), _blur(y)
-        var_x = _blur(x * x) - mu_x * mu_x
-        var_y = _blur(y * y) - mu_y * mu_y
-        cov = _blur(x * y) - mu_x * mu_y
-        a1, a2 = 2 * mu_x * mu_y + SSIM_C1, 2 * cov + SSIM_C2
-        b1, b2 = mu_x * mu_x + mu_y * mu_y + SSIM_C1, var_x + var_y + SSIM_C2
+        mu_x, mu_y, a1, a2, b1, b2 = _moments(image.detach(), target.detach())
         similarity = a1 * a2 / (b1 * b2)
         ctx.save_for_backward(image, target, mu_x, mu_y, a1, a2, b1, b2, similarity)
         return similarity

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+
     from attnwarp_eval.ablation.run import Plan, Summary
     from attnwarp_eval.ablation.store import Store
 
@@ -109,14 +112,6 @@ def _calibration_problems(store: Store) -> list[str]:
 def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
     """Run with a progress bar on a terminal, or a line a cell where there is none."""
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     from attnwarp_eval.ablation import run as runner
 
@@ -126,15 +121,7 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
         f"study [bold]{planned.study.name}[/bold]: {len(planned.cells)} cells{reused} -> {store.root}",
         highlight=False,
     )
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with _bar(console) as bar:
         task = bar.add_task("starting", total=len(planned.cells), completed=planned.reused)
         finished = planned.reused
 
@@ -150,6 +137,28 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
                 console.print(f"[{finished}/{len(planned.cells)}] {info['title']}{word}", markup=False, highlight=False)
 
         return runner.execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
+
+
+def _bar(console: Console) -> Progress:
+    """A progress bar; nothing where there is no terminal."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal)
 
 
 def _print_failures(summary: Summary) -> None:
@@ -359,6 +368,113 @@ def studies() -> None:
     for name in shipped_studies():
         loaded = load_study(name)
         typer.echo(f"{name:12} {loaded.title}")
+
+
+@app.command()
+def metrics(
+    renders: Annotated[Path | None, typer.Option(help="Folder: renders of the edited scene.")] = None,
+    edited: Annotated[Path | None, typer.Option(help="Folder: the edited pictures, named as the renders.")] = None,
+    originals: Annotated[Path | None, typer.Option(help="Folder: the views before the edit, named alike.")] = None,
+    source_edit: Annotated[Path | None, typer.Option(help="Picture: the edited source view.")] = None,
+    prompt: Annotated[str | None, typer.Option(help="What the edited scene should show.")] = None,
+    source_prompt: Annotated[str | None, typer.Option(help="What the scene showed before.")] = None,
+    clip: Annotated[
+        str | None, typer.Option(help="clip-small, clip:FOLDER or none; clip-small if left out.", metavar="NAME")
+    ] = None,
+    dino: Annotated[
+        str | None, typer.Option(help="dino-small, dinov2:FOLDER or none; dino-small if left out.", metavar="NAME")
+    ] = None,
+    perceptual: Annotated[
+        str | None,
+        typer.Option(
+            help="perceptual-small, lpips:FILE_OR_FOLDER or none; perceptual-small if left out.", metavar="NAME"
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None, typer.Option(help="Folder: masks named as the renders; white counts for Edit PSNR.")
+    ] = None,
+    background: Annotated[
+        str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
+    ] = "black",
+    device: Annotated[str, typer.Option(help="cpu or cuda, for real encoders.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json and metrics.md.")] = Path("runs/metrics"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print metrics.json instead of a table.")] = False,
+) -> None:
+    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures. What is left out is said, with the reason."""
+    from rich.console import Console
+
+    with clear_errors():
+        from attnwarp_eval import userimages, userimages_report
+
+        inputs = userimages.Inputs(
+            renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
+        )
+        names: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
+        console = Console(stderr=True)
+        with _bar(console) as bar:
+            task = bar.add_task("starting", total=None)
+            measured = userimages.measure(
+                inputs, names, device=device,
+                progress=lambda done, total, view: bar.update(task, completed=done, total=total, description=view),
+            )  # fmt: skip
+        paths = userimages_report.write(measured, out)
+    if as_json:
+        typer.echo(userimages_report.to_json(measured), nl=False)
+    else:
+        Console().print(userimages_report.table(measured))
+        for kind, about in measured.encoders.items():
+            typer.echo(f"{kind}: {about.name}, weights {about.weights_sha256[:12]}")
+    for what, why in measured.missing.items():
+        typer.echo(f"not computed: {what}: {why}", err=True)
+    for line in (*measured.unpaired, *measured.notes):
+        typer.echo(line, err=True)
+    for path in paths:
+        typer.echo(path, err=as_json)
+    if not measured.any_value:
+        raise fail("every figure is undefined on these pictures; see the notes above", TOO_LITTLE)
+
+
+def _color(text: str) -> tuple[float, float, float]:
+    from attnwarp_eval.errors import InputError
+
+    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text in named:
+        return named[text]
+    try:
+        r, g, b = (float(part) for part in text.split(","))
+    except ValueError:
+        r = g = b = -1.0
+    if not all(0 <= value <= 1 for value in (r, g, b)):
+        raise InputError(f"--background: got {text!r}, expected black, white or r,g,b in [0, 1] such as 0.2,0.5,1")
+    return r, g, b
+
+
+@app.command()
+def encoders(
+    name: Annotated[str | None, typer.Argument(help="Load this one and say what it is.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON.")] = False,
+) -> None:
+    """The encoders that metrics can use: what ships with the package, and what is read from a folder of yours."""
+    import json
+
+    with clear_errors():
+        from attnwarp_eval import encoders as known
+
+        if name is not None:
+            about = known.load_encoder(name).about.to_dict()
+            lines = [json.dumps(about, indent=2)] if as_json else [f"{key:15} {value}" for key, value in about.items()]
+        elif as_json:
+            rows = [
+                {"name": n, "kind": kind, "about": line, "bundled": n in known.BUNDLED}
+                for n, (kind, line) in (known.BUNDLED | known.REAL).items()
+            ]
+            lines = [json.dumps(rows, indent=2)]
+        else:
+            lines = ["ships with the package:"]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.BUNDLED.items()]
+            lines += ["read from a place of yours (docs/encoders.md says which files go there):"]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.REAL.items()]
+    typer.echo("\n".join(lines))
 
 
 def main() -> None:

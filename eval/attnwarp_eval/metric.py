@@ -18,8 +18,8 @@ class Metric:
     Attributes:
         name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
-        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "share" (of 1), "ratio" or "pixels"
-            (a count).
+        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "dE00" (CIEDE2000), "share" (of 1),
+            "ratio", "cosine" (of embeddings, -1 to 1), "pixels" or "views" (counts).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -45,6 +45,16 @@ class Registry(dict[str, Metric]):
             raise KeyError(key)
         return self[name]
 
+
+_DISAGREEMENT: tuple[tuple[str, str, Direction, float, float, str], ...] = (
+    ("mae_linear", "ratio", "lower", 1e-5, 1e-2, "mean absolute colour difference of two views in linear light"),
+    ("rmse_linear", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in linear light"),
+    ("rmse_srgb", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in sRGB"),
+    ("delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 between two views"),
+    ("delta_e_p95", "dE00", "lower", 1e-2, 1e-2, "95th percentile of CIEDE2000 between two views"),
+    ("share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
+    ("pixels", "pixels", "none", 0, 0, "pixels compared"),
+)
 
 _SPECS = (
     Metric(
@@ -97,6 +107,94 @@ _SPECS = (
     Metric("depth.coverage", "share", "higher", 1e-4, 0, "pixels with a surface that have a depth"),
     Metric("depth.pixels", "pixels", "none", 0, 0, "pixels with a surface"),
     Metric("depth.phantom", "pixels", "none", 0, 0, "pixels with a depth and no surface"),
+    # Float32 networks on other processors agree to 1e-6; the rest of atol is for pictures that differ by rounding.
+    Metric("embedding.clip_similarity", "cosine", "higher", 1e-3, 0, "CLIP: render against the target prompt"),
+    Metric("embedding.clip_directional", "cosine", "higher", 2e-3, 0, "CLIP: change of the view against the prompt's"),
+    Metric("embedding.clip_image", "cosine", "higher", 1e-3, 0, "CLIP: render against the edited source view"),
+    Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
+    Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
+    Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
+    # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/metrics.md.
+    Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values"),
+    Metric("image.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of sRGB values; infinite for equal pictures"),
+    Metric("image.mse_linear", "ratio", "lower", 1e-6, 1e-2, "mean squared error in linear light"),
+    Metric("image.psnr_linear", "dB", "higher", 1e-2, 1e-3, "PSNR in linear light; infinite for equal pictures"),
+    Metric("image.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of sRGB values (11 x 11, sigma 1.5, whole windows)"),
+    Metric("image.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM of sRGB values, five scales, from 176 px"),
+    Metric("image.pixels", "pixels", "none", 0, 0, "pixels compared"),
+    Metric("edit.psnr_pooled", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: PSNR of the mean MSE over the views"),
+    Metric("edit.psnr_mean", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: mean of the views' finite PSNRs"),
+    Metric("edit.psnr", "dB", "higher", 1e-2, 1e-3, "Edit PSNR of one view, whose name stands behind"),
+    Metric("edit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of one view, whose name stands behind"),
+    Metric("edit.views", "views", "none", 0, 0, "edited views that were compared"),
+    Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
+    Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
+    *(
+        Metric(f"consistency.{prefix}{name}", unit, direction, atol, rtol, f"{what}, {where}")
+        for prefix, where in (
+            ("", "at exact correspondences"),
+            ("flow_", "along optical flow"),
+            ("flow_same_", "along optical flow at the pixels of the exact figure"),
+        )
+        for name, unit, direction, atol, rtol, what in _DISAGREEMENT
+    ),
+    Metric("consistency.flow_gap_mae_linear", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_gap_rmse_srgb", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_gap_delta_e", "dE00", "zero", 1e-3, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_ratio_delta_e", "ratio", "none", 1e-3, 1e-2, "flow's figure over the exact one"),
+    Metric("consistency.flow_epe_median", "px", "lower", 1e-2, 1e-2, "median endpoint error of the optical flow"),
+    Metric(
+        "consistency.flow_epe_p95", "px", "lower", 1e-1, 1e-2, "95th percentile of the optical flow's endpoint error"
+    ),
+    Metric("consistency.flow_below_1px", "share", "higher", 1e-3, 0, "visible pixels with flow to within 1 px"),
+    Metric(
+        "consistency.flow_epe_median_accepted",
+        "px",
+        "lower",
+        1e-2,
+        1e-2,
+        "median endpoint error where flow's check passes",
+    ),
+    Metric(
+        "consistency.flow_epe_p95_accepted",
+        "px",
+        "lower",
+        1e-1,
+        1e-2,
+        "95th percentile of it where flow's check passes",
+    ),
+    Metric("consistency.flow_recall", "share", "higher", 1e-3, 0, "of the visible pixels, flow's check passes"),
+    Metric(
+        "consistency.flow_false", "share", "lower", 1e-3, 0, "of what flow's check passes, not visible in the source"
+    ),
+    Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit"),
+    Metric("fidelity.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the truth of the edit"),
+    Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),
+    Metric("fidelity.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM against the truth of the edit"),
+    Metric("fidelity.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance to the truth of the edit"),
+    Metric(
+        "fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object"
+    ),
+    Metric(
+        "fidelity.preserved_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the unedited picture, outside the object"
+    ),
+    Metric(
+        "fidelity.preserved_ssim",
+        "ratio",
+        "higher",
+        1e-4,
+        1e-3,
+        "SSIM against the unedited picture, outside the object",
+    ),
+    Metric(
+        "fidelity.preserved_distance",
+        "ratio",
+        "lower",
+        1e-4,
+        1e-2,
+        "distance to the unedited picture, outside the object",
+    ),
+    Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
 )
 
 METRICS = Registry({metric.name: metric for metric in _SPECS})

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from attnwarp.visibility import angle_between
-from attnwarp_eval.checks._arrays import floats, mask, mean, quantile, regions, share
+from attnwarp_eval.arrays import floats, mask, mean, quantile, regions, share
 
 
 def depth_error(

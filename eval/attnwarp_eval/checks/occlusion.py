@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from attnwarp import _check
-from attnwarp_eval.checks._arrays import mask, regions, share
+from attnwarp_eval.arrays import mask, regions, share
 from attnwarp_eval.labels import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 COUNTS = (

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.checks._arrays import floats, mask, mean, quantile, regions, share
+from attnwarp_eval.arrays import floats, mask, mean, quantile, regions, share
 
 
 def endpoint_error(xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, image_px: Any = 1.0) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What the checks share: checks at the door, and means that are NaN when there is nothing to average."""
+"""What checks and metrics share: checks at the door, and means that are NaN when there is nothing to average."""
 
 from __future__ import annotations
 

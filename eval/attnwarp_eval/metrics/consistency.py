@@ -1,0 +1,299 @@
+"""Do two edited views agree about the colour of the same surface? Exactly, and as published work approximates it.
+
+Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at correspondences known
+from the scene itself. Published work has no such correspondences and takes optical flow between the unedited pictures
+instead (Lai et al. 2018, Learning Blind Video Temporal Consistency): :func:`optical_flow` and :func:`flow_consistency`
+do that, :func:`flow_error` says how far the flow is from the truth, and :func:`approximation_error` what it does to the
+figure. Both paths share everything but where they look.
+
+Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light; at exact positions in float64
+(``cv2.remap`` rounds positions to 1/32 px, and the sampler of :mod:`attnwarp.warp` is what is being judged).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import _check
+from attnwarp_eval.arrays import Array, Mask, mean, quantile, share
+from attnwarp_eval.colors import to_linear, to_srgb
+from attnwarp_eval.metrics._pictures import picture, region
+
+if TYPE_CHECKING:
+    from attnwarp_eval.truth import TwoView
+
+FlowMethod = Literal["dis", "farneback"]
+
+FLOW_LEAST = 12
+"""Smallest side in pixels that OpenCV's DIS takes; below it there is no flow."""
+
+FLOW_SLOPE, FLOW_SLACK = 0.01, 0.5
+"""The forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram, Brox & Keutzer 2010, section 3)."""
+
+VIEW_DEPENDENT = 0.05
+"""Tolerance of :func:`view_dependent` in linear light, above the noise of 8 samples a pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Disagreement:
+    """How far two pictures disagree, pixel by pixel of the target, and where that was counted.
+
+    Attributes:
+        counted: (H, W) bool, pixels that were compared.
+        linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
+        srgb: (H, W, 3) the same of sRGB values.
+        delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
+        candidates: number of pixels that could have been compared: those asked about that have a position.
+    """
+
+    counted: Mask
+    linear: Array
+    srgb: Array
+    delta_e: Array
+    candidates: int
+
+    def figures(self, prefix: str = "") -> dict[str, float]:
+        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN where nothing was counted."""
+        linear, srgb, delta_e = self.linear[self.counted], self.srgb[self.counted], self.delta_e[self.counted]
+        pixels = int(self.counted.sum())
+        found = {
+            "mae_linear": mean(np.abs(linear)),
+            "rmse_linear": float(np.sqrt(mean(linear**2))),
+            "rmse_srgb": float(np.sqrt(mean(srgb**2))),
+            "delta_e": mean(delta_e),
+            "delta_e_p95": quantile(delta_e, 0.95),
+            "share": share(pixels, self.candidates),
+            "pixels": pixels,
+        }
+        return {f"consistency.{prefix}{name}": value for name, value in found.items()}
+
+
+def cross_view(
+    source_srgb: Any, target_srgb: Any, pair: TwoView, *, mask: Any = None, exclude: Any = None
+) -> Disagreement:
+    """Disagreement of two pictures about the same surface points, at exact correspondences.
+
+    Counted are pixels of the target that the source certainly shows (``pair.visible``), that lie in neither view within
+    2 px of a depth or object edge (``pair.edge``), whose position has all four bilinear taps, and that ``exclude`` does not name.
+    Among them the pictures of a perfect, matt scene still differ: by what bilinear sampling cannot follow, by the area that
+    a pixel covers in either view, and by the noise of the renderer. That floor is the same function of the two TRUE
+    pictures; a figure without its floor says little.
+
+    Args:
+        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
+        pair: :func:`attnwarp_eval.truth.two_view` of them.
+        mask: (H, W) bool of the target, pixels that are asked about, such as the edited object's; all if left out.
+        exclude: (H, W) bool of the target, pixels that may rightly differ, from :func:`view_dependent`.
+
+    Raises:
+        ValueError: a picture that is not sRGB in [0, 1] or has another size than its camera.
+    """
+    source, target = _pictures(source_srgb, target_srgb, pair)
+    asked = region(mask, target.shape) & pair.visible
+    kept = asked & ~pair.edge
+    if exclude is not None:
+        kept &= ~region(exclude, target.shape, "exclude")
+    return _disagreement(source, target, pair.xy, kept, int(asked.sum()))
+
+
+def view_dependent(source_srgb: Any, target_srgb: Any, pair: TwoView, *, tolerance: float = VIEW_DEPENDENT) -> Mask:
+    """(H, W) bool: target pixels whose surface truly looks different from the source, such as highlights and reflections.
+
+    A pixel is one when its colour in the TRUE target leaves the range of the four taps around its position in the TRUE
+    source by more than ``tolerance``, in any channel of linear light. The range, and not their blend, so that a fine
+    texture that sampling cannot follow is no highlight. False where the source does not show the pixel.
+
+    Args:
+        source_srgb, target_srgb: truth of the two views, unedited. An edit that makes a matt thing shiny has highlights
+            of its own: where its truth is known, ask for it too and join the two masks.
+        pair: as for :func:`cross_view`.
+        tolerance: in linear light, of 1; above the noise of the pictures.
+    """
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance: got {tolerance}, expected a number of linear light that is not negative")
+    source, target = (to_linear(each) for each in _pictures(source_srgb, target_srgb, pair))
+    ask = pair.visible & ~pair.edge & _has_taps(pair.xy, source.shape)
+    column, row = np.floor(pair.xy[ask] - 0.5).astype(np.int64).T
+    # The last pixel's centre has its second tap at weight 0, outside.
+    right, below = np.minimum(column + 1, source.shape[1] - 1), np.minimum(row + 1, source.shape[0] - 1)
+    taps = np.stack([source[row, column], source[row, right], source[below, column], source[below, right]])
+    beyond = np.maximum(taps.min(axis=0) - target[ask], target[ask] - taps.max(axis=0))
+    found = np.zeros(ask.shape, dtype=bool)
+    found[ask] = (beyond > tolerance).any(axis=-1)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Optical flow from a target picture to a source picture.
+
+    Attributes:
+        xy: (H, W, 2) source positions in pixels, centres at +0.5; NaN where there is no flow.
+        accepted: (H, W) bool: passes the forward-backward check, inside the source picture.
+        method: which algorithm.
+    """
+
+    xy: Array
+    accepted: Mask
+    method: FlowMethod
+
+
+def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis") -> Flow:
+    """Where OpenCV's optical flow finds each target pixel in the source picture.
+
+    Args:
+        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as published work has it.
+        method: "dis", Dense Inverse Search (Kroeger et al. 2016) with the medium preset, or "farneback" (Farneback
+            2003) with five levels and a window of 15 px. Both see 8-bit grey.
+
+    Returns:
+        No flow at all, NaN and False everywhere, for pictures below 12 x 12 px.
+
+    Raises:
+        ValueError: pictures of different sizes or not sRGB in [0, 1]; another method.
+    """
+    _check.one_of(method, ("dis", "farneback"), "method")
+    target = picture(target_srgb, "target_srgb")
+    source = picture(source_srgb, "source_srgb", shape=target.shape)
+    height, width = shape = target.shape[:2]
+    if min(shape) < FLOW_LEAST:
+        return Flow(np.full((*shape, 2), np.nan), np.zeros(shape, dtype=bool), method)
+    forward = _flow(_grey(target), _grey(source), method)
+    backward = _flow(_grey(source), _grey(target), method)
+    centers = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    xy = centers + forward
+    inside = _has_taps(xy, shape)
+    back = np.full((*shape, 2), np.nan)
+    back[inside] = _sample(backward, xy[inside])
+    gap, length = ((forward + back) ** 2).sum(axis=-1), (forward**2).sum(axis=-1) + (back**2).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        accepted = inside & (gap <= FLOW_SLOPE * length + FLOW_SLACK)
+    return Flow(xy, accepted, method)
+
+
+def flow_consistency(source_srgb: Any, target_srgb: Any, flow: Flow, *, mask: Any = None) -> Disagreement:
+    """Disagreement of two edited pictures along the flow of the unedited ones, where the forward-backward check passes.
+
+    Args:
+        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
+        flow: from :func:`optical_flow`.
+        mask: (H, W) bool of the target, pixels that are asked about; all if left out.
+    """
+    shape = flow.accepted.shape
+    target = picture(target_srgb, "target_srgb", shape=shape)
+    source = picture(source_srgb, "source_srgb", shape=shape)
+    asked = region(mask, shape)
+    return _disagreement(source, target, flow.xy, asked & flow.accepted, int(asked.sum()))
+
+
+def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, float]:
+    """How far a flow is from the exact correspondences.
+
+    Args:
+        flow: from :func:`optical_flow` on the pictures of ``pair``.
+        pair: what is exactly known about them.
+        mask: (H, W) bool of the target, pixels that are asked about; all if left out.
+
+    Returns:
+        ``consistency.flow_epe_median``, ``_p95`` and ``flow_below_1px`` over all pixels that the source certainly shows,
+        away from edges; ``flow_epe_median_accepted`` and ``_p95_accepted`` over those of them that pass the
+        forward-backward check; ``flow_recall``, the share that passes; and ``flow_false``, of all that pass the share that
+        the source certainly does not show. NaN where there is nothing to measure.
+    """
+    shape = pair.label.shape
+    if flow.accepted.shape != shape:
+        raise ValueError(f"flow: got {flow.accepted.shape} pixels (H x W), expected {shape}, those of pair's target")
+    asked = region(mask, shape)
+    seen = asked & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
+    offset = np.hypot(*np.moveaxis(flow.xy - pair.xy, -1, 0))
+    every, kept = offset[seen], offset[seen & flow.accepted]
+    accepted = asked & flow.accepted
+    wrong = accepted & pair.unseen
+    return {
+        "consistency.flow_epe_median": quantile(every, 0.5),
+        "consistency.flow_epe_p95": quantile(every, 0.95),
+        "consistency.flow_below_1px": share(int((every < 1).sum()), every.size),
+        "consistency.flow_epe_median_accepted": quantile(kept, 0.5),
+        "consistency.flow_epe_p95_accepted": quantile(kept, 0.95),
+        "consistency.flow_recall": share(kept.size, every.size),
+        "consistency.flow_false": share(int(wrong.sum()), int(accepted.sum())),
+    }
+
+
+def approximation_error(exact: Disagreement, flow: Disagreement) -> dict[str, float]:
+    """What flow in place of exact correspondences does to the figures: flow minus exact, and mean DeltaE as a ratio.
+
+    NaN where either side counted nothing; the ratio too where the exact one is 0.
+    """
+    one, other = exact.figures(), flow.figures()
+    gaps = {
+        f"consistency.flow_gap_{name}": other[f"consistency.{name}"] - one[f"consistency.{name}"]
+        for name in ("mae_linear", "rmse_srgb", "delta_e")
+    }
+    truth = one["consistency.delta_e"]
+    ratio = other["consistency.delta_e"] / truth if truth > 0 else float("nan")
+    return gaps | {"consistency.flow_ratio_delta_e": ratio}
+
+
+def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array, Array]:
+    return (
+        picture(source_srgb, "source_srgb", shape=(pair.source.height, pair.source.width)),
+        picture(target_srgb, "target_srgb", shape=pair.label.shape),
+    )
+
+
+def _has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
+    """Positions with all four bilinear taps in a picture of (H, W): not beyond the outermost pixel centres; not NaN."""
+    height, width = shape[:2]
+    with np.errstate(invalid="ignore"):
+        inside: Mask = (xy >= 0.5).all(axis=-1) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] <= height - 0.5)
+    return inside
+
+
+def _sample(image: Array, xy: Array) -> Array:
+    """(N, C) bilinear samples of an (H, W, C) picture at (N, 2) positions that have taps."""
+    from scipy.ndimage import map_coordinates
+
+    at = (xy[:, ::-1] - 0.5).T
+    return np.stack([map_coordinates(image[..., c], at, order=1, mode="nearest") for c in range(image.shape[-1])], -1)
+
+
+def _disagreement(source: Array, target: Array, xy: Array, kept: Mask, candidates: int) -> Disagreement:
+    """Of sRGB pictures, at the pixels of ``kept`` whose position has taps."""
+    from skimage.color import deltaE_ciede2000, rgb2lab
+
+    counted = kept & _has_taps(xy, source.shape)
+    shape = counted.shape
+    linear, srgb, delta_e = (np.full((*shape, *rest), np.nan) for rest in ((3,), (3,), ()))
+    if counted.any():
+        there = _sample(to_linear(source), xy[counted])
+        here = target[counted]
+        there_srgb = to_srgb(there)
+        linear[counted] = to_linear(here) - there
+        srgb[counted] = here - there_srgb
+        delta_e[counted] = deltaE_ciede2000(rgb2lab(here), rgb2lab(there_srgb))
+    return Disagreement(counted, linear, srgb, delta_e, candidates)
+
+
+def _grey(image: Array) -> npt.NDArray[np.uint8]:
+    import cv2
+
+    return cv2.cvtColor(np.round(255 * image).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(np.uint8)
+
+
+def _flow(here: npt.NDArray[np.uint8], there: npt.NDArray[np.uint8], method: FlowMethod) -> Array:
+    """(H, W, 2) displacement of each pixel of ``here`` in ``there``."""
+    import cv2
+
+    cv: Any = cv2  # its stubs lack DIS, and None for the flow to start from
+    if method == "dis":
+        found = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(here, there, None)
+    else:
+        found = cv.calcOpticalFlowFarneback(
+            here, there, None, pyr_scale=0.5, levels=5, winsize=15, iterations=3, poly_n=7, poly_sigma=1.5, flags=0
+        )
+    return found.astype(np.float64)

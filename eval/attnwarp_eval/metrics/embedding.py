@@ -1,0 +1,158 @@
+"""What is computed from embeddings of pictures and texts. Pure: arrays in, arrays out; no network, no file.
+
+Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what the figures mean:
+keep its :class:`attnwarp_eval.encoders.EncoderInfo` beside them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+TINY_NORM = 1e-6
+"""An embedding shorter than this has no direction: encoders compute in float32 with features of order 1 and give
+lengths of 1 to 100, of which this is the rounding."""
+
+TINY_DISPLACEMENT = 1e-5
+"""Two unit embeddings closer than this are taken for one. The same picture in another batch, with other threads or in
+float64 moved its unit embedding by up to 1.2e-6 (ViT-B/32 and ViT-S/14 of random weights), and the direction of such a
+step means nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Cosines, one a view.
+
+    Attributes:
+        values: (N,) float64 in [-1, 1]; NaN where undefined.
+    """
+
+    values: npt.NDArray[np.float64]
+
+    @property
+    def undefined(self) -> int:
+        """How many views have no value."""
+        return int(np.isnan(self.values).sum())
+
+    @property
+    def defined(self) -> int:
+        """How many views have one."""
+        return len(self.values) - self.undefined
+
+    @property
+    def mean(self) -> float:
+        """Mean over the views that have a value; NaN where none has."""
+        return float(np.nanmean(self.values)) if self.defined else float("nan")
+
+
+def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
+    """Cosine of each picture with the prompt: how well the pictures show what the prompt says.
+
+    Args:
+        images: (N, D) embeddings of the renders.
+        text: (D,) or (1, D) of the one prompt, or (N, D), one for each picture.
+
+    Returns:
+        One value a picture, undefined where an embedding is shorter than TINY_NORM. It is the plain cosine: neither
+        multiplied by 100 nor cut off at 0, as some call by the name of CLIP score.
+
+    Raises:
+        ValueError: other shapes, or embeddings that are NaN or infinite.
+
+    Source: A. Radford et al., "Learning Transferable Visual Models From Natural Language Supervision", ICML 2021.
+    """
+    pictures = _embeddings(images, "images")
+    return Similarity(_cosine(_unit(pictures), _unit(_matching(text, pictures, "text"))))
+
+
+def directional_similarity(
+    images_before: npt.ArrayLike, images_after: npt.ArrayLike, text_before: npt.ArrayLike, text_after: npt.ArrayLike
+) -> Similarity:
+    """Cosine of the change of each picture with the change of the prompt.
+
+    Args:
+        images_before, images_after: (N, D) embeddings, pair by pair of one view: the original and its edited render.
+        text_before, text_after: (D,), (1, D) or (N, D) of the prompts that describe them.
+
+    Returns:
+        cos(I1 - I0, T1 - T0) of embeddings brought to unit length first, one a pair. Undefined where an embedding is
+        shorter than TINY_NORM, or a change smaller than TINY_DISPLACEMENT: nothing was changed, and 0 would say that
+        it was changed in a wrong direction.
+
+    Raises:
+        ValueError: other shapes, or embeddings that are NaN or infinite.
+
+    Source: R. Gal et al., "StyleGAN-NADA: CLIP-Guided Domain Adaptation of Image Generators", SIGGRAPH 2022; as a
+    metric of edits, T. Brooks, A. Holynski, A. A. Efros, "InstructPix2Pix", CVPR 2023.
+    """
+    after = _embeddings(images_after, "images_after")
+    before = _embeddings(images_before, "images_before")
+    if before.shape != after.shape:
+        raise ValueError(f"images_before: got shape {before.shape}, expected {after.shape}, as images_after")
+    change = _unit(after) - _unit(before)
+    wanted = _unit(_matching(text_after, after, "text_after")) - _unit(_matching(text_before, after, "text_before"))
+    return Similarity(_cosine(_unit(change, TINY_DISPLACEMENT), _unit(wanted, TINY_DISPLACEMENT)))
+
+
+def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Similarity:
+    """Cosine of each render with the edited source view: how far the scene follows the one picture that was edited.
+
+    Args:
+        source_edit: (D,) or (1, D) embedding of the edited source view.
+        renders: (N, D) embeddings of the renders.
+
+    Returns:
+        One value a render, undefined where an embedding is shorter than TINY_NORM. With DINO's class token it is the
+        DINO, with CLIP's picture embedding the CLIP single-image similarity.
+
+    Raises:
+        ValueError: other shapes, or embeddings that are NaN or infinite.
+    """
+    pictures = _embeddings(renders, "renders")
+    source = _matching(source_edit, pictures, "source_edit")
+    return Similarity(_cosine(_unit(pictures), _unit(source)))
+
+
+def _embeddings(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
+    """(N, D) in float64, so that lengths of float16 embeddings do not overflow."""
+    array = np.asarray(value)
+    if array.ndim != 2 or array.shape[1] == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (N, D)")
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{name}: got {array.dtype}, expected real numbers")
+    bad = ~np.isfinite(array).all(axis=1)
+    if bad.any():
+        raise ValueError(
+            f"{name}: {int(bad.sum())} of {len(array)} embeddings are NaN or infinite, row {int(bad.argmax())} first; "
+            "an encoder that computes in float16 overflows: let it compute in float32"
+        )
+    return array.astype(np.float64)
+
+
+def _matching(value: npt.ArrayLike, pictures: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
+    """One embedding for all pictures, or one for each."""
+    array = np.asarray(value)
+    array = _embeddings(array[None] if array.ndim == 1 else array, name)
+    if array.shape[1] != pictures.shape[1] or len(array) not in (1, len(pictures)):
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected ({pictures.shape[1]},), (1, {pictures.shape[1]}) or "
+            f"{pictures.shape}; both must come from one encoder"
+        )
+    return array
+
+
+def _unit(rows: npt.NDArray[np.float64], tiny: float = TINY_NORM) -> npt.NDArray[np.float64]:
+    """Rows of length 1, and NaN where a row is shorter than ``tiny``."""
+    # Scaled first: the square of a float64 above 1e154 overflows.
+    largest = np.abs(rows).max(axis=1, initial=0, keepdims=True)
+    scaled = np.divide(rows, largest, out=np.zeros_like(rows), where=largest > 0)
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    defined = largest >= tiny / np.maximum(length, 1)
+    return np.divide(scaled, length, out=np.full_like(rows, np.nan), where=defined & (length > 0))
+
+
+def _cosine(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Of unit rows; one row of either stands for all. Rounding past 1 is cut off, NaN stays."""
+    return np.asarray(np.clip((a * b).sum(axis=1), -1, 1))

@@ -1,0 +1,118 @@
+"""Did the edit do what it should, where it should, and leave the rest alone? Against the rendered truth of the edit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from attnwarp_eval.arrays import Array, Mask, share
+from attnwarp_eval.metrics._pictures import picture, region
+from attnwarp_eval.metrics.image import edit_psnr, ms_ssim, mse, psnr_of_mse, ssim
+
+Distance = Callable[[Array, Array], float]
+"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""
+
+
+def fidelity(
+    image_srgb: Any, truth_srgb: Any, mask: Any, *, original_srgb: Any = None, distance: Distance | None = None
+) -> dict[str, float]:
+    """The ``fidelity.*`` figures of an edited view against the truth of the edit.
+
+    Whole, ``.inside`` the edited object and ``.outside`` of it: a method that paints the object well and the rest of
+    the picture too shows it in the last alone. Pixels on the object's outline, one on each side, count in neither: the
+    mask is of pixel centres and a pixel shows the mean of its area, so the truth itself changes there. ``preserved_*``
+    is outside too, but against the picture before the edit: what the truth gets there is the best to be had, less than
+    perfect where an edited object throws another light, so put ``preserved_*`` of the truth beside it.
+
+    Args:
+        image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
+        truth_srgb: the same view of the scene as it should be after the edit
+            (:meth:`attnwarp_eval.scene.Scene.edited`).
+        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.edits.edit_mask`). All True for an edit of the light,
+            which leaves nothing outside: those figures are NaN.
+        original_srgb: the view before the edit; without it nothing is said about preservation.
+        distance: a perceptual distance; without it there is none. Inside, the rest of the picture is made equal to the
+            truth first, and the distance divided by the share of the picture that is inside; outside, the other way round.
+            For a distance that is a mean over places it then is the mean over those of the region, apart from what
+            spills over the region's border.
+
+    Returns:
+        ``mse``, ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and ``.outside``, ``ms_ssim`` whole, the
+        ``preserved_*`` figures, and the counts of pixels. PSNR divides by the region's pixels; SSIM counts windows
+        wholly inside the region. NaN where a region is empty, such as the inside of an object two pixels wide.
+
+    Raises:
+        ValueError: a picture that is not sRGB in [0, 1], pictures of different sizes, a mask that is not bool.
+    """
+    image = picture(image_srgb, "image_srgb")
+    truth = picture(truth_srgb, "truth_srgb", shape=image.shape)
+    inside = region(mask, image.shape)
+    parts = {"": np.ones_like(inside), ".inside": _shrunk(inside), ".outside": _shrunk(~inside)}
+    figures: dict[str, float] = {}
+    for suffix, part in parts.items():
+        error = mse(image, truth, part)
+        figures[f"fidelity.mse{suffix}"] = error
+        figures[f"fidelity.psnr{suffix}"] = psnr_of_mse(error)
+        figures[f"fidelity.ssim{suffix}"] = ssim(image, truth, part)
+        figures[f"fidelity.pixels{suffix}"] = int(part.sum())
+        if distance is not None:
+            figures[f"fidelity.distance{suffix}"] = _distance(distance, image, truth, part)
+    figures["fidelity.ms_ssim"] = ms_ssim(image, truth)
+    if original_srgb is not None:
+        outside = parts[".outside"]
+        original = picture(original_srgb, "original_srgb", shape=image.shape)
+        error = mse(image, original, outside)
+        figures["fidelity.preserved_mse"] = error
+        figures["fidelity.preserved_psnr"] = psnr_of_mse(error)
+        figures["fidelity.preserved_ssim"] = ssim(image, original, outside)
+        if distance is not None:
+            figures["fidelity.preserved_distance"] = _distance(distance, image, original, outside)
+    return figures
+
+
+def nearest_answer(
+    images: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]], masks: Mapping[str, Any] | None = None
+) -> tuple[str | None, dict[str, float]]:
+    """Which of an ambiguous edit's right answers a method gave: one for all views, the least mean MSE over them.
+
+    One answer for all, since a method that answers differently from view to view is not free to (docs/edits.md).
+
+    Args:
+        images: (H, W, 3) sRGB by the view's name, the edited views.
+        answers: by the answer's name, its truth in the same views.
+        masks: (H, W) bool by the view's name, the edited object.
+
+    Returns:
+        The answer's name, None where nothing could be measured; and the PSNR in dB, pooled over the views, for each answer.
+
+    Raises:
+        ValueError: no answers, or one that does not have the views of ``images``.
+    """
+    if not answers:
+        raise ValueError("answers: got none, expected the truth of at least one")
+    for name, truth in answers.items():
+        if set(truth) != set(images):
+            raise ValueError(
+                f"answers[{name!r}]: got views {sorted(truth)}, expected those of images, {sorted(images)}"
+            )
+    found = {name: edit_psnr(images, truth, masks).pooled for name, truth in answers.items()}
+    defined = {name: value for name, value in found.items() if not math.isnan(value)}
+    return (max(defined, key=defined.__getitem__) if defined else None), found
+
+
+def _shrunk(part: Mask) -> Mask:
+    """Without the pixels that have one of the eight around them outside; the picture's border is no outline."""
+    from scipy.ndimage import binary_erosion
+
+    kept: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)
+    return kept
+
+
+def _distance(distance: Distance, image: Array, truth: Array, part: Mask) -> float:
+    covered = share(int(part.sum()), part.size)
+    if not covered > 0:
+        return math.nan
+    return float(distance(np.where(part[..., None], image, truth), truth)) / covered

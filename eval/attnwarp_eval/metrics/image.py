@@ -1,0 +1,237 @@
+"""How alike two pictures are: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
+
+Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions take values as they come: whether
+they are sRGB or linear is the caller's to name, and :func:`image_error` names it in its figures. Everything is summed in
+float64. With nothing to measure (an empty mask, a picture smaller than the window) a figure is NaN, never 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.arrays import Array, Mask, mean
+from attnwarp_eval.colors import to_linear
+from attnwarp_eval.metrics._pictures import pair
+
+WINDOW = 11
+"""Side of SSIM's window in pixels; that of :data:`attnwarp.losses.SSIM_WINDOW`, not imported since it brings torch."""
+
+MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+"""Exponents of the scales, finest first: Wang, Simoncelli & Bovik 2003, section 3.2."""
+
+MS_SSIM_LEAST = WINDOW * 2 ** (len(MS_SSIM_WEIGHTS) - 1)
+"""Smallest side in pixels for which the coarsest scale holds a window: 176."""
+
+
+def mse(image: Any, target: Any, mask: Any = None) -> float:
+    """Mean over the mask's pixels and channels of the squared difference; NaN for an empty mask.
+
+    Args:
+        image, target: (H, W, 3) in [0, 1], of one size. What they hold outside the mask does not count, NaN included.
+        mask: (H, W) bool, the pixels that count; all if left out.
+
+    Raises:
+        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0, 1].
+    """
+    return _mse(*pair(image, target, mask))
+
+
+def psnr(image: Any, target: Any, mask: Any = None) -> float:
+    """-10 log10 of :func:`mse`, in dB: +inf where the pictures are equal, NaN for an empty mask.
+
+    The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to 0, gains
+    -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see :func:`edit_psnr`.
+    """
+    return psnr_of_mse(mse(image, target, mask))
+
+
+def ssim(image: Any, target: Any, mask: Any = None) -> float:
+    """Mean structural similarity (Wang, Bovik, Sheikh & Simoncelli 2004) over windows and channels; at most 1.
+
+    The windows are 11 x 11, Gaussian with sigma 1.5, and lie wholly inside the picture and, given a mask, wholly inside
+    the mask: a window that is partly outside would score what is not in question. The values are those of
+    :func:`attnwarp.losses.ssim`.
+
+    Returns:
+        NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x 11 square.
+    """
+    found = ssim_map(image, target, mask)
+    return mean(found[np.isfinite(found)])
+
+
+def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
+    """(H - 10, W - 10) similarity of each window, a mean over channels; NaN where it is not wholly inside the mask.
+
+    The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11 px.
+    """
+    first, second, inside = pair(image, target, mask)
+    if min(inside.shape) < WINDOW:
+        return np.empty(tuple(max(0, side - WINDOW + 1) for side in inside.shape))
+    luminance, structure = _terms(first, second)
+    return np.where(whole_windows(inside), (luminance * structure).mean(axis=-1), np.nan)
+
+
+def whole_windows(mask: Mask) -> Mask:
+    """(H - 10, W - 10) bool: the 11 x 11 windows that lie wholly inside a mask of at least that size."""
+    # A window is whole when it holds no pixel outside: sums of an integral image are exact.
+    outside = np.pad(np.cumsum(np.cumsum(~mask, axis=0), axis=1), ((1, 0), (1, 0)))
+    columns: npt.NDArray[np.int64] = outside[WINDOW:] - outside[:-WINDOW]
+    whole: Mask = columns[:, WINDOW:] == columns[:, :-WINDOW]
+    return whole
+
+
+def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
+    """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003), in [0, 1].
+
+    Contrast and structure at five scales, each half the one before (means of 2 x 2 pixels; an odd last row or column
+    is dropped), and luminance at the coarsest, each averaged over windows and channels, then multiplied with the paper's
+    exponents. A mean below 0 (pictures that are each other's negatives) has no real power and counts as 0.
+
+    Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count as in :func:`ssim`.
+
+    Returns:
+        NaN when some scale has no window: a side below 176 px, or a mask that holds no square of about that size.
+    """
+    first, second, inside = pair(image, target, mask)
+    product = 1.0
+    for scale, weight in enumerate(MS_SSIM_WEIGHTS):
+        if scale:
+            first, second = (_halved(x).mean(axis=(1, 3)) for x in (first, second))
+            inside = _halved(inside).all(axis=(1, 3))
+        if min(inside.shape) < WINDOW or not (windows := whole_windows(inside)).any():
+            return math.nan
+        luminance, structure = _terms(first, second)
+        coarsest = scale == len(MS_SSIM_WEIGHTS) - 1
+        term = luminance * structure if coarsest else structure
+        product *= max(mean(term[windows]), 0.0) ** weight
+    return product
+
+
+def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str, float]:
+    """The ``image.*`` figures of an sRGB picture against what it should be.
+
+    All are of the sRGB values, as the field has it, apart from those named ``_linear``, which are of linear light and so
+    weigh bright parts more.
+
+    Args:
+        image_srgb, target_srgb: (H, W, 3), sRGB-encoded, in [0, 1].
+        mask: (H, W) bool, the pixels that count; all if left out.
+    """
+    first, second, inside = pair(image_srgb, target_srgb, mask, ("image_srgb", "target_srgb"))
+    error, linear = _mse(first, second, inside), _mse(to_linear(first), to_linear(second), inside)
+    return {
+        "image.mse": error,
+        "image.psnr": psnr_of_mse(error),
+        "image.mse_linear": linear,
+        "image.psnr_linear": psnr_of_mse(linear),
+        "image.ssim": ssim(first, second, inside),
+        "image.ms_ssim": ms_ssim(first, second, inside),
+        "image.pixels": int(inside.sum()),
+    }
+
+
+@dataclass(frozen=True)
+class EditPsnr:
+    """How closely the views of an edited scene follow the edited pictures that it was made from.
+
+    Attributes:
+        views: the views that were measured, by name and in order. Methods that edit different views are not comparable
+            by this figure: fewer edited views are easier to follow.
+        mse: of each view; NaN where it is undefined.
+        psnr: of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
+    """
+
+    views: tuple[str, ...]
+    mse: tuple[float, ...]
+    psnr: tuple[float, ...]
+
+    @property
+    def pooled(self) -> float:
+        """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of them are equal."""
+        return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
+
+    @property
+    def mean_finite(self) -> float:
+        """Mean of the finite PSNRs; identical and undefined views are left out and counted, NaN when none is left."""
+        return mean(np.array([value for value in self.psnr if math.isfinite(value)]))
+
+    @property
+    def identical(self) -> int:
+        """Number of views whose pictures are equal, PSNR +inf."""
+        return sum(value == math.inf for value in self.psnr)
+
+    @property
+    def undefined(self) -> int:
+        """Number of views with nothing to measure."""
+        return sum(math.isnan(value) for value in self.psnr)
+
+    def figures(self) -> dict[str, float]:
+        """The ``edit.*`` figures; each view's own as ``edit.psnr.NAME`` and ``edit.mse.NAME``."""
+        return {
+            "edit.psnr_pooled": self.pooled,
+            "edit.psnr_mean": self.mean_finite,
+            "edit.views": len(self.views),
+            "edit.views_identical": self.identical,
+            "edit.views_undefined": self.undefined,
+            **{f"edit.psnr.{view}": value for view, value in zip(self.views, self.psnr, strict=True)},
+            **{f"edit.mse.{view}": value for view, value in zip(self.views, self.mse, strict=True)},
+        }
+
+
+def edit_psnr(
+    edited: Mapping[str, Any], rendered: Mapping[str, Any], masks: Mapping[str, Any] | None = None
+) -> EditPsnr:
+    """Edit PSNR: edited pictures against renders of the edited scene, view by view.
+
+    Args:
+        edited: (H, W, 3) in [0, 1] by the view's name, all views that were edited, in whatever stage.
+        rendered: the same views of the scene that was fitted on them.
+        masks: (H, W) bool by the view's name, the pixels that count, for all views or none.
+
+    Raises:
+        ValueError: the three do not name the same views; a picture that :func:`mse` refuses, with the view's name.
+    """
+    for name, other in (("rendered", rendered), ("masks", masks)):
+        if other is not None and set(other) != set(edited):
+            without, beyond = sorted(set(edited) - set(other)), sorted(set(other) - set(edited))
+            said = [f"no view {without[0]!r}"] if without else []
+            said += [f"a view {beyond[0]!r} that is not among the edited ones"] if beyond else []
+            raise ValueError(f"{name}: got {' and '.join(said)}, expected the {len(edited)} views of edited")
+    errors = []
+    for view, image in edited.items():
+        mask = None if masks is None else masks[view]
+        errors.append(_mse(*pair(image, rendered[view], mask, (f"edited[{view!r}]", f"rendered[{view!r}]"))))
+    return EditPsnr(tuple(edited), tuple(errors), tuple(psnr_of_mse(error) for error in errors))
+
+
+def _mse(image: Array, target: Array, inside: Mask) -> float:
+    return mean((image[inside] - target[inside]) ** 2)
+
+
+def psnr_of_mse(error: float) -> float:
+    """:func:`attnwarp.losses.psnr_of_mse`, +inf for 0, and NaN for NaN. To average views, average the error."""
+    from attnwarp import losses
+
+    return math.nan if math.isnan(error) else losses.psnr_of_mse(error)
+
+
+def _terms(image: Array, target: Array) -> tuple[Array, Array]:
+    """(H - 10, W - 10, 3) luminance, and contrast and structure, of each window."""
+    import torch
+
+    from attnwarp import losses
+
+    luminance, structure = losses.ssim_terms(torch.from_numpy(image), torch.from_numpy(target))
+    return luminance.numpy(), structure.numpy()
+
+
+def _halved(value: Any) -> Any:
+    """(H, W, ...) as (H // 2, 2, W // 2, 2, ...): its 2 x 2 blocks."""
+    height, width = (side // 2 for side in value.shape[:2])
+    return value[: 2 * height, : 2 * width].reshape(height, 2, width, 2, *value.shape[2:])

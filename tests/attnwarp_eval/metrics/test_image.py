@@ -1,0 +1,350 @@
+"""PSNR, SSIM and MS-SSIM against scikit-image, torchmetrics, brute force and closed forms; hard cases 14, 31, 34 to 36, 40."""
+
+import json
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from skimage import metrics as skimage
+from torchmetrics.functional.image import (
+    multiscale_structural_similarity_index_measure,
+    peak_signal_noise_ratio,
+    structural_similarity_index_measure,
+)
+
+from attnwarp_eval import metrics
+from attnwarp_eval.colors import to_linear
+from attnwarp_eval.metric import METRICS, metric
+
+
+def pictures(height=40, width=52, seed=0, noise=0.15):
+    """A smooth picture and the same with noise, as edited views are: not two pictures of noise."""
+    random = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / 17.0
+    image = np.stack([0.5 + 0.4 * np.sin(x * (k + 1) + y + random.uniform(0, 6)) for k in range(3)], axis=-1)
+    return image, np.clip(image + noise * random.standard_normal(image.shape), 0, 1)
+
+
+def tensor(image):
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+
+
+SIZES = [(11, 11), (12, 31), (40, 52), (64, 64), (177, 200)]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_mse_and_psnr_are_those_of_scikit_image_and_torchmetrics(size):
+    image, target = pictures(*size)
+    assert metrics.mse(image, target) == pytest.approx(skimage.mean_squared_error(image, target), rel=1e-12)
+    expected = skimage.peak_signal_noise_ratio(target, image, data_range=1.0)
+    assert metrics.psnr(image, target) == pytest.approx(expected, abs=1e-10)
+    other = peak_signal_noise_ratio(tensor(image), tensor(target), data_range=1.0)
+    # Its factor 10 / ln 10 is float32: 5e-8 of 17 dB.
+    assert metrics.psnr(image, target) == pytest.approx(float(other), abs=2e-6)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_ssim_is_that_of_scikit_image_and_torchmetrics(size):
+    image, target = pictures(*size)
+    expected, full = skimage.structural_similarity(
+        image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1.0,
+        full=True,
+    )  # fmt: skip
+    assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-12)
+    np.testing.assert_allclose(metrics.ssim_map(image, target), full[5:-5, 5:-5].mean(-1), rtol=0, atol=1e-12)
+    _, other = structural_similarity_index_measure(
+        tensor(image), tensor(target), data_range=1.0, return_full_image=True
+    )
+    # torchmetrics' own mean counts windows over a reflected border too; its map without them is ours.
+    windows = other[0].numpy()[:, 5:-5, 5:-5]
+    # Its kernel is normalised in another order; 1e-10 is rounding.
+    assert metrics.ssim(image, target) == pytest.approx(windows.mean(), abs=1e-10)
+
+
+def oracle_ms_ssim(image, target):
+    """From torchmetrics' SSIM and contrast-structure at each scale, without its reflected border at the coarsest."""
+    a, b = tensor(image), tensor(target)
+    product = 1.0
+    for scale, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
+        if scale:
+            a, b = (torch.nn.functional.avg_pool2d(x, 2) for x in (a, b))
+        _, structure = structural_similarity_index_measure(a, b, data_range=1.0, return_contrast_sensitivity=True)
+        _, full = structural_similarity_index_measure(a, b, data_range=1.0, return_full_image=True)
+        term = float(full[..., 5:-5, 5:-5].mean()) if scale == 4 else float(structure)
+        product *= max(term, 0.0) ** weight
+    return product, float(full.mean()), float(full[..., 5:-5, 5:-5].mean())
+
+
+@pytest.mark.parametrize(("size", "noise"), [((176, 176), 0.05), ((177, 191), 0.4), ((224, 180), 0.15)])
+def test_ms_ssim_is_that_of_torchmetrics(size, noise):
+    image, target = pictures(*size, noise=noise)
+    expected, bordered, valid = oracle_ms_ssim(image, target)
+    got = metrics.ms_ssim(image, target)
+    assert got == pytest.approx(expected, abs=1e-10)
+    whole = float(multiscale_structural_similarity_index_measure(tensor(image), tensor(target), data_range=1.0))
+    # All that separates us from its public figure is the border of the coarsest scale, which the paper's code leaves out.
+    # Its exponents are float32.
+    assert got * (bordered / valid) ** 0.1333 == pytest.approx(whole, abs=1e-8)
+
+
+def test_ms_ssim_of_negatives_is_zero_and_not_a_complex_number():
+    image, _ = pictures(176, 176)
+    assert metrics.ms_ssim(image, 1 - image) == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 30), (10, 30), (40, 52), (180, 180)])
+def test_identical_pictures(size):
+    # Hard case 34: +inf, kept apart; and SSIM 1, where there is one (hard case 14).
+    image, _ = pictures(*size)
+    found = metrics.image_error(image, image.copy())
+    assert found["image.mse"] == found["image.mse_linear"] == 0
+    assert found["image.psnr"] == found["image.psnr_linear"] == math.inf
+    for name, least in (("image.ssim", 11), ("image.ms_ssim", 176)):
+        if min(size) < least:
+            assert math.isnan(found[name])
+        else:
+            assert found[name] == pytest.approx(1, abs=1e-12)
+
+
+def test_pictures_of_one_pixel_have_an_error_and_no_structure():
+    # Hard case 14.
+    image, target = np.full((1, 1, 3), 0.25), np.full((1, 1, 3), 0.75)
+    found = metrics.image_error(image, target)
+    assert found["image.mse"] == 0.25
+    assert found["image.psnr"] == pytest.approx(20 * math.log10(2), abs=1e-12)
+    assert math.isnan(found["image.ssim"]) and math.isnan(found["image.ms_ssim"])
+    assert metrics.ssim_map(image, target).size == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (40, 52), (180, 180)])
+def test_an_empty_mask_leaves_everything_undefined(size):
+    # Hard case 35.
+    image, target = pictures(*size)
+    found = metrics.image_error(image, target, np.zeros(size, bool))
+    assert found.pop("image.pixels") == 0
+    assert all(math.isnan(value) for value in found.values())
+
+
+def test_a_constant_offset_has_its_closed_form_whatever_the_mask():
+    image = np.full((30, 30, 3), 0.3)
+    for coverage in (1, 7, 450, 900):
+        mask = np.zeros(900, bool)
+        mask[np.random.default_rng(0).permutation(900)[:coverage]] = True
+        assert metrics.psnr(image, image + 0.1, mask.reshape(30, 30)) == pytest.approx(20, abs=1e-9)
+
+
+def test_masked_psnr_gains_nothing_from_what_is_left_out():
+    # Hard case 40: over all pixels, with the rest set to 0, a quarter's coverage gains 10 log10(4) = 6.02 dB.
+    image, target = pictures(64, 64)
+    mask = np.zeros((64, 64), bool)
+    mask[:32, :32] = True
+    right = metrics.psnr(image[:32, :32], target[:32, :32])
+    assert metrics.psnr(image, target, mask) == pytest.approx(right, abs=1e-12)
+    wrong = metrics.psnr(np.where(mask[..., None], image, 0), np.where(mask[..., None], target, 0))
+    assert wrong - right == pytest.approx(10 * math.log10(4), abs=1e-9)
+
+
+def brute_ssim(image, target, mask):
+    """Windows one by one, textbook formula, two passes for the variances."""
+    taps = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
+    weights = np.outer(taps, taps) / taps.sum() ** 2
+    found = np.full((image.shape[0] - 10, image.shape[1] - 10), np.nan)
+    for i in range(found.shape[0]):
+        for j in range(found.shape[1]):
+            at = slice(i, i + 11), slice(j, j + 11)
+            if not mask[at].all():
+                continue
+            channels = []
+            for c in range(3):
+                x, y = image[at][..., c], target[at][..., c]
+                mx, my = (weights * x).sum(), (weights * y).sum()
+                vx, vy = (weights * (x - mx) ** 2).sum(), (weights * (y - my) ** 2).sum()
+                cov = (weights * (x - mx) * (y - my)).sum()
+                channels.append((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
+            found[i, j] = np.mean(channels)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_masked_ssim_is_the_mean_over_windows_wholly_inside(seed):
+    image, target = pictures(26, 31, seed)
+    mask = np.ones((26, 31), bool)
+    mask[tuple(np.random.default_rng(seed).integers(0, (26, 31), (6, 2)).T)] = False
+    expected = brute_ssim(image, target, mask)
+    assert 0 < np.isfinite(expected).sum() < expected.size
+    np.testing.assert_allclose(metrics.ssim_map(image, target, mask), expected, rtol=0, atol=1e-12)
+    assert metrics.ssim(image, target, mask) == pytest.approx(np.nanmean(expected), abs=1e-12)
+
+
+def test_ssim_of_a_mask_thinner_than_the_window_is_undefined():
+    image, target = pictures(40, 40)
+    mask = np.zeros((40, 40), bool)
+    mask[:10] = True
+    assert math.isnan(metrics.ssim(image, target, mask))
+    assert math.isfinite(metrics.psnr(image, target, mask))
+
+
+def test_ms_ssim_in_a_rectangle_is_that_of_the_rectangle_alone():
+    # Aligned to 16 px, so that the blocks of all five scales are the crop's own.
+    image, target = pictures(224, 208)
+    mask = np.zeros((224, 208), bool)
+    mask[16:208, 32:208] = True
+    expected = metrics.ms_ssim(image[16:208, 32:208], target[16:208, 32:208])
+    assert metrics.ms_ssim(image, target, mask) == pytest.approx(expected, abs=1e-12)
+    mask[100, 100] = False  # the hole reaches every window of the coarsest scale but some
+    holed = metrics.ms_ssim(image, target, mask)
+    assert math.isnan(holed) or 0 < holed < 1
+
+
+@pytest.mark.parametrize("filling", [np.nan, np.inf, -3.0, 1e300])
+def test_what_lies_outside_the_mask_changes_nothing(filling):
+    # Hard case 36.
+    image, target = pictures(180, 180)
+    mask = np.zeros((180, 180), bool)
+    mask[:178, :178] = True
+    expected = metrics.image_error(image, target, mask)
+    spoiled = [np.where(mask[..., None], x, filling) for x in (image, target)]
+    assert metrics.image_error(*spoiled, mask) == expected
+    assert all(math.isfinite(value) for value in expected.values())
+
+
+def test_values_that_are_no_picture_are_refused_with_their_place():
+    image, target = pictures()
+    spoiled = target.copy()
+    spoiled[3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match="target: nan at row 3, column 4, channel 1; 1 values are NaN or outside"):
+        metrics.mse(image, spoiled)
+    spoiled[3, 4, 1] = 1.01
+    with pytest.raises(ValueError, match="image: 1.01 at row 3"):
+        metrics.ssim(spoiled, target)
+    with pytest.raises(ValueError, match=r"image: got uint8, expected float32 or float64 in \[0, 1\]; divide by 255"):
+        metrics.psnr(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="target: got float16"):
+        metrics.psnr(np.zeros((4, 4, 3)), np.zeros((4, 4, 3), np.float16))
+    with pytest.raises(ValueError, match=r"target: got 40 x 51 pixels \(H x W\), expected 40 x 52"):
+        metrics.mse(image, target[:, 1:])
+    with pytest.raises(ValueError, match=r"image: got shape \(40, 52\), expected \(H, W, 3\)"):
+        metrics.mse(image[..., 0], target[..., 0])
+    with pytest.raises(ValueError, match="mask: got float64, expected bool"):
+        metrics.mse(image, target, np.ones((40, 52)))
+    with pytest.raises(ValueError, match=r"mask: got shape \(52, 40\), expected \(40, 52\)"):
+        metrics.mse(image, target, np.ones((52, 40), bool))
+    with pytest.raises(ValueError, match="image_srgb: -0.1 at row 0"):
+        metrics.image_error(image - image - 0.1, target)
+
+
+def test_linear_figures_are_those_of_the_linear_pictures():
+    image, target = pictures()
+    found = metrics.image_error(image, target)
+    assert found["image.mse_linear"] == metrics.mse(to_linear(image), to_linear(target))
+    assert found["image.psnr_linear"] == metrics.psnr(to_linear(image), to_linear(target))
+    assert found["image.mse_linear"] != found["image.mse"]
+
+
+def test_single_precision_is_measured_in_double():
+    # Hard case 31's kin: an error of 1e-6 is squared to 1e-12, below float32's resolution of a mean.
+    image = np.full((200, 200, 3), 0.5, np.float32)
+    target = image + np.float32(2**-20)
+    assert metrics.mse(image, target) == pytest.approx(2.0**-40, rel=1e-12)
+    assert metrics.psnr(torch.from_numpy(image), torch.from_numpy(target)) == pytest.approx(120.4, abs=0.05)
+
+
+SYMMETRIES = {
+    "transposed": lambda x: np.swapaxes(x, 0, 1),
+    "mirrored": lambda x: x[:, ::-1],
+    "upside down": lambda x: x[::-1],
+}
+
+
+@pytest.mark.parametrize("how", SYMMETRIES)
+@pytest.mark.parametrize("seed", range(3))
+def test_no_direction_no_channel_and_neither_picture_is_special(how, seed):
+    # 192 halves evenly four times, so no row is dropped on one side.
+    image, target = pictures(192, 176, seed)
+    mask = np.ones((192, 176), bool)
+    mask[:3] = False
+    turn = SYMMETRIES[how]
+    expected = metrics.image_error(image, target)
+    assert metrics.image_error(target, image) == pytest.approx(expected, rel=1e-12)
+    assert metrics.image_error(turn(image), turn(target)) == pytest.approx(expected, rel=1e-10)
+    assert metrics.image_error(image[..., ::-1], target[..., ::-1]) == pytest.approx(expected, rel=1e-10)
+    masked = metrics.mse(image, target, mask), metrics.ssim(image, target, mask)
+    turned = turn(image), turn(target), np.ascontiguousarray(turn(mask))
+    assert (metrics.mse(*turned), metrics.ssim(*turned)) == pytest.approx(masked, rel=1e-10)
+
+
+def test_more_noise_is_never_better():
+    random = np.random.default_rng(0)
+    image, _ = pictures(192, 192)
+    grain = random.standard_normal(image.shape)
+    image = 0.3 + 0.4 * image
+    found = [metrics.image_error(image, np.clip(image + s * grain, 0, 1)) for s in (0.003, 0.01, 0.03, 0.1)]
+    for name in ("image.psnr", "image.psnr_linear", "image.ssim", "image.ms_ssim"):
+        values = [each[name] for each in found]
+        assert values == sorted(values, reverse=True) and values[0] > values[-1]
+    assert 0 <= found[-1]["image.ms_ssim"] <= 1
+
+
+def test_edit_psnr_averages_the_error_and_not_the_decibels():
+    flat = np.full((4, 5, 3), 0.5)
+    edited = {"b": flat + 0.1, "a": flat + 0.01, "same": flat, "unseen": flat}
+    rendered = dict.fromkeys(edited, flat)
+    masks = {view: np.full((4, 5), view != "unseen") for view in edited}
+    got = metrics.edit_psnr(edited, rendered, masks)
+    assert got.views == ("b", "a", "same", "unseen")  # in the order they came
+    assert got.psnr[:3] == pytest.approx((20, 40, math.inf)) and math.isnan(got.psnr[3])
+    assert got.pooled == pytest.approx(-10 * math.log10((1e-2 + 1e-4 + 0) / 3), abs=1e-9)
+    assert got.mean_finite == pytest.approx(30, abs=1e-9)
+    assert (got.identical, got.undefined) == (1, 1)
+    figures = got.figures()
+    assert figures["edit.psnr.b"] == pytest.approx(20) and figures["edit.mse.b"] == pytest.approx(0.01)
+    assert (figures["edit.views"], figures["edit.views_identical"], figures["edit.views_undefined"]) == (4, 1, 1)
+
+
+def test_edit_psnr_of_whole_views_of_one_size_is_that_of_one_stack():
+    views = {str(k): pictures(seed=k, noise=0.05 * (k + 1)) for k in range(4)}
+    got = metrics.edit_psnr({k: v[0] for k, v in views.items()}, {k: v[1] for k, v in views.items()})
+    stacked = [np.concatenate([v[side] for v in views.values()]) for side in (0, 1)]
+    expected = skimage.peak_signal_noise_ratio(*stacked, data_range=1.0)
+    assert got.pooled == pytest.approx(expected, abs=1e-10)
+    # Jensen: decibels averaged are never less.
+    assert got.mean_finite > got.pooled
+
+
+@pytest.mark.parametrize(
+    ("psnr", "pooled"), [((math.inf, math.inf), math.inf), ((math.nan, math.nan), math.nan), ((), math.nan)]
+)
+def test_edit_psnr_where_no_view_has_a_finite_one(psnr, pooled):
+    mse = tuple(0.0 if value == math.inf else value for value in psnr)
+    got = metrics.EditPsnr(tuple(map(str, range(len(psnr)))), mse, psnr)
+    assert got.pooled == pytest.approx(pooled, nan_ok=True)
+    assert math.isnan(got.mean_finite)
+    assert got.identical + got.undefined == len(psnr)
+
+
+def test_edit_psnr_refuses_views_that_do_not_match():
+    flat = np.full((2, 2, 3), 0.5)
+    with pytest.raises(ValueError, match="rendered: got no view 'b', expected the 2 views of edited"):
+        metrics.edit_psnr({"a": flat, "b": flat}, {"a": flat})
+    with pytest.raises(ValueError, match="masks: got a view 'c' that is not among the edited ones"):
+        metrics.edit_psnr({"a": flat}, {"a": flat}, {"a": np.ones((2, 2), bool), "c": np.ones((2, 2), bool)})
+    with pytest.raises(ValueError, match=r"rendered\['a'\]: 1.5 at row 0"):
+        metrics.edit_psnr({"a": flat}, {"a": flat * 3})
+
+
+def test_every_figure_is_registered():
+    image, target = pictures(12, 12)
+    names = {*metrics.image_error(image, target), *metrics.edit_psnr({"yaw.010": image}, {"yaw.010": target}).figures()}
+    for name in names:
+        assert metric(name).unit
+    assert METRICS["image.psnr"].direction == "higher" and METRICS["image.mse"].direction == "lower"
+
+
+def test_importing_metrics_imports_nothing_heavy():
+    code = "import sys, json, attnwarp_eval.metrics; print(json.dumps(sorted(sys.modules)))"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"torch", "cv2", "scipy", "skimage", "mitsuba", "open3d", "pyvista", "numba"}
+    assert not heavy & set(json.loads(ran.stdout))
