@@ -1,0 +1,235 @@
+"""The networks of the bundled encoders. Small enough for a CPU; the recipes in eval/training/ train them.
+
+Pictures come in as (N, 3, H, W) sRGB in [0, 1]; each network centres them itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+Tensor = torch.Tensor
+
+
+class Residual(nn.Module):
+    """Two 3 x 3 convolutions with batch normalisation about an identity (He et al. 2016, figure 2)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.first_norm = nn.BatchNorm2d(channels)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.second_norm = nn.BatchNorm2d(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, C, h, w)."""
+        y = F.relu(self.first_norm(self.first(x)))
+        return F.relu(x + self.second_norm(self.second(y)))
+
+
+class Stages(nn.Module):
+    """Convolutional stages: the first at a quarter of the size, each further one at half of the one before.
+
+    Args:
+        widths: channels of the stages.
+        depths: residual blocks of the stages.
+    """
+
+    def __init__(self, widths: Sequence[int], depths: Sequence[int]) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, widths[0] // 2, 3, stride=2, padding=1, bias=False),
+            nn.BatchNorm2d(widths[0] // 2),
+            nn.ReLU(),
+            nn.Conv2d(widths[0] // 2, widths[0], 2, stride=2),
+        )
+        self.stages = nn.ModuleList()
+        for k, (width, depth) in enumerate(zip(widths, depths, strict=True)):
+            down = [nn.Conv2d(widths[k - 1], width, 2, stride=2)] if k else []
+            self.stages.append(nn.Sequential(*down, *(Residual(width) for _ in range(depth))))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """(N, 3, H, W) in [0, 1] -> the output of every stage, (N, C_k, H / 2^(k + 2), W / 2^(k + 2))."""
+        x = self.stem(4 * x - 2)
+        out = []
+        for stage in self.stages:
+            x = stage(x)
+            out.append(x)
+        return out
+
+
+class AttentionPool(nn.Module):
+    """One query that looks at every place, as in CLIP's convolutional towers (Radford et al. 2021, section 2.4)."""
+
+    def __init__(self, channels: int, heads: int, dim: int) -> None:
+        super().__init__()
+        self.position = nn.Parameter(torch.zeros(1, channels, 8, 8))
+        self.attend = nn.MultiheadAttention(channels, heads, batch_first=True)
+        self.norm = nn.LayerNorm(channels)
+        self.project = nn.Linear(2 * channels, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, dim)."""
+        position = F.interpolate(self.position, x.shape[-2:], mode="bilinear", align_corners=False)
+        tokens = self.norm((x + position).flatten(2).transpose(1, 2))
+        mean = tokens.mean(dim=1, keepdim=True)
+        looked, _ = self.attend(mean, tokens, tokens, need_weights=False)
+        return self.project(torch.cat([looked[:, 0], mean[:, 0]], dim=-1))
+
+
+class TextTower(nn.Module):
+    """A small causal transformer over byte-pair tokens; the embedding is read at the last token.
+
+    Args:
+        vocabulary: number of tokens; token 0 is padding.
+        width, depth, heads: of the transformer.
+        length: longest text in tokens; longer ones are cut, keeping their end token.
+        dim: of the embedding.
+    """
+
+    def __init__(self, vocabulary: int, width: int, depth: int, heads: int, length: int, dim: int) -> None:
+        super().__init__()
+        self.length = length
+        self.words = nn.Embedding(vocabulary, width, padding_idx=0)
+        self.position = nn.Parameter(0.01 * torch.randn(length, width))
+        layer = nn.TransformerEncoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
+        self.layers = nn.TransformerEncoder(layer, depth, nn.LayerNorm(width), enable_nested_tensor=False)
+        self.project = nn.Linear(width, dim)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """(N, L) int64, padded with 0 at the end -> (N, dim)."""
+        x = self.words(tokens) + self.position[: tokens.shape[1]]
+        x = self.layers(x, src_key_padding_mask=tokens == 0)
+        last = (tokens != 0).sum(dim=1).clamp(min=1) - 1
+        return self.project(x[torch.arange(len(x)), last])
+
+
+class ClipSmall(nn.Module):
+    """Pictures and texts in one space (Radford et al. 2021), small.
+
+    Args:
+        vocabulary: of the tokenizer.
+        dim: of the shared space.
+    """
+
+    size = 128
+    length = 40
+
+    def __init__(self, vocabulary: int, dim: int = 192) -> None:
+        super().__init__()
+        self.vision = Stages((48, 96, 208), (2, 2, 2))
+        self.pool = AttentionPool(208, 4, dim)
+        self.text = TextTower(vocabulary, 128, 3, 4, self.length, dim)
+        # exp of it multiplies the cosine, as in the paper, which starts at 1 / 0.07.
+        self.scale = nn.Parameter(torch.tensor(2.66))
+
+    def images(self, x: Tensor) -> Tensor:
+        """(N, 3, 128, 128) in [0, 1] -> (N, dim)."""
+        return self.pool(self.vision(x)[-1])
+
+    def texts(self, tokens: Tensor) -> Tensor:
+        """(N, L) tokens -> (N, dim)."""
+        return self.text(tokens)
+
+
+class Block(nn.Module):
+    """A transformer block, normalised first, with the residual branches scaled (Touvron et al. 2021, LayerScale)."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.attend_norm = nn.LayerNorm(dim)
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.think_norm = nn.LayerNorm(dim)
+        self.think = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
+        self.attend_scale = nn.Parameter(0.1 * torch.ones(dim))
+        self.think_scale = nn.Parameter(0.1 * torch.ones(dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, L, D) -> (N, L, D)."""
+        n, length, dim = x.shape
+        q, k, v = self.qkv(self.attend_norm(x)).view(n, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
+        # Written out: for a few hundred tokens on a CPU, two matrix products are several times faster than the fused kernel.
+        weights = (q @ k.transpose(-1, -2) * (dim // self.heads) ** -0.5).softmax(dim=-1)
+        y = (weights @ v).transpose(1, 2).reshape(n, length, dim)
+        x = x + self.attend_scale * self.out(y)
+        return x + self.think_scale * self.think(self.think_norm(x))
+
+
+class DinoSmall(nn.Module):
+    """Convolutions to an eighth of the size, then a transformer with a class token (Caron et al. 2021), small.
+
+    The convolutions take the place of the patch embedding: a transformer alone needs far more pictures.
+    """
+
+    size = 128
+    patch = 8
+
+    def __init__(self, dim: int = 128, depth: int = 2, heads: int = 4) -> None:
+        super().__init__()
+        self.dim = dim
+        self.stages = Stages((32, 96), (1, 3))
+        self.embed = nn.Conv2d(96, dim, 1)
+        self.cls = nn.Parameter(0.02 * torch.randn(1, 1, dim))
+        self.position = nn.Parameter(0.02 * torch.randn(1, dim, 16, 16))
+        self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, H, W) in [0, 1], sides multiples of 8 -> class token (N, D), patch tokens (N, D, H / 8, W / 8)."""
+        y = self.embed(self.stages(x)[-1])
+        h, w = y.shape[-2:]
+        y = y + F.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
+        tokens = torch.cat([self.cls.expand(len(y), -1, -1), y.flatten(2).transpose(1, 2)], dim=1)
+        for block in self.blocks:
+            tokens = block(tokens)
+        tokens = self.norm(tokens)
+        return tokens[:, 0], tokens[:, 1:].transpose(1, 2).reshape(len(y), self.dim, h, w)
+
+
+class PerceptualSmall(nn.Module):
+    """Differences of features, weighted by channel and averaged over places and stages (Zhang et al. 2018, eq. 1), small.
+
+    Features are normalised at each place; weights are kept positive by their exponential. The picture itself, a little
+    blurred, is a first stage of its own, so that differences too faint for the features still count.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.widths = (32, 48, 64, 96)
+        self.layers = nn.ModuleList()
+        before = 3
+        for k, width in enumerate(self.widths):
+            self.layers.append(nn.Conv2d(before, width, 5 if k == 0 else 3, padding=2 if k == 0 else 1))
+            before = width
+        self.log_weights = nn.ParameterList(nn.Parameter(torch.zeros(width)) for width in self.widths)
+        self.color_log_weight = nn.Parameter(torch.zeros(3))
+
+    def features(self, x: Tensor) -> list[Tensor]:
+        """(N, 3, H, W) in [0, 1] -> (N, C_k, h_k, w_k): full size, then a half of the size before at each stage."""
+        x = 4 * x - 2
+        out = []
+        for k, layer in enumerate(self.layers):
+            if k:
+                x = F.avg_pool2d(x, 2, ceil_mode=True)
+            x = F.relu(layer(x)) if k < len(self.layers) - 1 else layer(x)
+            out.append(x)
+        return out
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        """(N, 3, H, W) twice -> (N,) distances, 0 for equal pictures, symmetric."""
+        size = 4 if min(a.shape[-2:]) >= 4 else 1
+        total = (F.avg_pool2d(a, size) - F.avg_pool2d(b, size)).square().mean((2, 3)) @ self.color_log_weight.exp()
+        for x, y, weight in zip(self.features(a), self.features(b), self.log_weights, strict=True):
+            difference = (_unit(x) - _unit(y)).square().mean((2, 3))
+            total = total + difference @ weight.exp()
+        return total
+
+
+def _unit(x: Tensor) -> Tensor:
+    """Each place's feature vector to length 1; where it is all but zero it stays so."""
+    return x / (x.square().sum(dim=1, keepdim=True) + 1e-2).sqrt()

@@ -1,0 +1,147 @@
+"""Rebuild the bundled encoders from nothing: python -m training, from the folder eval/."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(help="Recipes of the bundled encoders. Run from eval/: python -m training all", no_args_is_help=True)
+
+Data = Annotated[Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")]
+Out = Annotated[Path, typer.Option(help="Folder of checkpoints; training goes on from them.")]
+Weights = Annotated[Path, typer.Option(help="Folder that gets weights and cards.")]
+Threads = Annotated[int, typer.Option(min=1, help="Of training and rendering.")]
+
+DATA, OUT = Path("../runs/encoders/data"), Path("../runs/encoders")
+WEIGHTS = Path(__file__).parent.parent / "attnwarp_eval" / "encoders" / "weights"
+NAMES = ("clip-small", "dino-small", "perceptual-small")
+
+
+@app.command()
+def data(folder: Data = DATA, threads: Threads = 2) -> None:
+    """Render the pictures (half an hour on two cores)."""
+    from training.data import SPLITS, make
+
+    for name in SPLITS:
+        make(folder, name, threads)
+
+
+@app.command()
+def train(name: str, data: Data = DATA, out: Out = OUT, threads: Threads = 2) -> None:
+    """Train one encoder: clip-small, dino-small or perceptual-small."""
+    import torch
+
+    torch.set_num_threads(threads)
+    _recipe(name).train(data, out)
+
+
+@app.command()
+def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
+    """Write a trained encoder's weights in half precision, as the package carries them."""
+    import shutil
+
+    import torch
+    from safetensors.torch import save_file
+
+    state = torch.load(out / f"{name}.pt", weights_only=True)
+    if name == "dino-small":  # the teacher is the better one, as in DINO
+        prefix = "net."
+        net = {k.removeprefix(prefix): v for k, v in state["teacher"].items() if k.startswith(prefix)}
+    else:
+        net = state["model"]
+    weights.mkdir(parents=True, exist_ok=True)
+    half = {k: v.half().contiguous() if v.is_floating_point() else v for k, v in net.items()}
+    save_file(half, weights / f"{name}.safetensors")
+    words = out / f"{name}.tokenizer.json"
+    if words.exists():
+        shutil.copyfile(words, weights / words.name)
+    typer.echo(weights / f"{name}.safetensors")
+
+
+@app.command()
+def assess(name: str, data: Data = DATA, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
+    """Measure an encoder on what it has never seen, and write its card."""
+    import torch
+
+    from attnwarp_eval.encoders.bundled import load
+    from training import assess as questions
+    from training.cards import card
+
+    torch.set_num_threads(threads)
+    encoder: Any = load(name, weights)
+    sets = questions.test_sets(data)
+
+    def figures() -> list[dict[str, Any]]:
+        if name == "clip-small":
+            found = questions.clip_figures(encoder, sets)
+        elif name == "dino-small":
+            found = questions.dino_figures(encoder, sets["test"])
+        else:
+            found = questions.perceptual_figures(encoder, sets["test"].images)
+        return [f.to_dict() for f in found]
+
+    trained = figures()
+    facts = _facts(name, encoder, data)
+    torch.manual_seed(0)
+    encoder.net = type(encoder.net)(encoder.tokenizer.get_vocab_size()) if name == "clip-small" else type(encoder.net)()
+    encoder.net.eval().requires_grad_(False)
+    control = figures()
+    for f in trained:
+        typer.echo(f"{100 * f['value']:6.1f} %  {f['what']}")
+    files = sorted(
+        p for p in weights.glob(f"{name}.*") if p.suffix in (".safetensors", ".json") and "figures" not in p.name
+    )
+    (weights / f"{name}.md").write_text(card(name, trained, control, facts, files))
+    (weights / f"{name}.figures.json").write_text(json.dumps({"trained": trained, "random": control}, indent=1) + "\n")
+
+
+@app.command("all")
+def everything(data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
+    """All of it: pictures, training, weights, cards."""
+    for name in NAMES:
+        train(name, data, out, threads)
+        export(name, out, weights)
+        assess(name, data, weights, threads)
+
+
+def _recipe(name: str) -> Any:
+    import importlib
+
+    if name not in NAMES:
+        raise typer.BadParameter(f"got {name!r}, expected one of {', '.join(NAMES)}")
+    return importlib.import_module(f"training.{name.removesuffix('-small')}")
+
+
+def _facts(name: str, encoder: Any, data: Path) -> dict[str, Any]:
+    import torch
+
+    from training.data import SPLITS
+    from training.perceptual import TRAIN_PHOTOS
+    from training.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES
+
+    def millions(net: Any) -> float:
+        return sum(p.numel() for p in net.parameters()) / 1e6
+
+    net, recipe = encoder.net, _recipe(name)
+    facts = {
+        "dim": encoder.about.dim, "size": millions(net), "torch": torch.__version__.partition("+")[0], "epochs": recipe.EPOCHS, "seed": recipe.SEED,
+        "train": 6 * SPLITS["train"].worlds, "rendered": SPLITS["train-rendered"].worlds, "objects": len(OBJECTS),
+        "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
+    }  # fmt: skip
+    if name == "clip-small":
+        facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}
+    if name == "dino-small":
+        facts["rendered"] = 0
+    if name == "perceptual-small":
+        facts |= {
+            "rendered": 0,
+            "photos": f"{len(TRAIN_PHOTOS)} photographs that scikit-image ships (four others are kept for the test); ",
+        }
+    return facts
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,409 @@
+"""What the encoders can do on what they have never seen: the figures of the model cards, each with an interval.
+
+Every figure is given for the trained network and for one of the same shape with random weights; where it says
+something, for raw pixels and colour histograms too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.encoders.base import Image, PerceptualDistance, TextImageEncoder, TokenEncoder
+from training.clip import true_of
+from training.data import SIZE, SPLITS, Pictures, load, looks_of
+from training.distort import HELD_OUT_KINDS, TRAIN_KINDS
+from training.perceptual import HELD_OUT_PHOTOS, Sources, photographs, triple
+from training.worlds import (
+    COLORS,
+    FINISHES,
+    GROUNDS,
+    HOURS,
+    NOUNS,
+    OBJECTS,
+    PLACES,
+    TIMES,
+    attributes,
+    draw_look,
+    draw_world,
+    sentence,
+    surface_words,
+)
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A share of right answers, or a mean.
+
+    Attributes:
+        what: the question.
+        value: the share.
+        low, high: 95 % interval, bootstrapped over worlds: pictures of one world are not independent.
+        count: answers.
+        chance: what guessing would give; None where that says nothing.
+        asked: the share that was asked for; None where none was.
+    """
+
+    what: str
+    value: float
+    low: float
+    high: float
+    count: int
+    chance: float | None = None
+    asked: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike, **more: float | None) -> Figure:
+    """A figure from one answer a question, grouped by world."""
+    values, groups = np.asarray(right, dtype=np.float64), np.asarray(worlds)
+    sums = {g: (values[groups == g].sum(), int((groups == g).sum())) for g in np.unique(groups)}
+    table = np.array(list(sums.values()))
+    rng = np.random.default_rng(0)
+    drawn = table[rng.integers(len(table), size=(2000, len(table)))].sum(axis=1)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
+    return Figure(what, float(values.mean()), float(low), float(high), len(values), **more)
+
+
+def as_float(images: npt.NDArray[np.uint8]) -> list[Image]:
+    """Pictures as encoders take them."""
+    return list(images.astype(np.float32) / 255)
+
+
+def _unit(x: npt.ArrayLike) -> Array:
+    x = np.asarray(x, dtype=np.float64)
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+# clip-small ----------------------------------------------------------------------------------------------------------
+
+TEMPLATES = ("a photo of {}", "a picture of {}", "an image of {}", "{}")
+
+
+def word_embeddings(encoder: TextImageEncoder, phrases: Sequence[Sequence[str]]) -> Array:
+    """(K, D) unit embeddings of K meanings, each the mean over its phrases in several sentences."""
+    rows = []
+    for choices in phrases:
+        rows.append(_unit(encoder.texts([t.format(c) for t in TEMPLATES for c in choices])).mean(axis=0))
+    return _unit(rows)
+
+
+def _a(words: str) -> str:
+    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+
+
+def _phrases(what: str) -> list[list[str]]:
+    match what:
+        case "object":
+            return [[_a(n) for n in NOUNS[o]] for o in OBJECTS]
+        case "color":
+            return [[_a(f"{c} thing"), _a(f"{c} object")] for c in COLORS]
+        case "material":
+            return [[_a(f"{m} object"), _a(f"{m} statue"), _a(f"{m} thing")] for m in MATERIALS]
+        case "ground":
+            return [[f"something {p}" for p in PLACES[g]] for g in GROUNDS]
+    return [[f"something {h}" for h in HOURS[t]] for t in TIMES]
+
+
+MATERIALS = ("golden", "silver", "bronze", "wooden", "stone", "marble")
+
+
+def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[Figure]:
+    """Naming, retrieval and direction on shapes, worlds and pairs that training never saw.
+
+    Args:
+        encoder: to be judged.
+        sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered" (by Mitsuba).
+    """
+    found = []
+    embedded = {name: _unit(encoder.images(as_float(p.images))) for name, p in sets.items()}
+    labels = {
+        what: word_embeddings(encoder, _phrases(what)) for what in ("object", "color", "material", "ground", "time")
+    }
+    titles = {"test": "new shapes", "test-new-pairs": "new pairs of colour and object", "test-rendered": "path-traced"}
+    for name, pictures in sets.items():
+        images, shown = embedded[name], pictures.attributes
+        kinds = np.array(FINISHES)[shown[:, 1]]
+        material = np.array([MATERIALS.index(k) if k in MATERIALS else -1 for k in kinds])
+        one_colored = np.isin(kinds, ["plain", "shiny"])
+        questions: list[tuple[str, npt.NDArray[np.int64], npt.NDArray[np.bool_], float | None]] = [
+            ("object", shown[:, 0], np.ones(len(shown), bool), 0.9),
+            ("color", shown[:, 2], one_colored, 0.9),
+            ("material", material, material >= 0, 0.9),
+            ("ground", shown[:, 4], np.ones(len(shown), bool), None),
+            ("time", shown[:, 5], np.ones(len(shown), bool), None),
+        ]
+        for what, truth, where, asked in questions:
+            if not where.any():
+                continue
+            guess = (images[where] @ labels[what].T).argmax(axis=1)
+            chance = 1 / len(labels[what])
+            found.append(
+                figure(
+                    f"name the {what}, {titles[name]}",
+                    guess == truth[where],
+                    pictures.world[where],
+                    chance=chance,
+                    asked=asked,
+                )
+            )
+        found.append(_retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}"))
+    found.append(_direction(encoder, embedded["test"], sets["test"]))
+    found.append(_viewpoint(embedded["test"], sets["test"], labels))
+    return found
+
+
+def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, what: str) -> Figure:
+    """Rank 1 of a picture's own caption among those of 63 others of other worlds; one that is true too is no error."""
+    rng = np.random.default_rng(1)
+    first = np.flatnonzero((pictures.view == 0) & (pictures.look == 0))
+    said = pictures.attributes
+    texts = _unit(encoder.texts([sentence(tuple(int(v) for v in said[k]), rng) for k in first]))
+    right = []
+    for place, k in enumerate(first):
+        others = rng.choice(np.delete(np.arange(len(first)), place), 63, replace=False)
+        choice = np.array([place, *others])
+        best = choice[(images[k] @ texts[choice].T).argmax()]
+        right.append(bool(true_of(said[first[best]][None], said[k][None])[0, 0]))
+    return figure(what, right, pictures.world[first], chance=1 / 64, asked=0.6)
+
+
+def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> Figure:
+    """Which of 8 edits was made: cos of the change of pictures and the change of captions, as the field's metric has it."""
+    rng = np.random.default_rng(2)
+    index = {(w, v, k): i for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))}
+    right, worlds = [], []
+    for (world, view, look), before in index.items():
+        if look != 0:
+            continue
+        after = index[world, view, 1]
+        old, new = (tuple(int(v) for v in pictures.attributes[k]) for k in (before, after))
+        targets = [new]
+        while len(targets) < 8:
+            # Others change one attribute of the same picture too: surface, ground or time.
+            part = int(rng.integers(3))
+            drawn = attributes(old[0], draw_look(old[0], rng, pairs="any"))
+            other = (
+                (old[0], *drawn[1:4], *old[4:])
+                if part == 0
+                else (*old[:4], drawn[4], old[5])
+                if part == 1
+                else (*old[:5], drawn[5])
+            )
+            if other != old and other not in targets and not true_of(np.array([other]), np.array([new]))[0, 0]:
+                targets.append(other)
+        seed = int(rng.integers(2**31))
+        # One seed for all sentences: they differ in what they say, not in how.
+        texts = encoder.texts([sentence(said, np.random.default_rng(seed)) for said in (old, *targets)])
+        away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
+        moved = _unit(images[after] - images[before])
+        right.append((away @ moved).argmax() == 0)
+        worlds.append(world)
+    return figure("the edit among 8, by directional similarity", right, worlds, chance=1 / 8, asked=0.8)
+
+
+def _viewpoint(images: Array, pictures: Pictures, labels: dict[str, Array]) -> Figure:
+    """Whether both views of a thing get the same name."""
+    guess = (images @ labels["object"].T).argmax(axis=1)
+    index = {(w, v, k): i for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))}
+    pairs = [(i, index[w, 1, k], w) for (w, v, k), i in index.items() if v == 0]
+    same = [guess[i] == guess[j] for i, j, _ in pairs]
+    return figure("the same name for two views of a thing", same, [w for *_, w in pairs])
+
+
+# dino-small ----------------------------------------------------------------------------------------------------------
+
+
+def nearest(features: Array, pictures: Pictures, *, relit: bool, seed: int = 3) -> tuple[list[bool], list[int]]:
+    """Nearest neighbour among one view each of 64 things, for the other view of one of them.
+
+    Args:
+        features: (N, D); compared by their cosine.
+        pictures: whose they are.
+        relit: the query shows the thing on another ground or at another time of day (its own look 1, where that
+            changed no surface).
+        seed: of the galleries.
+    """
+    rng = np.random.default_rng(seed)
+    unit = _unit(features)
+    index = {
+        (int(w), int(v), int(k)): i
+        for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))
+    }
+    worlds = sorted({w for w, _, _ in index})
+    right, asked = [], []
+    for world in worlds:
+        query = index[world, 1, 0]
+        if relit:
+            query = index[world, 1, 1]
+            if (pictures.attributes[query, 1:4] != pictures.attributes[index[world, 0, 0], 1:4]).any():
+                continue
+        others = rng.choice([w for w in worlds if w != world], 63, replace=False)
+        gallery = [index[world, 0, 0], *(index[int(w), 0, 0] for w in others)]
+        right.append(bool((unit[gallery] @ unit[query]).argmax() == 0))
+        asked.append(world)
+    return right, asked
+
+
+def histograms(images: npt.NDArray[np.uint8]) -> Array:
+    """(N, 512) colour histograms of 8 x 8 x 8 bins, the square root of which makes cosines Bhattacharyya's."""
+    bins = images.astype(np.int64) // 32
+    flat = (bins[..., 0] * 64 + bins[..., 1] * 8 + bins[..., 2]).reshape(len(images), -1)
+    return np.sqrt(np.stack([np.bincount(row, minlength=512) for row in flat]) / flat.shape[1])
+
+
+def raw_pixels(images: npt.NDArray[np.uint8]) -> Array:
+    """(N, 3072) pictures of 32 x 32, centred."""
+    import cv2
+
+    small = np.stack([cv2.resize(i, (32, 32), interpolation=cv2.INTER_AREA) for i in images]).reshape(len(images), -1)
+    return small - small.mean(axis=1, keepdims=True, dtype=np.float64)
+
+
+def dino_figures(encoder: TokenEncoder, pictures: Pictures, *, parts: int = 60) -> list[Figure]:
+    """Finding a thing from another side, and parts of it; beside raw pixels and colour histograms."""
+    found = []
+    features = {"class token": encoder.images(as_float(pictures.images))}
+    features |= {"raw pixels": raw_pixels(pictures.images), "colour histogram": histograms(pictures.images)}
+    for name, values in features.items():
+        for relit in (False, True):
+            right, worlds = nearest(values, pictures, relit=relit)
+            where = "on other ground or at another time" if relit else "same light"
+            asked = 0.85 if name == "class token" and not relit else None
+            found.append(
+                figure(
+                    f"the thing from another side among 64, {where}: {name}", right, worlds, chance=1 / 64, asked=asked
+                )
+            )
+    return found + part_figures(encoder, parts)
+
+
+def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -> list[Figure]:
+    """PCK: a patch of the thing in one view, its best match in the other, right within a tenth of the picture of where it is.
+
+    Exact correspondences come from rays: a surface point of one view, projected into the other, where it must be the
+    point seen. Only patches of the thing itself count, and only ones that both views show.
+    """
+    from training.render import pictures as render
+
+    side = 16
+    rows: dict[str, list[bool]] = {"patch tokens": [], "raw patches": [], "middle of the thing": []}
+    worlds: list[int] = []
+    for k in range(count):
+        world = draw_world(first + k, new_shapes=True, thing=k % len(OBJECTS))
+        look = looks_of(world.seed, world.thing, SPLITS["test"])[0]
+        (one,), hits = render(world, [look], SIZE, view=0)
+        (two,), other = render(world, [look], SIZE, view=1)
+        camera = world.scene(look, SIZE).cameras[1]
+        place = np.arange(side) * (SIZE // side) + SIZE // side // 2
+        y, x = np.meshgrid(place, place, indexing="ij")
+        on = (hits.object_id[y, x] == 0).ravel()
+        points = hits.point[y, x].reshape(-1, 3)[on]
+        if not len(points):
+            continue
+        xy, depth = camera.project(points)
+        inside = np.isfinite(xy).all(axis=1) & (xy > 0).all(axis=1) & (xy < SIZE).all(axis=1)
+        px = np.floor(np.nan_to_num(xy)).astype(int).clip(0, SIZE - 1)
+        seen = other.depth[px[:, 1], px[:, 0]]
+        good = inside & (np.abs(seen - depth) < 0.02 * depth)
+        if not good.any():
+            continue
+        tokens = encoder.tokens(as_float(np.stack([one, two])))
+        means = np.stack([one, two]).reshape(2, side, SIZE // side, side, SIZE // side, 3).transpose(0, 1, 3, 2, 4, 5)
+        patches = means.reshape(2, side, side, -1).astype(np.float64)
+        centers = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.0
+        truth = xy[good]
+        for name, grid in (("patch tokens", tokens), ("raw patches", patches)):
+            flat = _unit(
+                grid.reshape(2, side * side, -1) - grid.reshape(2, side * side, -1).mean(axis=1, keepdims=True)
+            )
+            match = (flat[0][on][good] @ flat[1].T).argmax(axis=1)
+            rows[name] += list(np.linalg.norm(centers[match] - truth, axis=1) < 0.1 * SIZE)
+        thing = np.argwhere(other.object_id == 0)[:, ::-1].mean(axis=0)
+        rows["middle of the thing"] += list(np.linalg.norm(thing - truth, axis=1) < 0.1 * SIZE)
+        worlds += [world.seed] * int(good.sum())
+    return [
+        figure(f"parts from another side, within a tenth of the picture: {name}", right, worlds)
+        for name, right in rows.items()
+    ]
+
+
+# perceptual-small ----------------------------------------------------------------------------------------------------
+
+Distance = Callable[[Image, Image], float]
+
+
+def psnr_distance(a: Image, b: Image) -> float:
+    """Mean squared error: in the order of PSNR."""
+    return float(((a - b) ** 2).mean())
+
+
+def ssim_distance(a: Image, b: Image) -> float:
+    """1 - SSIM, by scikit-image."""
+    from skimage.metrics import structural_similarity
+
+    how: dict[str, Any] = {"channel_axis": 2, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5}
+    return 1 - float(structural_similarity(a, b, use_sample_covariance=False, **how))
+
+
+def perceptual_figures(
+    encoder: PerceptualDistance, renders: npt.NDArray[np.uint8], *, pairs: int = 600
+) -> list[Figure]:
+    """Which of two distortions is the stronger: on photographs and worlds that training never saw."""
+    sources = Sources(photographs(HELD_OUT_PHOTOS), renders)
+    distances: dict[str, Distance] = {
+        "perceptual": lambda a, b: float(encoder.distance([a], [b])[0]), "PSNR": psnr_distance, "SSIM": ssim_distance,
+    }  # fmt: skip
+    families: dict[str, tuple[tuple[str, ...], float]] = {
+        "all kinds": (TRAIN_KINDS, 0.5),
+        "shifts and blurs": (("shift", "turn", "blur", "motion"), 0.5),
+        "one kind": (TRAIN_KINDS, 0.0),
+        "kinds never seen": (HELD_OUT_KINDS, 0.0),
+    }
+    found = []
+    for what, (kinds, across) in families.items():
+        rng = np.random.default_rng([4, len(what)])
+        right: dict[str, list[bool]] = {name: [] for name in distances}
+        for _ in range(pairs):
+            x, weak, strong, _, _ = triple(sources, rng, kinds, across=across)
+            for name, distance in distances.items():
+                right[name].append(distance(x, weak) < distance(x, strong))
+        for name, answers in right.items():
+            asked = 0.95 if name == "perceptual" and what == "all kinds" else None
+            found.append(
+                figure(
+                    f"the stronger of two distortions, {what}: {name}",
+                    answers,
+                    np.arange(pairs),
+                    chance=0.5,
+                    asked=asked,
+                )
+            )
+    return found
+
+
+def test_sets(data: Path) -> dict[str, Pictures]:
+    """The held-out pictures, rendered where they are missing."""
+    return {name: load(data, name) for name in ("test", "test-new-pairs", "test-rendered")}
+
+
+__all__ = [
+    "Figure",
+    "clip_figures",
+    "dino_figures",
+    "figure",
+    "part_figures",
+    "perceptual_figures",
+    "surface_words",
+    "test_sets",
+]

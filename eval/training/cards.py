@@ -1,0 +1,96 @@
+"""Model cards: what each bundled encoder was made from, what it can and cannot do, and the figures behind that."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+ABOUT = {
+    "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million
+parameters for pictures of 128 x 128 px, a transformer of {text:.1f} million for text, byte-pair tokens.
+
+**Good for**: scores of renders and edits of scenes like those in `scenes/`: one thing on a ground, its colour, its material or pattern,
+the ground, the time of day; whether an edit went in the direction of the words; comparisons between methods on the same views.
+
+**Not good for**: photographs of the world, people's identity, style ("as Van Gogh would paint it"), counting, left and right, anything
+outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`training/worlds.py`). A word
+that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
+compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
+
+**Recipe**: `training/clip.py`. Contrast over batches of 192 pictures and 384 sentences, half of which have one attribute wrong; looks
+of one world, which differ in one attribute, lie in one batch; sentences that happen to be true of another picture are no negatives.
+Rare words and invented ones are scattered into captions so that unknown words do little harm.""",
+    "dino-small": """A class token and 16 x 16 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to an eighth of the
+size, then two transformer blocks; {size:.1f} million parameters.
+
+**Good for**: whether two pictures show the same thing, from whichever side; which patch of one view is which of another, roughly.
+
+**Not good for**: telling photographs of the world apart, fine differences within a kind, exact correspondences: warps are checked against rays
+(`checks/`), not against these tokens. Its figures do not compare with those of DINOv2 (`--dino dinov2:FOLDER`).
+
+**Recipe**: `training/dino.py`. Self-distillation with multi-crop, a momentum teacher, centring and sharpening; no labels. The two large crops are two
+views of one thing, which at times stands on another ground or in another light. Patches of small crops are taught by the teacher's patches
+at the same place.""",
+    "perceptual-small": """A distance of two pictures of one size, any size: differences of normalised features at four scales, weighted by channel
+and averaged, as LPIPS, plus the difference of the pictures themselves averaged over 4 x 4 px; {size:.2f} million parameters. Its square root times 5 is
+about the strength of a distortion on the scale of `training/distort.py`: 1 is faint, 5 ruined.
+
+**Good for**: putting degradations of a picture in order (blur, noise, compression, tone, small shifts), which PSNR and SSIM confuse; above all
+small shifts, which look like nothing and cost PSNR much.
+
+**Not good for**: standing in for people's judgement: the order of strengths is known, not asked of anyone, and between kinds of distortion it is
+our own scale. Different contents: it has no opinion on which of two other objects is nearer. Its figures do not compare with those of LPIPS (`--perceptual
+lpips:FILE`).
+
+**Recipe**: `training/perceptual.py`. Features and weights learned together from pairs of distortions of which one is the stronger, on crops of
+photographs that scikit-image ships and of rendered worlds.""",
+}
+
+DATA = """**Data**: pictures of random worlds, {train} by ray casting and {rendered} by Mitsuba (`training/worlds.py`, `training/objects.py`), with captions that are
+true of them by construction; {photos}nothing was downloaded. Never seen in training: every shape of the tests, one in ten pairs of object and colour,
+every world of the tests."""
+
+
+def card(
+    name: str,
+    figures: Sequence[dict[str, Any]],
+    control: Sequence[dict[str, Any]],
+    facts: dict[str, Any],
+    files: Sequence[Path],
+) -> str:
+    """A card in Markdown.
+
+    Args:
+        name: of the encoder.
+        figures: of the trained network (:class:`training.assess.Figure` as dictionaries).
+        control: the same of a network with random weights.
+        facts: what the text's blanks say.
+        files: of weights, whose hashes are given.
+    """
+    lines = [f"# {name}", "", ABOUT[name].format(**facts), "", DATA.format(**facts), ""]
+    lines += [
+        "## Figures on what it has never seen", "",
+        "Share of right answers with its 95 % interval (bootstrap over worlds); random weights: the same network untrained.", "",
+        "| question | trained | random weights | chance | asked for | answers |", "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    untrained = {f["what"]: f for f in control}
+    for f in figures:
+        other = untrained.get(f["what"])
+        same = other is None or other["value"] == f["value"]
+        lines.append(
+            f"| {f['what']} | **{100 * f['value']:.1f} %** ({100 * f['low']:.1f} to {100 * f['high']:.1f}) "
+            f"| {'' if same or other is None else format(100 * other['value'], '.1f') + ' %'} "
+            f"| {'' if f['chance'] is None else format(100 * f['chance'], '.1f') + ' %'} "
+            f"| {'' if f['asked'] is None else format(100 * f['asked'], '.0f') + ' %'} | {f['count']} |"
+        )
+    missed = [f["what"] for f in figures if f["asked"] is not None and f["value"] < f["asked"]]
+    if missed:
+        lines += ["", "Short of what was asked for: " + "; ".join(missed) + "."]
+    lines += ["", "## Files", "", "| file | bytes | SHA-256 |", "|---|---|---|"]
+    for path in files:
+        lines.append(f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |")
+    return "\n".join(
+        [*lines, "", f"Made with torch {facts['torch']}, {facts['epochs']} epochs, seed {facts['seed']}.", ""]
+    )

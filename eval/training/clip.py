@@ -1,0 +1,197 @@
+"""Recipe of clip-small: pictures and sentences in one space, by contrast.
+
+A batch holds the looks of a world side by side, which differ in one attribute, and for every sentence another with one
+attribute wrong. A sentence that happens to be true of another picture of the batch is no negative: both know what
+they show, so such pairs are left out of the sum.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
+
+from attnwarp_eval.encoders.nets import ClipSmall
+from training.common import Run, crops, groups, rate
+from training.data import Pictures, load
+from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
+
+SEED = 1
+EPOCHS = 16
+BATCH = 192
+PEAK = 1.5e-3
+VOCABULARY = 1024
+
+Ints = npt.NDArray[np.int64]
+
+
+def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
+    """Byte-level byte pairs learned from captions: any text can be written with it, known words in a token or two."""
+    rng = np.random.default_rng([SEED, 10])
+    corpus = []
+    for _ in range(sentences):
+        shown = _any_attributes(rng)
+        corpus.append(sentence(told(shown, rng), rng, fillers=True))
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=VOCABULARY, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )  # fmt: skip
+    tokenizer.train_from_iterator(corpus, trainer)
+    tokenizer.post_processor = processors.TemplateProcessing(single="$A <end>", special_tokens=[("<end>", 1)])
+    tokenizer.enable_padding(pad_id=0, pad_token="<pad>")
+    tokenizer.enable_truncation(ClipSmall.length)
+    return tokenizer
+
+
+def _any_attributes(rng: np.random.Generator) -> tuple[int, ...]:
+    finish = int(rng.integers(len(FINISHES)))
+    color, second = rng.choice(len(COLORS), 2, replace=False)
+    return (
+        int(rng.integers(len(OBJECTS))), finish, int(color) if FINISHES[finish] in COLORED else -1,
+        int(second) if FINISHES[finish] in TWO_COLORED else -1, int(rng.integers(len(GROUNDS))), int(rng.integers(len(TIMES))),
+    )  # fmt: skip
+
+
+def tokens(tokenizer: Tokenizer, sentences: list[str]) -> torch.Tensor:
+    """(N, L) int64, padded with 0."""
+    return torch.tensor([code.ids for code in tokenizer.encode_batch(sentences)], dtype=torch.int64)
+
+
+def true_of(said: Ints, shown: Ints) -> npt.NDArray[np.bool_]:
+    """(N images, M captions) whether each caption is true of each picture; colours of a pair have no order."""
+    a, b = shown[:, None], said[None]
+    same = (b == -1) | (a == b)
+    swapped = (a[..., 2] == b[..., 3]) & (a[..., 3] == b[..., 2])
+    colors = (same[..., 2] & same[..., 3]) | swapped
+    # "a red ball" is said of a single colour; a red and white one is another thing.
+    single = (b[..., 1] == -1) & (b[..., 2] >= 0)
+    finish = np.where(single, np.isin(a[..., 1], [FINISHES.index("plain"), FINISHES.index("shiny")]), same[..., 1])
+    return same[..., 0] & finish & colors & same[..., 4] & same[..., 5]
+
+
+def wrong(said: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
+    """The caption with one of the attributes that it says replaced."""
+    thing, finish, color, second, ground, time = said
+    ways = [k for k, v in (("thing", thing), ("ground", ground), ("time", time)) if v >= 0]
+    if finish >= 0 or color >= 0:
+        ways += ["surface", "surface"]
+    if second >= 0:
+        ways.append("swap")
+    way = ways[int(rng.integers(len(ways)))] if ways else "thing"
+    while True:
+        other = _any_attributes(rng)
+        match way:
+            case "thing":
+                made = (other[0], finish, color, second, ground, time)
+            case "ground":
+                made = (thing, finish, color, second, other[4], time)
+            case "time":
+                made = (thing, finish, color, second, ground, other[5])
+            case _ if finish == -1 or FINISHES[finish] == "shiny":
+                made = (thing, finish, int(rng.integers(len(COLORS))), second, ground, time)
+                if rng.uniform() < 0.3:
+                    made = (thing, *other[1:4], ground, time)
+            case _:
+                made = (thing, *other[1:4], ground, time)
+        if made != said:
+            return made
+
+
+def pseudo_word(rng: np.random.Generator) -> str:
+    """A word that nobody knows, so that the text tower learns to read past those it does not know."""
+    starts, ends = (
+        ("b", "br", "cl", "d", "fl", "gr", "k", "l", "m", "pr", "s", "st", "t", "v", "z"),
+        ("ck", "l", "m", "n", "rd", "sh", "t", "x", ""),
+    )
+    vowels = "aeiou"
+    return "".join(
+        starts[int(rng.integers(len(starts)))] + vowels[int(rng.integers(5))] + ends[int(rng.integers(len(ends)))]
+        for _ in range(int(rng.integers(1, 4)))
+    )
+
+
+def _scattered(text: str, rng: np.random.Generator) -> str:
+    if rng.uniform() > 0.1:
+        return text
+    words = text.split()
+    words.insert(int(rng.integers(1, len(words) + 1)), pseudo_word(rng))
+    return " ".join(words)
+
+
+def loss_of(model: ClipSmall, images: torch.Tensor, texts: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """Symmetric contrast of N pictures and 2 N texts, the first N of which are theirs.
+
+    Args:
+        model: the two towers.
+        images: (N, 3, 128, 128).
+        texts: (2 N, L) tokens.
+        truth: (N, 2 N) bool, which texts are true of which pictures.
+    """
+    n = len(images)
+    with torch.autocast("cpu", torch.bfloat16):
+        i, t = model.images(images), model.texts(texts)
+    i, t = F.normalize(i.float(), dim=-1), F.normalize(t.float(), dim=-1)
+    logits = model.scale.clamp(max=4.6).exp() * i @ t.T
+    mine = torch.arange(n)
+    also = truth.clone()
+    also[mine, mine] = False
+    logits = logits.masked_fill(also, -torch.inf)
+    by_image = F.cross_entropy(logits, mine)
+    by_text = F.cross_entropy(logits[:, :n].T, mine)
+    return 0.5 * (by_image + by_text)
+
+
+def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
+    """Train clip-small; the checkpoint's path."""
+    torch.manual_seed(SEED)
+    tokenizer = make_tokenizer()
+    out.mkdir(parents=True, exist_ok=True)
+    tokenizer.save(str(out / "clip-small.tokenizer.json"))
+    model = ClipSmall(tokenizer.get_vocab_size()).to(memory_format=torch.channels_last)
+    sets = [load(data, "train"), load(data, "train-rendered")]
+    # A unit of the shuffle is all pictures of one view of a world: its looks belong into one batch.
+    units = [(k, rows) for k, pictures in enumerate(sets) for rows in _units(pictures)]
+    each = sum(len(rows) for _, rows in units) // BATCH
+    optimizer = torch.optim.AdamW(groups(model, 0.05), lr=PEAK, betas=(0.9, 0.98))
+
+    def epoch(number: int) -> dict[str, float]:
+        rng = np.random.default_rng([SEED, number])
+        order = rng.permutation(len(units))
+        flat = [(k, row) for u in order for k, rows in [units[u]] for row in rows]
+        model.train()
+        total = 0.0
+        for step in range(each):
+            for group in optimizer.param_groups:
+                group["lr"] = rate(number * each + step, epochs * each, PEAK, 200)
+            rows = flat[step * BATCH : (step + 1) * BATCH]
+            images = crops(np.stack([sets[k].images[r] for k, r in rows]), 128, rng, scale=(0.72, 1.0))
+            shown = np.stack([sets[k].attributes[r] for k, r in rows])
+            said = [told(tuple(int(v) for v in row), rng) for row in shown]
+            false = [wrong(s, rng) for s in said]
+            texts = [_scattered(sentence(s, rng, fillers=True), rng) for s in [*said, *false]]
+            truth = torch.from_numpy(true_of(np.array([*said, *false]), shown))
+            loss = loss_of(model, images, tokens(tokenizer, texts), truth)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+            optimizer.step()
+            total += float(loss.detach())
+        return {"loss": total / each, "scale": float(model.scale.detach().exp())}
+
+    checkpoint = out / "clip-small.pt"
+    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs).train(epoch)
+    return checkpoint
+
+
+def _units(pictures: Pictures) -> list[Ints]:
+    keys = pictures.world * 8 + pictures.view
+    order = np.argsort(keys, kind="stable")
+    return list(np.split(order, np.flatnonzero(np.diff(keys[order])) + 1))

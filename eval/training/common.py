@@ -1,0 +1,115 @@
+"""What the recipes share: crops, the learning rate, and checkpoints that training goes on from."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+
+Tensor = torch.Tensor
+
+
+def crops(
+    images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
+    turn: float = 8.0, tone: float = 0.12, flip: bool = True,
+) -> Tensor:  # fmt: skip
+    """Random crops of square pictures, turned, mirrored, brightened and darkened a little.
+
+    Args:
+        images: (N, S, S, 3).
+        out: side of a crop in px.
+        rng: to draw from.
+        scale: shares of S, of which the crop's side is drawn.
+        turn: degrees to either side.
+        tone: strength of the change in brightness and contrast; hues stay.
+        flip: whether half of the crops are mirrored.
+
+    Returns:
+        (N, 3, out, out) float32 in [0, 1], channels last.
+    """
+    return placed_crops(images, out, rng, scale=scale, turn=turn, tone=tone, flip=flip)[0]
+
+
+def placed_crops(
+    images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
+    turn: float = 8.0, tone: float = 0.12, flip: bool = True,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """As :func:`crops`, and where each came from: (N, 2, 3) maps from the crop's [-1, 1] to the picture's."""
+    n = len(images)
+    side = rng.uniform(*scale, n)
+    angle = np.radians(rng.uniform(-turn, turn, n))
+    mirror = np.where(rng.uniform(size=n) < 0.5, -1.0, 1.0) if flip else np.ones(n)
+    free = np.maximum(1 - side * (np.abs(np.cos(angle)) + np.abs(np.sin(angle))), 0)
+    shift = rng.uniform(-1, 1, (n, 2)) * free[:, None]
+    theta = np.zeros((n, 2, 3))
+    theta[:, 0, 0], theta[:, 0, 1] = side * np.cos(angle) * mirror, -side * np.sin(angle)
+    theta[:, 1, 0], theta[:, 1, 1] = side * np.sin(angle) * mirror, side * np.cos(angle)
+    theta[:, :, 2] = shift
+    x = torch.from_numpy(images).permute(0, 3, 1, 2).float().div_(255)
+    shrink = scale[1] * images.shape[1] / out
+    if shrink >= 2:  # bilinear taps would alias
+        x = F.avg_pool2d(x, int(shrink))
+    grid = F.affine_grid(torch.from_numpy(theta).float(), [n, 3, out, out], align_corners=False)
+    x = F.grid_sample(x, grid, padding_mode="reflection", align_corners=False)
+    if tone:
+        gain = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
+        gamma = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
+        x = (x.clamp(1e-4, 1) ** gamma) * gain
+    return x.clamp(0, 1).to(memory_format=torch.channels_last), torch.from_numpy(theta).float()
+
+
+def rate(step: int, total: int, peak: float, warm: int) -> float:
+    """The learning rate: linear up to ``peak``, then half a cosine down to a hundredth of it."""
+    if step < warm:
+        return peak * (step + 1) / warm
+    done = (step - warm) / max(1, total - warm)
+    return peak * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+def groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
+    """Parameters for AdamW: matrices decay, biases, norms and scales do not."""
+    matrices = [p for p in model.parameters() if p.ndim >= 2]
+    others = [p for p in model.parameters() if p.ndim < 2]
+    return [{"params": matrices, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
+
+
+@dataclass
+class Run:
+    """A training run that can be killed and gone on with: its state is written after every epoch.
+
+    Attributes:
+        path: of the checkpoint.
+        state: everything that has a ``state_dict``, by name.
+        epochs: how many in all.
+    """
+
+    path: Path
+    state: dict[str, Any]
+    epochs: int
+
+    def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
+        """Run the epochs that are left; each draws from generators seeded by its number, so a resumed run is the same."""
+        first = 0
+        if self.path.exists():
+            stored = torch.load(self.path, weights_only=True)
+            for name, thing in self.state.items():
+                thing.load_state_dict(stored[name])
+            first = int(stored["epoch"])
+        for number in range(first, self.epochs):
+            start = time.perf_counter()
+            said = epoch(number)
+            words = ", ".join(f"{k} {v:.4g}" for k, v in said.items())
+            print(f"epoch {number + 1}/{self.epochs}: {words}, {time.perf_counter() - start:.0f} s", flush=True)
+            temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
+            kept = {name: thing.state_dict() for name, thing in self.state.items()}
+            torch.save({**kept, "epoch": number + 1}, temporary)
+            temporary.replace(self.path)

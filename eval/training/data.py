@@ -1,0 +1,157 @@
+"""Pictures of random worlds on disk, in shards: seeded, resumable, the same whatever the number of workers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from training.worlds import FINISHES, OBJECTS, Look, attributes, change, draw_look, draw_world
+
+DATA_PROTOCOL = 1
+"""Raised whenever the same seed would give other pictures."""
+
+SIZE = 160
+"""Pixels along a side; crops are taken from it, so more than the 128 that the encoders see."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """A set of worlds.
+
+    Attributes:
+        first: seed of the first world; the seeds of splits do not meet.
+        worlds: how many.
+        shard: worlds in a file.
+        pairs: colours of the objects: "seen" in training, "new", or "any".
+        new_shapes: whether the shapes are ones that training never sees.
+        path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the ray caster (three
+            looks, two views).
+    """
+
+    first: int
+    worlds: int
+    shard: int = 50
+    pairs: str = "seen"
+    new_shapes: bool = False
+    path_traced: bool = False
+
+
+SPLITS = {
+    "train": Split(0, 2500),
+    "train-rendered": Split(1_000_000, 500, path_traced=True),
+    "test": Split(2_000_000, 400, pairs="any", new_shapes=True),
+    "test-new-pairs": Split(3_000_000, 200, pairs="new", new_shapes=True),
+    "test-rendered": Split(4_000_000, 200, pairs="any", new_shapes=True, path_traced=True),
+}
+"""Everything that the recipes train and are measured on."""
+
+SPP = 16
+TEXELS = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures with what they show.
+
+    Attributes:
+        images: (N, size, size, 3) uint8 sRGB.
+        attributes: (N, 6) as :data:`training.worlds.ATTRIBUTES`.
+        world: (N,) seed of the world.
+        view: (N,) which of its cameras.
+        look: (N,) which of its looks; 1 differs from 0 in one attribute, 2 in everything that was drawn.
+    """
+
+    images: npt.NDArray[np.uint8]
+    attributes: npt.NDArray[np.int64]
+    world: npt.NDArray[np.int64]
+    view: npt.NDArray[np.int64]
+    look: npt.NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def looks_of(seed: int, thing: int, split: Split) -> list[Look]:
+    """The looks of a world: one, the same with one attribute changed, and another."""
+    rng = np.random.default_rng([seed, 6])
+    first = draw_look(thing, rng, pairs=split.pairs)
+    if split.path_traced:
+        # Mitsuba's plastic cannot have the colours of a mesh's vertices, which bodies have.
+        while FINISHES[first.finish] == "shiny":
+            first = draw_look(thing, rng, pairs=split.pairs)
+        return [first]
+    # What the test for directions changes is drawn like everything else.
+    what = ("surface", "surface", "ground", "time")[int(rng.integers(4))]
+    return [first, change(first, what, thing, rng, pairs=split.pairs), draw_look(thing, rng, pairs=split.pairs)]
+
+
+def render_world(
+    seed: int, split: Split, size: int = SIZE
+) -> Iterator[tuple[npt.NDArray[np.uint8], tuple[int, ...], int, int]]:
+    """The pictures of one world: image, attributes, view, look."""
+    from training.render import pictures
+
+    # Objects come in turn, so that every word is seen as often.
+    world = draw_world(seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS))
+    looks = looks_of(seed, world.thing, split)
+    if split.path_traced:
+        from attnwarp_eval.colors import to_srgb
+        from attnwarp_eval.effects import plan
+        from attnwarp_eval.truth import mitsuba
+
+        # Baking textures as finely as truth wants them takes ten times as long as the small picture itself.
+        mitsuba.TEXELS = TEXELS
+        scene = world.scene(looks[0], size)
+        image = to_srgb(mitsuba.render_plan(scene, scene.source, plan(scene, SPP), seed))
+        yield np.rint(255 * image).astype(np.uint8), attributes(world.thing, looks[0]), 0, 0
+        return
+    for view in range(world.views):
+        made, _ = pictures(world, looks, size, view=view)
+        for look, image in enumerate(made):
+            yield image, attributes(world.thing, looks[look]), view, look
+
+
+def _make_shard(path: Path, split: Split, start: int) -> Path:
+    rows = []
+    for seed in range(start, min(start + split.shard, split.first + split.worlds)):
+        rows += [(image, shown, seed, view, look) for image, shown, view, look in render_world(seed, split)]
+    images, shown, world, view, look = zip(*rows, strict=True)
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        np.savez(file, images=np.stack(images), attributes=np.array(shown), world=world, view=view, look=look)
+    temporary.replace(path)
+    return path
+
+
+def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
+    """Render what is missing of a split; the files of it, in order."""
+    from rich.progress import Progress
+
+    split = SPLITS[name]
+    folder.mkdir(parents=True, exist_ok=True)
+    starts = range(split.first, split.first + split.worlds, split.shard)
+    files = [folder / f"{name}-v{DATA_PROTOCOL}-{start}.npz" for start in starts]
+    missing = [(path, start) for path, start in zip(files, starts, strict=True) if not path.exists()]
+    if missing:
+        with Progress() as bar, ProcessPoolExecutor(workers) as pool:
+            task = bar.add_task(f"pictures: {name}", total=len(files), completed=len(files) - len(missing))
+            for done in as_completed([pool.submit(_make_shard, path, split, start) for path, start in missing]):
+                done.result()
+                bar.advance(task)
+    return files
+
+
+def load(folder: Path, name: str, workers: int = 2) -> Pictures:
+    """The pictures of a split, rendered where they are missing."""
+    found: dict[str, list[npt.NDArray]] = {}
+    for path in make(folder, name, workers):
+        with np.load(path) as stored:
+            for key in stored.files:
+                found.setdefault(key, []).append(stored[key])
+    return Pictures(**{key: np.concatenate(parts) for key, parts in found.items()})

@@ -1,0 +1,170 @@
+"""Recipe of dino-small: self-distillation with multi-crop (Caron et al. 2021), without labels.
+
+A student sees small crops and has to say what a teacher, its own moving average, says of large ones. Both large crops show
+one thing from two sides, so that what stays the same from side to side is what is learned. Patches are
+taught too: a small crop's patches say what the teacher's patches at the same place of the same picture say (a dense
+form of the same loss, as in Zhou et al. 2022 without masks).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from attnwarp_eval.encoders.nets import DinoSmall
+from training.common import Run, groups, placed_crops, rate
+from training.data import Pictures, load
+
+SEED = 2
+EPOCHS = 16
+BATCH = 48
+PEAK = 1.2e-3
+LARGE, SMALL = 96, 48
+PROTOTYPES = 1024
+DENSE_PROTOTYPES = 192
+STUDENT_TEMPERATURE, TEACHER_TEMPERATURE = 0.1, 0.05
+DENSE = 0.5
+"""Weight of the patches' loss beside the class token's."""
+
+Tensor = torch.Tensor
+
+
+class Head(nn.Module):
+    """A projection to scores of prototypes, its last layer normalised, as in DINO."""
+
+    def __init__(self, dim: int, hidden: int, count: int) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(nn.Linear(dim, hidden), nn.GELU(), nn.Linear(hidden, 128))
+        self.prototypes = nn.Parameter(torch.randn(count, 128) / 11)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., dim) -> (..., count)."""
+        return F.normalize(self.mlp(x), dim=-1) @ F.normalize(self.prototypes, dim=-1).T
+
+
+class Distiller(nn.Module):
+    """A network with one head for the class token and one for patches."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net = DinoSmall()
+        self.head = Head(self.net.dim, 512, PROTOTYPES)
+        self.dense = Head(self.net.dim, 256, DENSE_PROTOTYPES)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, H, W) -> class scores (N, P), patch scores (N, P, h, w)."""
+        cls, patches = self.net(x)
+        return self.head(cls), self.dense(patches.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+def places(inner: Tensor, outer: Tensor, size: int) -> Tensor:
+    """Where the patches of one crop lie in another crop of the same picture.
+
+    Args:
+        inner, outer: (N, 2, 3) maps of the crops to the picture's [-1, 1].
+        size: patches along a side of the inner crop.
+
+    Returns:
+        (N, size, size, 2) in the outer crop's [-1, 1]; outside of it where it does not reach.
+    """
+    grid = F.affine_grid(inner, [len(inner), 1, size, size], align_corners=False)
+    turn, shift = outer[:, :, :2], outer[:, None, None, :, 2]
+    return torch.einsum("nij,nhwj->nhwi", torch.linalg.inv(turn), grid - shift)
+
+
+def _views(pictures: Pictures) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+    """For every world and surface: the pictures from its first side, and from its second."""
+    surface = pictures.attributes[:, 1:4]
+    keys: dict[tuple[int, ...], tuple[list[int], list[int]]] = {}
+    for row in range(len(pictures)):
+        key = (int(pictures.world[row]), *(int(v) for v in surface[row]))
+        keys.setdefault(key, ([], []))[int(pictures.view[row])].append(row)
+    return [(np.array(a), np.array(b)) for a, b in keys.values()]
+
+
+def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
+    """Train dino-small; the checkpoint's path."""
+    torch.manual_seed(SEED)
+    out.mkdir(parents=True, exist_ok=True)
+    pictures = load(data, "train")
+    things = _views(pictures)
+    student = Distiller().to(memory_format=torch.channels_last)
+    teacher = copy.deepcopy(student)
+    teacher.requires_grad_(False)
+    sizes = {"cls": PROTOTYPES, "dense": DENSE_PROTOTYPES}
+    center = nn.ParameterDict(
+        {name: nn.Parameter(torch.zeros(size), requires_grad=False) for name, size in sizes.items()}
+    )
+    optimizer = torch.optim.AdamW(groups(student, 0.05), lr=PEAK)
+    each = len(things) // BATCH
+
+    def soften(scores: Tensor, name: str, dim: int) -> Tensor:
+        shape = [1] * scores.ndim
+        shape[dim] = -1
+        middle = center[name].detach().view(shape)
+        mean = scores.mean(dim=[k for k in range(scores.ndim) if k != dim])
+        center[name].data.mul_(0.9).add_(mean, alpha=0.1)
+        return F.softmax((scores - middle) / TEACHER_TEMPERATURE, dim=dim)
+
+    def epoch(number: int) -> dict[str, float]:
+        rng = np.random.default_rng([SEED, number])
+        order = rng.permutation(len(things))
+        student.train()
+        teacher.train()
+        sums = np.zeros(3)
+        for step in range(each):
+            now = number * each + step
+            for group in optimizer.param_groups:
+                group["lr"] = rate(now, epochs * each, PEAK, 200)
+            chosen = [things[k] for k in order[step * BATCH : (step + 1) * BATCH]]
+            sides = [
+                np.stack([pictures.images[rows[int(rng.integers(len(rows)))]] for rows in side])
+                for side in zip(*chosen, strict=True)
+            ]
+            large = [placed_crops(side, LARGE, rng, scale=(0.6, 1.0), tone=0.2) for side in sides]
+            small = [placed_crops(side, SMALL, rng, scale=(0.25, 0.5), tone=0.2) for side in sides]
+            with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+                t_cls, t_patch = teacher(torch.cat([x for x, _ in large]))
+            with torch.autocast("cpu", torch.bfloat16):
+                s_large, _ = student(torch.cat([x for x, _ in large]))
+                s_small, s_small_patch = student(torch.cat([x for x, _ in small]))
+            target = soften(t_cls.float(), "cls", 1).chunk(2)
+            dense_target = soften(t_patch.float(), "dense", 1).chunk(2)
+            by_crop = [F.log_softmax(s / STUDENT_TEMPERATURE, dim=1) for s in (*s_large.chunk(2), *s_small.chunk(2))]
+            terms = [-(t * s).sum(1).mean() for k, t in enumerate(target) for j, s in enumerate(by_crop) if j != k]
+            cls = torch.stack(terms).mean()
+            dense_terms = []
+            for side, scores in enumerate(s_small_patch.chunk(2)):
+                at = places(small[side][1], large[side][1], SMALL // DinoSmall.patch)
+                inside = (at.abs() <= 1).all(dim=-1)
+                wanted = F.grid_sample(dense_target[side], at, align_corners=False)
+                loss = -(wanted * F.log_softmax(scores.float() / STUDENT_TEMPERATURE, dim=1)).sum(1)
+                dense_terms.append((loss * inside).sum() / inside.sum().clamp(min=1))
+            dense = torch.stack(dense_terms).mean()
+            loss = cls + DENSE * dense
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(student.parameters(), 2.0)
+            if number == 0:  # the prototypes stand still at first, which keeps the start from collapsing
+                student.head.prototypes.grad = student.dense.prototypes.grad = None
+            optimizer.step()
+            keep = 1 - 0.01 * (0.5 + 0.5 * math.cos(math.pi * now / (epochs * each)))
+            with torch.no_grad():
+                for mine, theirs in zip(teacher.parameters(), student.parameters(), strict=True):
+                    mine.lerp_(theirs, 1 - keep)
+            entropy = -(target[0].mean(0) * (target[0].mean(0) + 1e-9).log()).sum()
+            sums += [float(cls.detach()), float(dense.detach()), float(entropy)]
+        return dict(zip(("class", "patches", "entropy"), sums / each, strict=True))
+
+    checkpoint = out / "dino-small.pt"
+    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer, "center": center}, epochs).train(
+        epoch
+    )
+    return checkpoint

@@ -1,0 +1,150 @@
+"""Pictures of random worlds by ray casting: every look of a world from one set of rays.
+
+Direct light of sun and sky on the surfaces, as :mod:`attnwarp_eval.truth.shading` has it, and one reflection for
+what is shiny or of metal. About twenty pictures a second; Mitsuba, which renders a share of the data, makes five.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene import Scene, SceneSpec, SkySpec, SunSpec
+from attnwarp_eval.textures import albedo, linear_rgb
+from attnwarp_eval.truth import Geometry
+from attnwarp_eval.truth.raycast import Hits
+from attnwarp_eval.truth.shading import hemisphere, sky_radiance, sun_direction
+from training.worlds import FINISHES, Look, World
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+SKY_RAYS = 12
+"""Toward the sky from each point, shared by all looks. Their error is noise, which training may see."""
+
+REFLECTANCE = {"golden": (1.0, 0.77, 0.34), "silver": (0.96, 0.96, 0.95), "bronze": (0.75, 0.44, 0.25)}
+"""At normal incidence, linear (measured metals, bronze with the tint that scenes give it)."""
+
+
+def pictures(world: World, looks: Sequence[Look], size: int, *, view: int = 0) -> tuple[list[Image], Hits]:
+    """One view of a world in several looks.
+
+    Args:
+        world: what to show.
+        looks: how; geometry is traced once for all of them.
+        size: width and height in pixels.
+        view: which of the world's cameras.
+
+    Returns:
+        (size, size, 3) sRGB pictures, and what the rays hit.
+    """
+    scenes = [world.scene(look, size) for look in looks]
+    # Details have their colours in the shape; a statue's look leaves them out when it is shaded.
+    geometry = Geometry(Scene(SceneSpec.model_validate(world.spec(looks[0], size, statue=False))))
+    camera = scenes[0].cameras[view]
+    hits = geometry.trace(camera)
+    seen = hits.valid
+    points, normals, ids = hits.point[seen], hits.normal[seen], hits.primitive_id[seen]
+    directions = camera.directions() @ camera.rotation
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    free = [(d, geometry.reached(points + 2 * geometry.extent * d, points, ids)) for d in hemisphere(normals, SKY_RAYS)]
+    mirrored = _mirrored(geometry, points, normals, directions[seen], ids)
+    out = []
+    for scene, look in zip(scenes, looks, strict=True):
+        radiance = _sky(scene, directions.reshape(-1, 3)).reshape(*seen.shape, 3)
+        radiance[seen] = _radiance(scene, look, geometry, points, normals, ids, directions[seen], free, mirrored)
+        out.append(np.rint(255 * to_srgb(radiance)).astype(np.uint8))
+    return out, hits
+
+
+def _mirrored(
+    geometry: Geometry, points: Array, normals: Array, directions: Array, ids: npt.NDArray[np.int64]
+) -> tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]]:
+    """Where the object's mirror directions lead: direction, which of the points, and what they meet there."""
+    mine = np.flatnonzero(geometry.object_of(ids) == 0)
+    d, n = directions[mine], normals[mine]
+    away = d - 2 * np.einsum("ij,ij->i", d, n)[:, None] * n
+    met = geometry.trace_rays(points[mine] + 1e-4 * geometry.extent * n, away)
+    hit = np.isfinite(met.point).all(axis=-1)
+    return away, mine, met.point[hit], met.normal[hit], np.where(hit, np.cumsum(hit) - 1, -1)
+
+
+def _radiance(
+    scene: Scene, look: Look, geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
+    directions: Array, free: list[tuple[Array, npt.NDArray[np.bool_]]],
+    mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
+) -> Array:  # fmt: skip
+    color = _albedo(scene, look, geometry, points, ids)
+    light = np.zeros((len(points), 3))
+    for spec in scene.spec.lights:
+        if isinstance(spec, SunSpec):
+            toward = sun_direction(spec)
+            cosine = normals @ toward
+            lit = np.flatnonzero(cosine > 0)
+            lit = lit[geometry.reached(points[lit] + 2 * geometry.extent * toward, points[lit], ids[lit])]
+            light[lit] += cosine[lit, None] * spec.irradiance * np.array(linear_rgb(spec.color))
+    for direction, reached in free:
+        light += np.where(reached[:, None], _sky(scene, direction), 0) * (np.pi / len(free))
+    radiance = color * light / np.pi
+    finish = FINISHES[look.finish]
+    if finish != "shiny" and finish not in REFLECTANCE:
+        return radiance
+    away, mine, there, _, index = mirrored
+    # What a mirror ray meets is shown under an even light: its own shadows are not traced.
+    ambient = _sky(scene, np.array([[0.0, 0.0, 1.0]]))[0] * 0.6 + _sun(scene) * 0.25
+    reflected = _sky(scene, away) + _glint(scene, away, look)
+    hit = index >= 0
+    if hit.any():
+        ground = np.array([linear_rgb(c) for c in scene.spec.objects[1].texture.colors]).mean(axis=0)  # type: ignore[union-attr]
+        low = there[index[hit]][:, 2:3] < 1e-3
+        reflected[hit] = np.where(low, ground, 0.25) * ambient
+    cosine = np.clip(-np.einsum("ij,ij->i", directions[mine], normals[mine]), 0, 1)[:, None]
+    if finish == "shiny":
+        base = np.full(3, 0.04)
+        fresnel = base + (1 - base) * (1 - cosine) ** 5
+        radiance[mine] = (1 - fresnel) * radiance[mine] + fresnel * reflected
+        return radiance
+    base = np.array(REFLECTANCE[finish])
+    fresnel = base + (1 - base) * (1 - cosine) ** 5
+    # A rough metal scatters some of the light about it, which the mirror ray alone would miss.
+    radiance[mine] = fresnel * (0.65 * reflected + 0.35 * light[mine] / np.pi)
+    return radiance
+
+
+def _albedo(scene: Scene, look: Look, geometry: Geometry, points: Array, ids: npt.NDArray[np.int64]) -> Array:
+    objects = geometry.object_of(ids)
+    color = np.zeros((len(points), 3))
+    for k, item in enumerate(scene.spec.objects):
+        mine = objects == k
+        if mine.any():
+            color[mine] = albedo(item.texture, points[mine])
+    tint = geometry.tint(points, ids)
+    return color if look.statue else color * tint
+
+
+def _sky(scene: Scene, directions: Array) -> Array:
+    total = np.zeros((len(directions), 3))
+    for spec in scene.spec.lights:
+        if isinstance(spec, SkySpec):
+            total += sky_radiance(spec, directions)
+    return total
+
+
+def _sun(scene: Scene) -> Array:
+    suns = [s for s in scene.spec.lights if isinstance(s, SunSpec)]
+    return sum((s.irradiance * np.array(linear_rgb(s.color)) for s in suns), np.zeros(3)) / np.pi
+
+
+def _glint(scene: Scene, away: Array, look: Look) -> Array:
+    """The sun in a rough mirror: a lobe as wide as the roughness, with the sun's irradiance in it."""
+    total = np.zeros((len(away), 3))
+    width = 0.1 if FINISHES[look.finish] == "shiny" else 0.25
+    for spec in scene.spec.lights:
+        if isinstance(spec, SunSpec):
+            angle = 1 - away @ sun_direction(spec)
+            lobe = np.exp(-2 * angle / width**2) / (np.pi * width**2)
+            total += lobe[:, None] * spec.irradiance * np.array(linear_rgb(spec.color))
+    return total
