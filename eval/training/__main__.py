@@ -78,7 +78,7 @@ def assess(name: str, data: Data = DATA, weights: Weights = WEIGHTS, threads: Th
         if name == "clip-small":
             found = questions.clip_figures(encoder, sets)
         elif name == "dino-small":
-            found = questions.dino_figures(encoder, sets["test"])
+            found = questions.dino_figures(encoder, sets)
         else:
             found = questions.perceptual_figures(encoder, sets["test"].images)
         return [f.to_dict() for f in found]

@@ -126,11 +126,12 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
         sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered" (by Mitsuba).
     """
     found = []
+    titles = {"test": "new shapes", "test-new-pairs": "new pairs of colour and object", "test-rendered": "path-traced"}
+    sets = {name: sets[name] for name in titles}
     embedded = {name: _unit(encoder.images(as_float(p.images))) for name, p in sets.items()}
     labels = {
         what: word_embeddings(encoder, _phrases(what)) for what in ("object", "color", "material", "ground", "time")
     }
-    titles = {"test": "new shapes", "test-new-pairs": "new pairs of colour and object", "test-rendered": "path-traced"}
     for name, pictures in sets.items():
         images, shown = embedded[name], pictures.attributes
         kinds = np.array(FINISHES)[shown[:, 1]]
@@ -224,15 +225,17 @@ def _viewpoint(images: Array, pictures: Pictures, labels: dict[str, Array]) -> F
 # dino-small ----------------------------------------------------------------------------------------------------------
 
 
-def nearest(features: Array, pictures: Pictures, *, relit: bool, seed: int = 3) -> tuple[list[bool], list[int]]:
+def nearest(features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3) -> tuple[list[bool], list[int]]:
     """Nearest neighbour among one view each of 64 things, for the other view of one of them.
 
     Args:
         features: (N, D); compared by their cosine.
         pictures: whose they are.
-        relit: the query shows the thing on another ground or at another time of day (its own look 1, where that
-            changed no surface).
+        look: of the query; the 64 are seen in look 0.
         seed: of the galleries.
+
+    Returns:
+        Whether the nearest is the thing itself, and the thing's world, for every world.
     """
     rng = np.random.default_rng(seed)
     unit = _unit(features)
@@ -241,18 +244,12 @@ def nearest(features: Array, pictures: Pictures, *, relit: bool, seed: int = 3) 
         for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))
     }
     worlds = sorted({w for w, _, _ in index})
-    right, asked = [], []
+    right = []
     for world in worlds:
-        query = index[world, 1, 0]
-        if relit:
-            query = index[world, 1, 1]
-            if (pictures.attributes[query, 1:4] != pictures.attributes[index[world, 0, 0], 1:4]).any():
-                continue
         others = rng.choice([w for w in worlds if w != world], 63, replace=False)
         gallery = [index[world, 0, 0], *(index[int(w), 0, 0] for w in others)]
-        right.append(bool((unit[gallery] @ unit[query]).argmax() == 0))
-        asked.append(world)
-    return right, asked
+        right.append(bool((unit[gallery] @ unit[index[world, 1, look]]).argmax() == 0))
+    return right, worlds
 
 
 def histograms(images: npt.NDArray[np.uint8]) -> Array:
@@ -270,21 +267,28 @@ def raw_pixels(images: npt.NDArray[np.uint8]) -> Array:
     return small - small.mean(axis=1, keepdims=True, dtype=np.float64)
 
 
-def dino_figures(encoder: TokenEncoder, pictures: Pictures, *, parts: int = 60) -> list[Figure]:
-    """Finding a thing from another side, and parts of it; beside raw pixels and colour histograms."""
+def dino_figures(encoder: TokenEncoder, sets: dict[str, Pictures], *, parts: int = 60) -> list[Figure]:
+    """Finding a thing from another side, and parts of it; beside raw pixels and colour histograms.
+
+    Args:
+        encoder: to be judged.
+        sets: "test-bare" (things alone, all on the same grass in the same light), "test" (each in its own place) and
+            "test-moved" (each on another ground at another time).
+        parts: worlds for the correspondence of parts.
+    """
     found = []
-    features = {"class token": encoder.images(as_float(pictures.images))}
-    features |= {"raw pixels": raw_pixels(pictures.images), "colour histogram": histograms(pictures.images)}
-    for name, values in features.items():
-        for relit in (False, True):
-            right, worlds = nearest(values, pictures, relit=relit)
-            where = "on other ground or at another time" if relit else "same light"
-            asked = 0.85 if name == "class token" and not relit else None
-            found.append(
-                figure(
-                    f"the thing from another side among 64, {where}: {name}", right, worlds, chance=1 / 64, asked=asked
-                )
-            )
+    where = {
+        "test-bare": "all on the same grass", "test": "each in its own place", "test-moved": "moved to another ground and time",
+    }  # fmt: skip
+    for name, words in where.items():
+        pictures = sets[name]
+        features = {"class token": encoder.images(as_float(pictures.images))}
+        features |= {"raw pixels": raw_pixels(pictures.images), "colour histogram": histograms(pictures.images)}
+        for what, values in features.items():
+            right, worlds = nearest(values, pictures, look=1 if name == "test-moved" else 0)
+            asked = 0.85 if what == "class token" and name == "test-bare" else None
+            title = f"the thing from another side among 64, {words}: {what}"
+            found.append(figure(title, right, worlds, chance=1 / 64, asked=asked))
     return found + part_figures(encoder, parts)
 
 
@@ -394,7 +398,7 @@ def perceptual_figures(
 
 def test_sets(data: Path) -> dict[str, Pictures]:
     """The held-out pictures, rendered where they are missing."""
-    return {name: load(data, name) for name in ("test", "test-new-pairs", "test-rendered")}
+    return {name: load(data, name) for name in SPLITS if name.startswith("test")}
 
 
 __all__ = [

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from training.worlds import FINISHES, OBJECTS, Look, attributes, change, draw_look, draw_world
+from training.worlds import FINISHES, GROUNDS, OBJECTS, TIMES, Look, attributes, change, draw_look, draw_world
 
 DATA_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""
@@ -30,8 +30,11 @@ class Split:
         shard: worlds in a file.
         pairs: colours of the objects: "seen" in training, "new", or "any".
         new_shapes: whether the shapes are ones that training never sees.
-        path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the ray caster (three
-            looks, two views).
+        path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the ray caster (two
+            views of each look).
+        moved: whether all looks of a world have its surface, on other grounds at other times; else there are three, of
+            which the second differs from the first in one attribute.
+        bare: whether every thing stands alone on the same grass by day, so that nothing but the thing tells it apart.
     """
 
     first: int
@@ -40,13 +43,18 @@ class Split:
     pairs: str = "seen"
     new_shapes: bool = False
     path_traced: bool = False
+    moved: bool = False
+    bare: bool = False
 
 
 SPLITS = {
     "train": Split(0, 2500),
+    "train-moved": Split(6_000_000, 2000, moved=True),
     "train-rendered": Split(1_000_000, 500, path_traced=True),
     "test": Split(2_000_000, 400, pairs="any", new_shapes=True),
     "test-new-pairs": Split(3_000_000, 200, pairs="new", new_shapes=True),
+    "test-bare": Split(7_000_000, 200, pairs="any", new_shapes=True, bare=True),
+    "test-moved": Split(8_000_000, 200, pairs="any", new_shapes=True, moved=True),
     "test-rendered": Split(4_000_000, 200, pairs="any", new_shapes=True, path_traced=True),
 }
 """Everything that the recipes train and are measured on."""
@@ -86,6 +94,13 @@ def looks_of(seed: int, thing: int, split: Split) -> list[Look]:
         while FINISHES[first.finish] == "shiny":
             first = draw_look(thing, rng, pairs=split.pairs)
         return [first]
+    if split.bare:
+        return [replace(first, ground=GROUNDS.index("grass"), time=TIMES.index("day"))]
+    if split.moved:
+        other = draw_look(thing, rng, pairs="any")
+        while other.ground == first.ground or other.time == first.time:
+            other = draw_look(thing, rng, pairs="any")
+        return [first, replace(first, ground=other.ground, time=other.time)]
     # What the test for directions changes is drawn like everything else.
     what = ("surface", "surface", "ground", "time")[int(rng.integers(4))]
     return [first, change(first, what, thing, rng, pairs=split.pairs), draw_look(thing, rng, pairs=split.pairs)]
@@ -98,7 +113,7 @@ def render_world(
     from training.render import pictures
 
     # Objects come in turn, so that every word is seen as often.
-    world = draw_world(seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS))
+    world = draw_world(seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS), bare=split.bare)
     looks = looks_of(seed, world.thing, split)
     if split.path_traced:
         from attnwarp_eval.colors import to_srgb

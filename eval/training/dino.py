@@ -23,7 +23,7 @@ from training.common import Run, groups, placed_crops, rate
 from training.data import Pictures, load
 
 SEED = 2
-EPOCHS = 16
+EPOCHS = 7
 BATCH = 48
 PEAK = 1.2e-3
 LARGE, SMALL = 96, 48
@@ -93,8 +93,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     """Train dino-small; the checkpoint's path."""
     torch.manual_seed(SEED)
     out.mkdir(parents=True, exist_ok=True)
-    pictures = load(data, "train")
-    things = _views(pictures)
+    # Things that move from ground to ground teach that the ground is not the thing; they come as often as the others.
+    sets = [load(data, "train-moved"), load(data, "train")]
+    things = [(k, *views) for k, pictures in enumerate(sets) for views in _views(pictures) for _ in range((3, 1)[k])]
     student = Distiller().to(memory_format=torch.channels_last)
     teacher = copy.deepcopy(student)
     teacher.requires_grad_(False)
@@ -124,10 +125,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for group in optimizer.param_groups:
                 group["lr"] = rate(now, epochs * each, PEAK, 200)
             chosen = [things[k] for k in order[step * BATCH : (step + 1) * BATCH]]
-            sides = [
-                np.stack([pictures.images[rows[int(rng.integers(len(rows)))]] for rows in side])
-                for side in zip(*chosen, strict=True)
-            ]
+            # Never the same look from both sides, where there are two: ground and light must not tell things apart.
+            drawn = [(sets[k].images, a[n % len(a)], b[(n + 1) % len(b)]) for k, a, b in chosen for n in [int(rng.integers(2))]]
+            sides = [np.stack([images[a] for images, a, _ in drawn]), np.stack([images[b] for images, _, b in drawn])]
             large = [placed_crops(side, LARGE, rng, scale=(0.6, 1.0), tone=0.2) for side in sides]
             small = [placed_crops(side, SMALL, rng, scale=(0.25, 0.5), tone=0.2) for side in sides]
             with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):

@@ -22,10 +22,10 @@ from training.data import load
 from training.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair
 
 SEED = 3
-EPOCHS = 12
-STEPS = 250
-BATCH = 24
-SIZE = 96
+EPOCHS = 10
+STEPS = 200
+BATCH = 16
+SIZE = 64
 PEAK = 2e-3
 
 HELD_OUT_PHOTOS = ("chelsea.png", "rocket.jpg", "gravel.png", "coins.png")
@@ -116,8 +116,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for group in optimizer.param_groups:
                 group["lr"] = rate(number * STEPS + step, epochs * STEPS, PEAK, 100)
             x, weak, strong, strengths = _batch(lambda: triple(sources, rng, TRAIN_KINDS), BATCH)
-            d = model(torch.cat([x, x]), torch.cat([weak, strong]))
-            near, far = d.chunk(2)
+            seen = [y.chunk(3) for y in model.stack(torch.cat([x, weak, strong]))]
+            near, far = (model.between([y[0] for y in seen], [y[k] for y in seen]) for k in (1, 2))
+            d = torch.cat([near, far])
             order = F.softplus(-4 * (torch.log(far + 1e-5) - torch.log(near + 1e-5))).mean()
             # So that the number itself reads as a strength: 1 is ruined.
             reads = (d.sqrt() - strengths.T.reshape(-1) / 5).square().mean()

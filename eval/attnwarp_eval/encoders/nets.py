@@ -222,12 +222,18 @@ class PerceptualSmall(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """(N, 3, H, W) twice -> (N,) distances, 0 for equal pictures, symmetric."""
-        size = 4 if min(a.shape[-2:]) >= 4 else 1
-        total = (F.avg_pool2d(a, size) - F.avg_pool2d(b, size)).square().mean((2, 3)) @ self.color_log_weight.exp()
-        for x, y, weight in zip(self.features(a), self.features(b), self.log_weights, strict=True):
-            difference = (_unit(x) - _unit(y)).square().mean((2, 3))
-            total = total + difference @ weight.exp()
-        return total
+        return self.between(self.stack(a), self.stack(b))
+
+    def stack(self, x: Tensor) -> list[Tensor]:
+        """What is compared of pictures: themselves averaged over 4 x 4 px, then their unit features."""
+        size = 4 if min(x.shape[-2:]) >= 4 else 1
+        return [F.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
+
+    def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
+        """(N,) distances of what :meth:`stack` gave."""
+        weights = [self.color_log_weight, *self.log_weights]
+        parts = [(x - y).square().mean((2, 3)) @ w.exp() for x, y, w in zip(a, b, weights, strict=True)]
+        return torch.stack(parts).sum(dim=0)
 
 
 def _unit(x: Tensor) -> Tensor:
