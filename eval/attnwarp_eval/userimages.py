@@ -87,7 +87,7 @@ class Row:
         return [name for name, value in self.views.items() if np.isinf(value)]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Measured:
     """Everything that was measured on a person's pictures, and everything that was not.
 
@@ -230,9 +230,9 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
     return np.clip(values[..., :3] * alpha + (1 - alpha) * np.asarray(background, np.float32), 0, 1)
 
 
-def read_mask(path: Path) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: where the mean of the channels is above a half."""
-    return np.asarray(read_picture(path).mean(axis=2) > 0.5)
+def inside(picture: Picture) -> npt.NDArray[np.bool_]:
+    """(H, W) bool of a mask's picture: where the mean of the channels is above a half."""
+    return np.asarray(picture.mean(axis=2) > 0.5)
 
 
 def _header(path: Path, *, whole: bool = False) -> tuple[int, int] | None:
@@ -332,18 +332,21 @@ def _compare_names(
 
 def _check_sizes(folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]) -> None:
     """Before anything is computed: every pair has one size."""
-    partners = [("edited", _EDIT), ("edited", _PERCEPTUAL), ("originals", _DIRECTION), ("masks", _EDIT)]
-    for other, figure in partners:
-        if other not in folders:
-            continue
-        for name in views.get(figure, ()):
-            one, two = folders["renders"][name], folders[other][name]
-            a, b = _header(one), _header(two)
-            if a is not None and b is not None and a != b:
-                raise InputError(
-                    f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size; resize one "
-                    "of the two folders"
-                )
+    for figure, names in views.items():
+        for other in _groups(figure, folders):
+            for name in names if other != "renders" else ():
+                one, two = folders["renders"][name], folders[other][name]
+                a, b = _header(one), _header(two)
+                if a is not None and b is not None:
+                    _same_size(one, a, two, b)
+
+
+def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> None:
+    if a != b:
+        raise InputError(
+            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size; resize one of the "
+            "two folders"
+        )
 
 
 @dataclass
@@ -368,6 +371,13 @@ def _gather(
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
         return {name: read_picture(folders[group][name], inputs.background) for name in names}
 
+    def partners(group: str, names: Iterable[str], renders: Mapping[str, Picture]) -> dict[str, Picture]:
+        pictures = read(group, names)
+        for name, picture in pictures.items():  # again, for formats whose header alone is not known
+            sizes = [(array.shape[1], array.shape[0]) for array in (renders[name], picture)]
+            _same_size(folders["renders"][name], sizes[0], folders[group][name], sizes[1])
+        return pictures
+
     def encode(kind: Kind, pictures: Mapping[str, Picture], to: dict[str, Embedding]) -> None:
         if kind in loaded and pictures:
             to.update(zip(pictures, loaded[kind].images(list(pictures.values())), strict=True))
@@ -379,11 +389,14 @@ def _gather(
         renders = read("renders", batch)
         encode("clip", renders, kept.clip)
         encode("dino", renders, kept.dino)
-        encode("clip", read("originals", [name for name in batch if name in members[_DIRECTION]]), kept.before)
-        pairs = members[_EDIT] | members[_PERCEPTUAL]
-        for name, picture in read("edited", [name for name in batch if name in pairs]).items():
+        changed = [name for name in batch if name in members[_DIRECTION]]
+        encode("clip", partners("originals", changed, renders), kept.before)
+        paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
+        masked = [name for name in paired if name in members[_EDIT] and "masks" in folders]
+        masks = {name: inside(picture) for name, picture in partners("masks", masked, renders).items()}
+        for name, picture in partners("edited", paired, renders).items():
             if name in members[_EDIT]:
-                mask = {name: read_mask(folders["masks"][name])} if "masks" in folders else None
+                mask = {name: masks[name]} if name in masks else None
                 one = metrics.edit_psnr({name: picture}, {name: renders[name]}, mask)
                 kept.errors[name] = (one.mse[0], one.psnr[0])
             if name in members[_PERCEPTUAL]:

@@ -14,7 +14,7 @@ from attnwarp_eval.cli import app
 from attnwarp_eval.encoders import load_encoder
 from attnwarp_eval.errors import InputError
 from attnwarp_eval.metric import metric
-from attnwarp_eval.userimages import read_mask, read_picture
+from attnwarp_eval.userimages import BATCH, inside, read_picture
 
 VIEWS = ("view1", "view2", "view10")
 PROMPTS = ("--prompt", "a bear in the snow", "--source-prompt", "a photo of a bear")
@@ -216,13 +216,41 @@ def test_names_that_never_meet_are_told_apart(data):
     )
 
 
-def test_a_pair_of_different_sizes_names_both(data, models):
+@pytest.mark.parametrize("group, suffix", [("edited", "tif"), ("originals", "PNG"), ("masks", "png")])
+def test_a_pair_of_different_sizes_names_both(data, models, group, suffix):
     folder, _ = data
-    write(folder / "edited" / "view2.tif", np.zeros((20, 24, 3), np.uint8))
-    done = everything(folder, models)
+    for view in VIEWS:
+        write(folder / "masks" / f"{view}.png", np.full((40, 48), 255, np.uint8))
+    write(folder / group / f"view2.{suffix}", np.zeros((20, 24, 3), np.uint8))
+    done = everything(folder, models, f"--mask={folder / 'masks'}")
     assert done.exit_code == 2
-    for part in ("view2.tif is 24 x 20 px, but ", "view2.png is 48 x 40: a pair must have one size"):
+    for part in (f"{group}/view2.{suffix} is 24 x 20 px, but ", "view2.png is 48 x 40: a pair must have one size"):
         assert part in done.stderr
+
+
+def test_views_beyond_one_batch_and_pairs_with_holes_keep_their_own_values(tmp_path, models):
+    random = np.random.default_rng(1)
+    names = [f"{i}" for i in range(2 * BATCH + 1)]
+    sizes = {name: (40, 48) if int(name) % 3 else (50, 36) for name in names}  # sizes differ from view to view
+    arrays = {g: {n: random_picture(random, sizes[n]) for n in names} for g in ("renders", "edited", "originals")}
+    here = {"renders": names, "edited": names[1::2], "originals": names[2::3]}
+    for group, some in here.items():
+        for name in some:
+            write(tmp_path / group / f"{name}.png", arrays[group][name])
+    write(tmp_path / "edit.png", arrays["edited"]["1"])
+    assert everything(tmp_path, models).exit_code == 0
+    found = saved(tmp_path)["metrics"]
+    clip = load_encoder(models["clip"])
+    (source,) = clip.images([arrays["edited"]["1"] / 255])
+    expected = {n: cosine(clip.images([arrays["renders"][n] / 255])[0], source) for n in names}
+    assert found["embedding.clip_image"]["views"] == pytest.approx(expected, abs=1e-5)
+    assert list(found["embedding.clip_directional"]["views"]) == here["originals"]
+    errors = {n: (((arrays["edited"][n] / 255.0) - (arrays["renders"][n] / 255.0)) ** 2).mean() for n in here["edited"]}
+    expected = {n: -10 * math.log10(e) for n, e in errors.items()}
+    assert found["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
+    assert found["edit.psnr_pooled"]["value"] == pytest.approx(
+        -10 * math.log10(np.mean(list(errors.values()))), abs=1e-4
+    )
 
 
 def test_a_view_alike_to_its_picture_is_counted_apart(data, models):
@@ -359,7 +387,7 @@ def test_16_bits_grey_and_transparent_pictures_are_read_as_documented(tmp_path):
         expected = 0.2 * np.array([200, 100, 50]) / 255 + 0.8 * np.array(background)
         np.testing.assert_allclose(seen[1, 1], expected, atol=1e-6)
     assert seen.dtype == np.float32 and seen.shape == (2, 2, 3)
-    assert read_mask(write(tmp_path / "m.png", grey)).sum() == 128
+    assert inside(read_picture(write(tmp_path / "m.png", grey))).sum() == 128
 
 
 def test_transparency_is_laid_over_the_chosen_background_before_it_is_measured(tmp_path):
@@ -401,3 +429,33 @@ def test_the_encoders_are_listed_and_one_is_described(models):
     assert "weights_sha256" in call("encoders", models["dino"]).stdout
     wrong = call("encoders", "dino:x")
     assert wrong.exit_code == 2 and "did you mean 'dinov2:FOLDER'" in wrong.stderr
+
+
+def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_named_is_an_error(data, monkeypatch):
+    import importlib.util
+
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name.endswith("bundled") else found(name))
+    folder, _ = data
+    pairs = (f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", "--out", folder / "out")
+    done = call("metrics", *pairs)
+    assert done.exit_code == 0 and set(saved(folder)["metrics"]) == {"edit.psnr_mean", "edit.psnr_pooled"}
+    reason = "needs --perceptual: encoder 'perceptual-small': this installation carries no bundled weights"
+    assert saved(folder)["not_computed"]["Perceptual distance"].startswith(reason)
+    done = call("metrics", *pairs, "--perceptual=perceptual-small")
+    assert done.exit_code == 2 and "--perceptual: encoder 'perceptual-small': this installation" in done.stderr
+
+
+def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypatch):
+    from dataclasses import replace
+
+    from attnwarp_eval import userimages
+
+    encoder = load_encoder(models["clip"])
+    encoder.about = replace(encoder.about, name="clip-small", source="bundled")
+    asked = []
+    monkeypatch.setattr(userimages, "load_encoder", lambda *a, **k: asked.append((a, k)) or encoder)
+    folder, _ = data
+    done = call("metrics", f"--renders={folder / 'renders'}", "--prompt=a bear", "--out", folder / "out")
+    assert asked == [(("clip-small", "clip"), {"device": "cpu"})]  # the default, and nothing that no figure needs
+    assert done.exit_code == 0 and "clip-small is small and was trained on this project's own scenes" in done.stderr

@@ -12,7 +12,7 @@ import difflib
 import importlib
 import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 from attnwarp_eval.encoders.base import (
     Encoder,
@@ -81,6 +81,14 @@ def kind_of(name: str) -> Kind:
     raise InputError(f"encoder {name!r}: unknown{guess} Known are {', '.join([*BUNDLED, *REAL])}")
 
 
+@overload
+def load_encoder(name: str, kind: Literal["clip"], *, device: str = "cpu") -> TextImageEncoder: ...
+@overload
+def load_encoder(name: str, kind: Literal["dino"], *, device: str = "cpu") -> TokenEncoder: ...
+@overload
+def load_encoder(name: str, kind: Literal["perceptual"], *, device: str = "cpu") -> PerceptualDistance: ...
+@overload
+def load_encoder(name: str, kind: None = None, *, device: str = "cpu") -> Encoder: ...
 def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") -> Any:
     """Load an encoder by name.
 

@@ -254,7 +254,7 @@ def _weight_files(folder: Path, name: str, kind: Kind) -> list[Path]:
 def _load(model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
     try:
-        with _quiet():
+        with _silent():
             model, said = model_class.from_pretrained(
                 str(folder), local_files_only=True, output_loading_info=True, dtype=torch.float32,
                 use_safetensors=files[0].suffix == ".safetensors",
@@ -277,7 +277,7 @@ def _load(model_class: Any, folder: Path, name: str, kind: Kind, device: torch.d
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silent() -> Iterator[None]:
     """Neither its progress bar nor its advice: what matters of it is checked here and raised."""
     from transformers.utils import logging as chatter
 
