@@ -16,12 +16,12 @@ import torch.nn.functional as F
 from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
 
 from attnwarp_eval.encoders.nets import ClipSmall
-from training.common import Run, crops, groups, rate
+from training.common import Run, channels_last, crops, groups, rate
 from training.data import Pictures, load
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
 SEED = 1
-EPOCHS = 13
+EPOCHS = 12
 BATCH = 128
 CROP = 112
 """Smaller than the 128 that the encoder sees: things then look a little larger in use than in training, which is known to
@@ -91,6 +91,7 @@ def wrong(said: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
     if second >= 0:
         ways.append("swap")
     way = ways[int(rng.integers(len(ways)))] if ways else "thing"
+    made: tuple[int, ...]
     while True:
         other = _any_attributes(rng)
         match way:
@@ -154,7 +155,9 @@ def contrast(model: ClipSmall, i: torch.Tensor, texts: torch.Tensor, truth: torc
     return 0.5 * (by_image + by_text)
 
 
-def naming_loss(model: ClipSmall, images: torch.Tensor, shown: Ints, tokenizer: Tokenizer, rng: np.random.Generator) -> torch.Tensor:
+def naming_loss(
+    model: ClipSmall, images: torch.Tensor, shown: Ints, tokenizer: Tokenizer, rng: np.random.Generator
+) -> torch.Tensor:
     """Contrast of pictures with the words for one attribute at a time: each thing, each colour, each ground, ...
 
     In whole sentences a colour and a ground nearly tell a batch's pictures apart, and shapes, which are harder, go
@@ -167,7 +170,8 @@ def naming_loss(model: ClipSmall, images: torch.Tensor, shown: Ints, tokenizer: 
         tokenizer: of the text tower.
         rng: picks one way to say each.
     """
-    texts, spans = [], []
+    texts: list[str] = []
+    spans: list[tuple[int, int, int]] = []
     for column, count in ((0, len(OBJECTS)), (1, len(FINISHES)), (2, len(COLORS)), (4, len(GROUNDS)), (5, len(TIMES))):
         spans.append((column, len(texts), len(texts) + count))
         for value in range(count):
@@ -200,7 +204,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     tokenizer = make_tokenizer()
     out.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(out / "clip-small.tokenizer.json"))
-    model = ClipSmall(tokenizer.get_vocab_size()).to(memory_format=torch.channels_last)
+    model = channels_last(ClipSmall(tokenizer.get_vocab_size()))
     sets = [load(data, "train"), load(data, "train-rendered")]
     # A unit of the shuffle is all pictures of one view of a world: its looks belong into one batch.
     units = [(k, rows) for k, pictures in enumerate(sets) for rows in _units(pictures)]

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ import torch
 import torch.nn.functional as F
 
 Tensor = torch.Tensor
+Model = TypeVar("Model", bound=torch.nn.Module)
 
 
 def crops(
@@ -65,6 +66,12 @@ def placed_crops(
         gamma = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
         x = (x.clamp(1e-4, 1) ** gamma) * gain
     return x.clamp(0, 1).to(memory_format=torch.channels_last), torch.from_numpy(theta).float()
+
+
+def channels_last(model: Model) -> Model:
+    """The model with its convolutions laid out as a CPU likes them."""
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return model
 
 
 def rate(step: int, total: int, peak: float, warm: int) -> float:

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from attnwarp_eval.encoders.nets import DinoSmall
-from training.common import Run, groups, placed_crops, rate
+from training.common import Run, channels_last, groups, placed_crops, rate
 from training.data import Pictures, load
 
 SEED = 2
@@ -96,7 +96,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     # Things that move from ground to ground teach that the ground is not the thing; they come as often as the others.
     sets = [load(data, "train-moved"), load(data, "train")]
     things = [(k, *views) for k, pictures in enumerate(sets) for views in _views(pictures) for _ in range((3, 1)[k])]
-    student = Distiller().to(memory_format=torch.channels_last)
+    student = channels_last(Distiller())
     teacher = copy.deepcopy(student)
     teacher.requires_grad_(False)
     sizes = {"cls": PROTOTYPES, "dense": DENSE_PROTOTYPES}
@@ -126,7 +126,11 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 group["lr"] = rate(now, epochs * each, PEAK, 200)
             chosen = [things[k] for k in order[step * BATCH : (step + 1) * BATCH]]
             # Never the same look from both sides, where there are two: ground and light must not tell things apart.
-            drawn = [(sets[k].images, a[n % len(a)], b[(n + 1) % len(b)]) for k, a, b in chosen for n in [int(rng.integers(2))]]
+            drawn = [
+                (sets[k].images, a[n % len(a)], b[(n + 1) % len(b)])
+                for k, a, b in chosen
+                for n in [int(rng.integers(2))]
+            ]
             sides = [np.stack([images[a] for images, a, _ in drawn]), np.stack([images[b] for images, _, b in drawn])]
             large = [placed_crops(side, LARGE, rng, scale=(0.6, 1.0), tone=0.2) for side in sides]
             small = [placed_crops(side, SMALL, rng, scale=(0.25, 0.5), tone=0.2) for side in sides]

@@ -8,12 +8,13 @@ different kinds are therefore only used a full step apart.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-Image = npt.NDArray[np.float32]
+Image = npt.NDArray[Any]
 Apply = Callable[[Image, float, np.random.Generator], Image]
 
 MARGIN = 8
@@ -65,8 +66,9 @@ def _jpeg(image: Image, strength: float, rng: np.random.Generator) -> Image:
     ok, code = cv2.imencode(
         ".jpg", np.clip(image * 255, 0, 255).astype(np.uint8)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
-    assert ok
-    return cv2.imdecode(code, cv2.IMREAD_COLOR)[..., ::-1].astype(np.float32) / 255
+    back = cv2.imdecode(code, cv2.IMREAD_COLOR)
+    assert ok and back is not None
+    return back[..., ::-1].astype(np.float32) / 255
 
 
 def _brightness(image: Image, strength: float, rng: np.random.Generator) -> Image:

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from attnwarp_eval.encoders.nets import PerceptualSmall
-from training.common import Run, rate
+from training.common import Run, channels_last, rate
 from training.data import load
 from training.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair
 
@@ -75,12 +75,12 @@ def photographs(names: tuple[str, ...]) -> list[npt.NDArray[np.uint8]]:
     import skimage.data
 
     folder = Path(skimage.data.__file__).parent
-    found = []
+    found: list[npt.NDArray[np.uint8]] = []
     for name in names:
         image = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
         if image is None:
             raise FileNotFoundError(f"{folder / name}: not in this scikit-image")
-        found.append(np.ascontiguousarray(image[..., ::-1]))
+        found.append(np.ascontiguousarray(image[..., ::-1]).astype(np.uint8))
     return found
 
 
@@ -106,7 +106,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     torch.manual_seed(SEED)
     out.mkdir(parents=True, exist_ok=True)
     sources = Sources(photographs(TRAIN_PHOTOS), load(data, "train").images[::7])
-    model = PerceptualSmall().to(memory_format=torch.channels_last)
+    model = channels_last(PerceptualSmall())
     optimizer = torch.optim.AdamW(model.parameters(), lr=PEAK, weight_decay=1e-4)
 
     def epoch(number: int) -> dict[str, float]:
@@ -121,7 +121,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             d = torch.cat([near, far])
             order = F.softplus(-4 * (torch.log(far + 1e-5) - torch.log(near + 1e-5))).mean()
             # So that the number itself reads as a strength: 1 is ruined.
-            reads = (d.sqrt() - strengths.T.reshape(-1) / 5).square().mean()
+            reads = ((d + 1e-6).sqrt() - strengths.T.reshape(-1) / 5).square().mean()
             loss = order + reads
             optimizer.zero_grad(set_to_none=True)
             loss.backward()

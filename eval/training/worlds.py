@@ -28,7 +28,7 @@ STATUES = ("golden", "silver", "bronze", "stone", "marble", "wooden")
 ATTRIBUTES = ("object", "finish", "color", "second", "ground", "time")
 """What a picture is described by, each an index into its words; -1 where it has none, or a caption does not say."""
 
-HSV = {
+HSV: dict[str, tuple[float, float, float]] = {
     "red": (2, 0.82, 0.78), "orange": (25, 0.88, 0.93), "yellow": (51, 0.80, 0.94), "green": (122, 0.60, 0.55),
     "blue": (218, 0.74, 0.74), "purple": (276, 0.58, 0.58), "pink": (337, 0.42, 0.95), "brown": (24, 0.62, 0.42),
     "black": (0, 0.05, 0.10), "white": (40, 0.03, 0.95), "grey": (0, 0.02, 0.50),
@@ -364,7 +364,9 @@ class World:
         return Scene(SceneSpec.model_validate(self.spec(look, size)))
 
 
-def draw_world(seed: int, *, new_shapes: bool = False, thing: int | None = None, views: int = 2, bare: bool = False) -> World:
+def draw_world(
+    seed: int, *, new_shapes: bool = False, thing: int | None = None, views: int = 2, bare: bool = False
+) -> World:
     """A random world; ``new_shapes`` draws a shape that training never sees, ``bare`` leaves out all else."""
     rng = np.random.default_rng([seed, 5])
     drawn = int(rng.integers(len(OBJECTS)))
@@ -480,11 +482,11 @@ def surface_words(finish: int, color: int, second: int, rng: np.random.Generator
             one, two = (hue, other) if rng.uniform() < 0.5 else (other, hue)
             word = {"striped": "striped", "checked": _one(("checked", "chequered"), rng)}[kind]
             return f"{one} and {two} {word}", False
-    word = {
+    words = {
         "golden": ("golden", "gold"), "silver": ("silver", "steel", "chrome"), "bronze": ("bronze", "copper"),
         "wooden": ("wooden",), "stone": ("stone",), "marble": ("marble", "white marble"),
     }[kind]  # fmt: skip
-    return _one(word, rng), bool(rng.uniform() < 0.4)
+    return _one(words, rng), bool(rng.uniform() < 0.4)
 
 
 def sentence(said: tuple[int, ...], rng: np.random.Generator, *, fillers: bool = False) -> str:
