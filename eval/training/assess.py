@@ -300,7 +300,7 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
     """
     from training.render import pictures as render
 
-    side = 16
+    side = 8  # DinoSmall's patches
     rows: dict[str, list[bool]] = {"patch tokens": [], "raw patches": [], "middle of the thing": []}
     worlds: list[int] = []
     for k in range(count):

@@ -22,8 +22,8 @@ compare with those of OpenAI's CLIP, whose name stands beside a figure when it w
 **Recipe**: `training/clip.py`. Contrast over batches of 192 pictures and 384 sentences, half of which have one attribute wrong; looks
 of one world, which differ in one attribute, lie in one batch; sentences that happen to be true of another picture are no negatives.
 Rare words and invented ones are scattered into captions so that unknown words do little harm.""",
-    "dino-small": """A class token and 16 x 16 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to an eighth of the
-size, then two transformer blocks; {size:.1f} million parameters.
+    "dino-small": """A class token and 8 x 8 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to a sixteenth of the
+size, then three transformer blocks; {size:.1f} million parameters.
 
 **Good for**: whether two pictures show the same thing, from whichever side; which patch of one view is which of another, roughly.
 

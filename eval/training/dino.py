@@ -23,8 +23,8 @@ from training.common import Run, channels_last, groups, placed_crops, rate
 from training.data import Pictures, load
 
 SEED = 2
-EPOCHS = 7
-BATCH = 48
+EPOCHS = 12
+BATCH = 64
 PEAK = 1.2e-3
 LARGE, SMALL = 96, 48
 PROTOTYPES = 1024

@@ -123,7 +123,7 @@ class BundledDino(_OfSquares):
         return np.concatenate(found) if found else np.zeros((0, self.net.dim))
 
     def tokens(self, images: Sequence[Image]) -> Array:
-        """(N, 16, 16, D) float64 patch tokens of the central square, each of 8 x 8 px of 128 x 128."""
+        """(N, 8, 8, D) float64 patch tokens of the central square, each of 16 x 16 px of 128 x 128."""
         with full_float32():
             found = [self.net(batch)[1].permute(0, 2, 3, 1).double().numpy() for batch in self._batches(images)]
         side = DinoSmall.size // DinoSmall.patch

@@ -61,23 +61,17 @@ class Stages(nn.Module):
         return out
 
 
-class AttentionPool(nn.Module):
-    """One query that looks at every place, as in CLIP's convolutional towers (Radford et al. 2021, section 2.4)."""
+class Pool(nn.Module):
+    """Mean and maximum over all places, projected: the mean for ground and light, the maximum for what is in one place."""
 
-    def __init__(self, channels: int, heads: int, dim: int) -> None:
+    def __init__(self, channels: int, dim: int) -> None:
         super().__init__()
-        self.position = nn.Parameter(torch.zeros(1, channels, 8, 8))
-        self.attend = nn.MultiheadAttention(channels, heads, batch_first=True)
-        self.norm = nn.LayerNorm(channels)
+        self.norm = nn.LayerNorm(2 * channels)
         self.project = nn.Linear(2 * channels, dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, dim)."""
-        position = F.interpolate(self.position, x.shape[-2:], mode="bilinear", align_corners=False)
-        tokens = self.norm((x + position).flatten(2).transpose(1, 2))
-        mean = tokens.mean(dim=1, keepdim=True)
-        looked, _ = self.attend(mean, tokens, tokens, need_weights=False)
-        return self.project(torch.cat([looked[:, 0], mean[:, 0]], dim=-1))
+        return self.project(self.norm(torch.cat([x.mean((2, 3)), x.amax((2, 3))], dim=1)))
 
 
 class TextTower(nn.Module):
@@ -120,8 +114,8 @@ class ClipSmall(nn.Module):
 
     def __init__(self, vocabulary: int, dim: int = 192) -> None:
         super().__init__()
-        self.vision = Stages((48, 96, 208), (2, 2, 2))
-        self.pool = AttentionPool(208, 4, dim)
+        self.vision = Stages((32, 64, 128, 224), (1, 1, 2, 2))
+        self.pool = Pool(224, dim)
         self.text = TextTower(vocabulary, 128, 3, 4, self.length, dim)
         # exp of it multiplies the cosine, as in the paper, which starts at 1 / 0.07.
         self.scale = nn.Parameter(torch.tensor(2.66))
@@ -161,26 +155,26 @@ class Block(nn.Module):
 
 
 class DinoSmall(nn.Module):
-    """Convolutions to an eighth of the size, then a transformer with a class token (Caron et al. 2021), small.
+    """Convolutions to a sixteenth of the size, then a transformer with a class token (Caron et al. 2021), small.
 
     The convolutions take the place of the patch embedding: a transformer alone needs far more pictures.
     """
 
     size = 128
-    patch = 8
+    patch = 16
 
-    def __init__(self, dim: int = 128, depth: int = 2, heads: int = 4) -> None:
+    def __init__(self, dim: int = 192, depth: int = 3, heads: int = 6) -> None:
         super().__init__()
         self.dim = dim
-        self.stages = Stages((32, 96), (1, 3))
-        self.embed = nn.Conv2d(96, dim, 1)
+        self.stages = Stages((32, 64, 128), (1, 2, 2))
+        self.embed = nn.Conv2d(128, dim, 1)
         self.cls = nn.Parameter(0.02 * torch.randn(1, 1, dim))
-        self.position = nn.Parameter(0.02 * torch.randn(1, dim, 16, 16))
+        self.position = nn.Parameter(0.02 * torch.randn(1, dim, 8, 8))
         self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, H, W) in [0, 1], sides multiples of 8 -> class token (N, D), patch tokens (N, D, H / 8, W / 8)."""
+        """(N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens (N, D, H / 16, W / 16)."""
         y = self.embed(self.stages(x)[-1])
         h, w = y.shape[-2:]
         y = y + F.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
