@@ -68,7 +68,8 @@ def variant() -> str:
         return named
     said = os.environ.get("DRJIT_LIBLLVM_PATH")
     # With nothing found in the usual places Dr.Jit may still know one that is not.
-    for library in [said] if said else libraries()[:TRIES] or [None]:
+    tried: list[str | None] = [said] if said else [*libraries()[:TRIES]] or [None]
+    for library in tried:
         if works(library):
             if library:
                 os.environ["DRJIT_LIBLLVM_PATH"] = library
@@ -80,7 +81,7 @@ def libraries() -> list[str]:
     """LLVM libraries in the usual places that may work: one path for each version, newest first."""
     found: dict[tuple[int, ...], str] = {}
     for place in PLACES:
-        for path in sorted(glob.glob(place.format(prefix=sys.prefix))):
+        for path in sorted(glob.glob(place.format(prefix=sys.prefix))):  # noqa: PTH207 - absolute patterns
             known = version(os.path.realpath(path)) or version(path)
             if known is not None and known[0] >= OLDEST and Path(path).is_file():
                 found.setdefault(known, os.path.realpath(path))

@@ -215,6 +215,11 @@ def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
     return table
 
 
+def use(name: str) -> None:
+    """Load or turn to a variant now, so that no timer has it."""
+    _mitsuba(name)
+
+
 def _mitsuba(name: str | None = None) -> Any:
     """The library, with the variant ``name``; without a name as the caller's caller has set it."""
     import mitsuba
