@@ -67,9 +67,11 @@ def test_refinement_takes_the_error_of_float32_away_and_the_worlds_offset_does_n
 def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent():
     panel = accuracy.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
     rays, nearest, bilinear = panel.contestants
-    assert rays.error[0] == 0 and rays.more["unanswered"] == 0
-    assert nearest.error[0] > 0.02 and nearest.more["unanswered"] == 0
+    # Clopper & Pearson: none of 150 excludes a share above 1 - 0.025^(1 / 150).
+    assert rays.error == pytest.approx((0, 0, 1 - 0.025 ** (1 / 150))) and rays.more["unanswered"] == 0
+    assert nearest.error[0] == nearest.more["wrong"] > 0.02 and nearest.more["unanswered"] == 0
     assert bilinear.more["unanswered"] > 0.2
+    assert bilinear.error[0] == pytest.approx(bilinear.more["wrong"] + bilinear.more["unanswered"])
 
 
 def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():

@@ -367,11 +367,20 @@ def visibility(
     out = []
     for name, got, took in zip(names, results, seconds, strict=False):
         answer = got[0][chosen]
-        answered = np.isfinite(answer)
-        share = float((answer[answered] != seen[answered]).mean()) if answered.any() else float("nan")
-        more = {"unanswered": float(1 - answered.mean()), "answered": float(answered.sum())}
-        out.append(Contestant(name, (share, share, share), tuple(took), more))
-    return Panel("visibility", scene.name, "share of points mislabelled", tuple(out), tuple(seconds[-1]))
+        right, answered = int((answer == seen).sum()), np.isfinite(answer)
+        wrong = int((answer[answered] != seen[answered]).sum())
+        more = {"wrong": wrong / len(seen), "unanswered": float(1 - answered.mean()), "points": float(len(seen))}
+        out.append(Contestant(name, _share(len(seen) - right, len(seen)), tuple(took), more))
+    return Panel("visibility", scene.name, "share of points not labelled rightly", tuple(out), tuple(seconds[-1]))
+
+
+def _share(count: int, total: int) -> tuple[float, float, float]:
+    """A share with the 95 % interval of Clopper & Pearson (1934)."""
+    from scipy import stats
+
+    low = float(stats.beta.ppf(0.025, count, total - count + 1)) if count else 0.0
+    high = float(stats.beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0
+    return count / total, low, high
 
 
 def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
@@ -489,6 +498,9 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
         mean, low, high = panel.contestants[k].error
+        if mean == 0 and high > 0:
+            # None wrong has no place on a logarithmic axis: shown at half a point, up to what none of so many excludes.
+            mean = 0.5 / panel.contestants[k].more["points"]
         seconds = Interval(base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan)
         return seconds, Interval(mean, low, high, 1, 1, 0, nan, nan)
 
@@ -500,13 +512,8 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         path = out / f"{question}.svg"
         with figures.drawing(path, columns=len(mine)) as axes:
             for ax, panel in zip(axes, mine, strict=True):
-                # An error of nothing has no place on a logarithmic axis; the table has it.
-                shown = {
-                    c.name: point(panel, k)
-                    for k, c in enumerate(panel.contestants)
-                    if np.isfinite(c.error[0]) and c.error[0] > 0
-                }
-                figures.cost_front(ax, shown, x="seconds", y=panel.unit, title=panel.scene)
+                shown = {c.name: point(panel, k) for k, c in enumerate(panel.contestants)}
+                figures.cost_front(ax, shown, x="seconds", y=SHORT[question], title=panel.scene)
         drawn.append((question, path))
     sections = _sections(panels)
     for section in sections:
@@ -529,6 +536,7 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     return files
 
 
+SHORT = {"pictures": "RMS error / mean", "depth": "largest relative error", "visibility": "not labelled rightly"}
 TITLES = {
     "pictures": "Pictures: samples, plan and variant",
     "depth": "Depth: float32 hits and their refinement",
@@ -549,8 +557,11 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
         if not mine:
             continue
         section = Section(title)
-        extra = {"pictures": ["bias of the mean", "time for the same noise, ratio"],
-                 "depth": ["median", "99 %", "off by more than 0.1 %"], "visibility": ["unanswered"]}[question]  # fmt: skip
+        extra = {
+            "pictures": ["bias of the mean", "time for the same noise, ratio"],
+            "depth": ["median", "99 %", "off by more than 0.1 %"],
+            "visibility": ["wrong", "unanswered"],
+        }[question]
         for panel in mine:
             rows = []
             for k, c in enumerate(panel.contestants):
@@ -563,8 +574,8 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                     more = [f"{c.more['median']:.1e}", f"{c.more['p99']:.1e}", f"{100 * c.more['wrong']:.2f} %"]
                     shown = f"{value:.1e}"
                 else:
-                    more = [f"{100 * c.more['unanswered']:.1f} %"]
-                    shown = f"{100 * value:.2f} %"
+                    more = [f"{100 * c.more[key]:.1f} %" for key in ("wrong", "unanswered")]
+                    shown = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
                 times = [number(1000 * float(np.median(c.seconds))), "1" if k == 0 else ratio(panel.ratio(k))]
                 rows.append([c.name, shown, *more, *times])
             blank = ["–"] * (1 + len(extra))

@@ -243,6 +243,8 @@ def _world(
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
     shone = {f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center) for k in lights}
+    # Asked for or not: what is not there does not make another world.
+    lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects))
 
     def make() -> tuple[Any, Array, Any]:
