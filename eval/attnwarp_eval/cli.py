@@ -415,13 +415,15 @@ def time_(
         from attnwarp_eval.scene import list_scenes
         from attnwarp_eval.truth import suite
 
-        with Console(stderr=True).status("starting") as status:
-            times = list(
-                suite.measure(
-                    scenes or list_scenes(), views=views, size=size, spp=spp, geometry_size=geometry_size,
-                    progress=status.update,
-                )
-            )  # fmt: skip
+        console, times = Console(stderr=True), []
+        with console.status("starting") as status:
+            for taken in suite.measure(
+                scenes or list_scenes(), views=views, size=size, spp=spp, geometry_size=geometry_size,
+                progress=status.update,
+            ):  # fmt: skip
+                times.append(taken)
+                # All of them take minutes: what is known is told at once.
+                console.print(f"{taken.scene}: {sum(taken.wall.values()):.1f} s", highlight=False)
     if as_json:
         typer.echo(json.dumps(suite.to_dict(times), indent=1))
         return

@@ -146,11 +146,12 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
 
     from attnwarp_eval.colors import to_srgb
     from attnwarp_eval.proof import blocks
-    from attnwarp_eval.truth.mitsuba import render_plan
+    from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
     small = scene.with_size(PICTURE_SIZE, PICTURE_SIZE)
+    made_by = comparable(small)
     ours, full = (
-        to_srgb(render_plan(small, small.source, made, 40 + k))
+        to_srgb(render_plan(small, small.source, made, 40 + k, made_by=made_by))
         for k, made in enumerate((plan(small, PLAN_SAMPLES), everything_on(small, FULL_SAMPLES)))
     )
     difference = ours.astype(np.float64) - full

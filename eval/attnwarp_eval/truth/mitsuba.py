@@ -178,6 +178,20 @@ def _part(
     return (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
 
 
+def comparable(scene: Scene) -> str:
+    """The variant in which renderings of the source by different integrators can be held against each other.
+
+    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that depends on how an
+    integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on the scene alone.
+    """
+    from attnwarp_eval.truth.raycast import Geometry
+
+    if variant() == SCALAR:
+        return SCALAR
+    tied, _ = Geometry(scene).ties(scene.source)
+    return SCALAR if tied.any() else variant()
+
+
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
     """What Mitsuba's own ray tracer hits at the pixel centres, to hold the exact geometry against.
 
