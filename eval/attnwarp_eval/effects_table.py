@@ -90,11 +90,10 @@ def collect(
         if entry is None or entry["key"] != key or (settings.pictures and not (out / entry["picture"]).is_file()):
             entry = {"key": key} | _entry(scene, out, settings, lambda text, n=number: progress(text, n))
             known[scene.name] = entry
-            _write(out, known)
         entries.append(entry)
+        # Scenes of an earlier call stay in the file; the table is of those asked for, as far as they are done.
+        _write(out, known, entries)
         forget()
-    # Scenes of an earlier call stay in the file; the table is of those asked for.
-    _write(out, known, entries)
     return entries
 
 
@@ -180,13 +179,12 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
         ) from None
 
 
-def _write(out: Path, known: Mapping[str, Any], shown: Sequence[Mapping[str, Any]] | None = None) -> None:
+def _write(out: Path, known: Mapping[str, Any], shown: Sequence[Mapping[str, Any]]) -> None:
     from attnwarp_eval.cost import environment
 
     data = {"environment": environment(), "scenes": [known[name] for name in sorted(known)]}
     _replace(out / "effects.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
-    if shown is not None:
-        _replace(out / "effects.md", _page(shown, data["environment"]))
+    _replace(out / "effects.md", _page(shown, data["environment"]))
 
 
 def _replace(path: Path, text: str) -> None:
