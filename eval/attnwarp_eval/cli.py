@@ -308,22 +308,33 @@ def edits(
 
 @scenes_app.command()
 def effects(
-    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    scene: Annotated[str | None, typer.Argument(help="A scene's name, or the path of its YAML.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON with the keys effects and plan.")] = False,
     prove: Annotated[
         bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
     ] = False,
-    budget: Annotated[float, typer.Option(min=1, help="Seconds that the proof may render.")] = 60.0,
+    budget: Annotated[float, typer.Option(min=1, help="Seconds that a proof may render.")] = 60.0,
+    every: Annotated[
+        bool, typer.Option("--all", help="A table and pictures of every scene; goes on where it was left.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder of --all.")] = Path("runs/effects"),
 ) -> None:
     """Which light transport a scene needs, how it is rendered, what that saves, and a proof that nothing is lost."""
     import json
 
+    if every == (scene is not None):
+        raise fail("name one scene, or say --all for a table of all of them")
+    if every:
+        if as_json:
+            raise fail("--json is of one scene; --all writes effects.json into --out")
+        _effects_of_all(out, prove, budget)
+        return
     with clear_errors():
         from attnwarp_eval import effects as planning
         from attnwarp_eval.proof import prove as hold
         from attnwarp_eval.scene import load_scene
 
-        loaded = load_scene(scene)
+        loaded = load_scene(str(scene))
         about = planning.report(loaded, cost=planning.measure(loaded))
         proof = hold(loaded, seconds=budget) if prove else None
     if proof is not None:
@@ -334,6 +345,102 @@ def effects(
     typer.echo("\n".join(lines))
     if proof is not None and proof.verdict != "certified":
         raise fail(f"{loaded.name}: the plan is not certified: {proof.verdict}", TOO_LITTLE)
+
+
+def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    with clear_errors():
+        from attnwarp_eval.effects_table import Settings, collect
+        from attnwarp_eval.scene import list_scenes
+
+        names = list_scenes()
+        console = Console(stderr=True)
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+            task = bar.add_task("starting", total=len(names))
+
+            def watch(text: str, done: int) -> None:
+                bar.update(task, description=text, completed=done)
+                if not console.is_terminal:
+                    console.print(f"[{done + 1}/{len(names)}] {text}", markup=False, highlight=False)
+
+            try:
+                entries = collect(names, out, Settings(prove=prove, budget=budget), watch)
+            except KeyboardInterrupt:
+                raise fail("interrupted; finished scenes are kept, the same command goes on from here", 130) from None
+            bar.update(task, description="done", completed=len(names))
+    typer.echo(out / "effects.md")
+    doubtful = [f"{e['scene']}: {e['proof']['verdict']}" for e in entries if "proof" in e
+                and e["proof"]["verdict"] != "certified"]  # fmt: skip
+    if doubtful:
+        raise fail(f"not every plan is certified: {'; '.join(doubtful)}", TOO_LITTLE)
+
+
+@scenes_app.command()
+def accuracy(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scenes' names or paths; a few telling ones if left out.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for accuracy.md, accuracy.json and the figures.")] = Path(
+        "runs/accuracy"
+    ),
+    rounds: Annotated[int, typer.Option(min=3, help="Of every timing.")] = 7,
+) -> None:
+    """Error of the truth itself against time: samples a pixel, Mitsuba's variant, float64 refinement, visibility."""
+    from rich.console import Console
+
+    with clear_errors():
+        from attnwarp_eval.truth import accuracy as truth
+
+        with Console(stderr=True).status("starting") as status:
+            panels = truth.measure(scenes or (), rounds=rounds, progress=status.update)
+        for path in truth.write(panels, out):
+            typer.echo(path)
+
+
+@scenes_app.command("time")
+def time_(
+    scenes: Annotated[list[str] | None, typer.Argument(help="Scenes' names or paths; all if left out.")] = None,
+    views: Annotated[int, typer.Option(min=1, help="Views of each scene, the source first.")] = 8,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures, px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 64,
+    geometry_size: Annotated[int, typer.Option(min=16, max=4096, help="Of depth and ids, px.")] = 512,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON, with every scene's stages.")] = False,
+) -> None:
+    """How long the truth takes from nothing (an empty cache of its own): meshes, geometry, pictures."""
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    with clear_errors():
+        from attnwarp_eval.scene import list_scenes
+        from attnwarp_eval.truth import suite
+
+        console, times = Console(stderr=True), []
+        with console.status("starting") as status:
+            for taken in suite.measure(
+                scenes or list_scenes(), views=views, size=size, spp=spp, geometry_size=geometry_size,
+                progress=status.update,
+            ):  # fmt: skip
+                times.append(taken)
+                # All of them take minutes: what is known is told at once.
+                console.print(f"{taken.scene}: {sum(taken.wall.values()):.1f} s", highlight=False)
+    if as_json:
+        typer.echo(json.dumps(suite.to_dict(times), indent=1))
+        return
+    columns, rows = suite.columns_and_rows(times)
+    table = Table(*columns, caption="wall, with CPU in brackets")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=160).print(table)
 
 
 @cache_app.command()

@@ -537,12 +537,20 @@ class Cost:
         return self.faster * self.variance[1] / self.variance[0] if self.variance[0] > 0 else float("inf")
 
 
-def measure(scene: Scene, *, size: int = 48, spp: int = 16, rounds: int = 7, seed: int = 7000) -> Cost:
-    """Render plan and everything on in turn and time both, after one unmeasured picture each."""
+def measure(
+    scene: Scene, *, size: int | None = None, spp: int | None = None, rounds: int = 7, seed: int = 7000
+) -> Cost:
+    """Render plan and everything on in turn and time both, after one unmeasured picture each.
+
+    Args:
+        size, spp: of the picture; if left out as large as needed for tracing, not starting, to take most of the time.
+    """
     import time
 
+    from attnwarp_eval.truth.llvm import LLVM, variant
     from attnwarp_eval.truth.mitsuba import render_plan
 
+    size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
     small = scene.with_size(size, size)
     contestants = (plan(small, spp), everything_on(small, spp, capped=False))
     pictures: tuple[list[Any], list[Any]] = ([], [])

@@ -291,7 +291,7 @@ def prove(
         ValueError: fewer than 10 seeds a side.
         SceneError: file and loaded scene disagree about the effects.
     """
-    from attnwarp_eval.truth.mitsuba import render_plan
+    from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
     if seeds < 10:
         raise ValueError(f"seeds: got {seeds}, expected at least 10 a side")
@@ -300,10 +300,13 @@ def prove(
     ours = plan(scene) if ours is None else ours
     against = everything_on(scene) if against is None else against
     rungs = [_structural(scene, ours)] if structure else []
+    made_by = comparable(scene)
 
     def pictures(made: Plan, spp: int, first: int, count: int) -> Array:
         steps = _with_spp(made, spp)
-        return np.stack([render_plan(scene, scene.source, steps, first + k) for k in range(count)]).astype(np.float64)
+        return np.stack(
+            [render_plan(scene, scene.source, steps, first + k, made_by=made_by) for k in range(count)]
+        ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
         return Proof(verdict, tuple(rungs), detectable or {}, time.perf_counter() - start)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import subprocess
 
 import numpy as np
 import pytest
@@ -414,45 +413,6 @@ def test_geometry_of_glass_is_its_first_surface():
     position, object_id = renderer.position_and_shape(foggy, foggy.source)
     assert np.array_equal(object_id, a.object_id) or (object_id == a.object_id).mean() > 0.995
     assert np.isfinite(position[object_id >= 0]).all()
-
-
-# llvm ----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def fresh_probe(monkeypatch):
-    monkeypatch.delenv("ATTNWARP_MITSUBA", raising=False)
-    renderer.variant.cache_clear()
-    yield monkeypatch
-    renderer.variant.cache_clear()
-
-
-@pytest.mark.parametrize(
-    ("code", "said", "expected"),
-    [(0, "works\n", "llvm_ad_rgb"), (-6, "", "scalar_rgb"), (1, "", "scalar_rgb"), (0, "black\n", "scalar_rgb")],
-)
-def test_llvm_is_used_only_where_a_child_process_lived_through_it(fresh_probe, code, said, expected):
-    calls = []
-
-    def run(*args, **kwargs):
-        calls.append(args)
-        return subprocess.CompletedProcess(args, code, said, "")
-
-    fresh_probe.setattr(renderer.subprocess, "run", run)
-    assert renderer.variant() == expected and renderer.variant() == expected
-    assert len(calls) == 1  # asked once in the life of a process
-
-
-def test_a_probe_that_hangs_means_scalar_and_a_named_variant_needs_no_probe(fresh_probe):
-    def hang(*args, **kwargs):
-        raise subprocess.TimeoutExpired("python", 1)
-
-    fresh_probe.setattr(renderer.subprocess, "run", hang)
-    assert renderer.variant() == "scalar_rgb"
-    renderer.variant.cache_clear()
-    fresh_probe.setenv("ATTNWARP_MITSUBA", "scalar_rgb")
-    fresh_probe.setattr(renderer.subprocess, "run", lambda *a, **k: pytest.fail("asked although a variant was named"))
-    assert renderer.variant() == "scalar_rgb"
 
 
 # The command line ----------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from attnwarp_eval.ablation.study import Splats
 from attnwarp_eval.ablation.world import World, splats, world
 from attnwarp_eval.content import digest
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
+from attnwarp_eval.effects_table import said_by
 from attnwarp_eval.errors import InputError
 from attnwarp_eval.truth import TwoView
 
@@ -84,6 +85,7 @@ def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> d
         "views": views,
         "pictures": pictures,
         **({"curve": curve} if curve else {}),
+        **({"effects": said_by(at.scene)} if cell.probe == "calibration" else {}),
         "cost": {
             "seconds": meter.seconds(),
             "counters": dict(sorted(meter.counters.items())),

@@ -13,6 +13,7 @@ from attnwarp_eval.report import figures
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.calibration import calibration
 from attnwarp_eval.report.claims import judge, load_claims
+from attnwarp_eval.report.effects import effects
 from attnwarp_eval.report.fits import fits
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
@@ -53,6 +54,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         *(fronts(results, root) if timings else []),
         *(_galleries(results) if pictures else []),
         *_failures(results),
+        *effects(results),
         _how(results, timings),
     ]
     if not timings:

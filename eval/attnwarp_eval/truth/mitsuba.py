@@ -1,7 +1,7 @@
 """Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.effects` plans them.
 
 Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else ``scalar_rgb``, which works
-everywhere: see :func:`variant`.
+everywhere: see :mod:`attnwarp_eval.truth.llvm`.
 
 Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64 first. Its cameras look
 along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1, -1, 1).
@@ -11,9 +11,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -36,6 +33,7 @@ from attnwarp_eval.optics import (
 )
 from attnwarp_eval.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.textures import albedo, linear_rgb
+from attnwarp_eval.truth.llvm import SCALAR, variant
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 
 if TYPE_CHECKING:
@@ -44,7 +42,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
 
-APPEARANCE_PROTOCOL = 1
+APPEARANCE_PROTOCOL = 2
 """Raised whenever the same scene, camera, plan and seed would give another picture."""
 
 TEXELS = 2048
@@ -96,10 +94,31 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
     return stored["image"]
 
 
-def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
-    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB. Nothing is kept; the same seed gives the same bits."""
-    # Which number a shape has is known for scalar_rgb only.
-    mi = _mitsuba("scalar_rgb" if any(step.first != "any" for step in plan.passes) else variant())
+def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None) -> Image:
+    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is kept.
+
+    Args:
+        made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
+        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads add them to pixels
+            in any order, which shows in the last bits of float32.
+    """
+    _mitsuba(made_by or variant())
+    total = _render_passes(scene, camera, plan, seed)
+    for again in range(1, ATTEMPTS):
+        broken = ~np.isfinite(total).all(-1)
+        if not broken.any():
+            break
+        total[broken] = _render_passes(scene, camera, plan, seed + again * OTHER_SEEDS)[broken]
+    return total
+
+
+ATTEMPTS, OTHER_SEEDS = 4, 1_000_003
+"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the pixel is then rendered
+again with other seeds, which biases it by nothing that a rejected sample would not."""
+
+
+def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
+    mi = _mitsuba()
     total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
     for number, step in enumerate(plan.passes):
         options: dict[str, Any] = {"type": step.integrator}
@@ -145,7 +164,7 @@ def _part(
     k = max(1, math.isqrt(step.spp))
     fine = camera.resize(camera.width * k, camera.height * k)
     lamps = [number for number, item in enumerate(scene.spec.objects) if item.emission]
-    smooth = np.isin([-1, *_owners(scene)], [-1, *smooth_objects(scene), *lamps])
+    smooth = np.isin(_owner_of_number(scene, world), [-1, *smooth_objects(scene), *lamps])
     if step.first == "rough":
         smooth = ~smooth
     integrator = mi.load_dict({"type": "aov", "aovs": "first:shape_index", "seen": options})
@@ -154,9 +173,23 @@ def _part(
     for number in range(each):
         sensor = _sensor(scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog)
         picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1))
-        keep = smooth[np.round(picture[..., 3]).astype(np.int64)]  # 1 + place among the shapes, 0 for none
+        keep = smooth[np.round(picture[..., 3]).astype(np.int64)]
         total += np.where(keep[..., None], picture[..., :3], 0.0)
     return (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
+
+
+def comparable(scene: Scene) -> str:
+    """The variant in which renderings of the source by different integrators can be held against each other.
+
+    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that depends on how an
+    integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on the scene alone.
+    """
+    from attnwarp_eval.truth.raycast import Geometry
+
+    if variant() == SCALAR:
+        return SCALAR
+    tied, _ = Geometry(scene).ties(scene.source)
+    return SCALAR if tied.any() else variant()
 
 
 def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
@@ -166,45 +199,39 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
         position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is hit.
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
-    mi = _mitsuba("scalar_rgb")
+    mi = _mitsuba(variant())
     world, center, _ = _world(scene, (), False, False)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would lie nowhere.
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
     sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None)
     picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64)
-    shape = np.round(picture[..., 3]).astype(np.int64)  # 1 + place among the shapes, 0 for none
-    owners = np.array([-1, *_owners(scene)])
+    shape = np.round(picture[..., 3]).astype(np.int64)
     position = np.where((shape > 0)[..., None], picture[..., :3] + center, np.nan)
-    return position, owners[shape]
+    return position, _owner_of_number(scene, world)[shape]
 
 
-PROBE = """
-import mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"},
-    "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}})
-total = float(mi.render(scene, spp=4).array.numpy().sum())
-print("works" if total == total and total > 0 else "black")
-"""
+def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
+    """Object by the number that the AOV shape_index has for a shape; -1 for 0, which is none.
 
-
-@functools.cache
-def variant() -> str:
-    """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
-
-    With some LLVMs (14 and 15) ``llvm_*`` aborts the process instead of raising, so a child process tries it, once in
-    the life of this one. ``DRJIT_LIBLLVM_PATH`` names another LLVM; ``ATTNWARP_MITSUBA`` names the variant and saves
-    the try.
+    It is 1 + the place among the shapes in scalar_rgb, the place in a registry of the whole process in the others.
     """
-    named = os.environ.get("ATTNWARP_MITSUBA")
-    if named:
-        return named
-    try:
-        tried = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=60, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return "scalar_rgb"
-    return "llvm_ad_rgb" if tried.returncode == 0 and tried.stdout.strip() == "works" else "scalar_rgb"
+    mi = _mitsuba()
+    shapes, owners = world.shapes(), _owners(scene)
+    numbers = list(range(1, len(shapes) + 1))
+    if mi.variant() != SCALAR:
+        import drjit
+
+        numbers = [int(np.array(drjit.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]) for shape in shapes]
+    table = np.full(max(numbers) + 1, -1, dtype=np.int64)
+    # A fog's own box, which comes last, belongs to no object.
+    table[numbers[: len(owners)]] = owners
+    return table
+
+
+def use(name: str) -> None:
+    """Load or turn to a variant now, so that no timer has it."""
+    _mitsuba(name)
 
 
 def _mitsuba(name: str | None = None) -> Any:
@@ -230,6 +257,8 @@ def _world(
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
     shone = {f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center) for k in lights}
+    # Asked for or not: what is not there does not make another world.
+    lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects))
 
     def make() -> tuple[Any, Array, Any]:
@@ -239,11 +268,6 @@ def _world(
         if media and scene.spec.medium is not None:
             fog = mi.load_dict(_homogeneous(scene.spec.medium))
             around = fog_box(scene)
-            pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
-            pose[:3, 3] = (around[0] + around[1]) / 2 - center
-            shapes["medium"] = mi.load_dict(
-                {"type": "cube", "to_world": mi.ScalarTransform4f(pose), "bsdf": {"type": "null"}, "interior": fog}
-            )
         for key, (shape, owner, form) in forms.items():
             item = scene.spec.objects[owner]
             extra: dict[str, Any] = {}
@@ -255,6 +279,13 @@ def _world(
                 # Light that leaves the glass is in the fog again.
                 extra["exterior"] = fog
             shapes[key] = mi.load_dict(form() | extra, optimize=False) if extra else shape
+        if fog is not None and around is not None:
+            # Last, so that the others' places are those of :func:`_owners`.
+            pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
+            pose[:3, 3] = (around[0] + around[1]) / 2 - center
+            shapes["medium"] = mi.load_dict(
+                {"type": "cube", "to_world": mi.ScalarTransform4f(pose), "bsdf": {"type": "null"}, "interior": fog}
+            )
         # optimize=False: the default merges shapes, after which their indices mean something else.
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
@@ -358,14 +389,22 @@ def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
 
 _loaded: dict[Any, Any] = {}
 
+KEPT = 12
+"""Loaded scenes and shapes that are kept: those of a plan with a caustic, a rendering of everything on, in two variants."""
+
 
 def _kept(key: Any, make: Callable[[], Any]) -> Any:
     """The value of ``make``, kept with the last few others: a scene's views come one after the other."""
     if key not in _loaded:
-        while len(_loaded) >= 6:
+        while len(_loaded) >= KEPT:
             _loaded.pop(next(iter(_loaded)))
         _loaded[key] = make()
     return _loaded[key]
+
+
+def forget() -> None:
+    """Let go of the loaded scenes, which are kept for the next picture."""
+    _loaded.clear()
 
 
 def _load_shapes(
@@ -494,6 +533,40 @@ def _files() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="attnwarp-")
 
 
+NEEDLE = 2e-3
+"""A triangle whose shortest edge is below this share of its longest is a needle. Mitsuba interpolates vertex colours with
+barycentric coordinates found anew in float32, whose denominator falls with the square of this share: 3 % wrong here, and
+NaN or any number at 3e-4."""
+
+
+def without_needles(vertices: Array, faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The faces with the short edge of every needle drawn together into one vertex, and those gone flat left out.
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+
+    Returns:
+        (G, 3), G <= F. Surfaces stay closed and move by at most the lengths of the edges that are gone.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)
+    length = np.linalg.norm(vertices[edges[..., 0]] - vertices[edges[..., 1]], axis=-1)
+    short = length < NEEDLE * length.max(axis=1, keepdims=True)
+    if not short.any():
+        return faces
+    ends = edges[short]
+    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(vertices), len(vertices)))
+    _, group = connected_components(joined, directed=False)
+    first = np.full(group.max() + 1, len(vertices), dtype=np.int64)
+    np.minimum.at(first, group, np.arange(len(vertices)))
+    out = first[group][faces]
+    whole = (out[:, 0] != out[:, 1]) & (out[:, 1] != out[:, 2]) & (out[:, 2] != out[:, 0])
+    return out[whole]
+
+
 def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
     """A binary PLY as Mitsuba reads it: r, g, b become the attribute vertex_color."""
     columns = [mesh.vertices - center]
@@ -503,8 +576,9 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
         names += ["nx", "ny", "nz"]
     columns.append(color)
     names += ["r", "g", "b"]
-    faces = np.zeros(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
-    faces["n"], faces["v"] = 3, mesh.faces
+    kept = without_needles(mesh.vertices, mesh.faces)
+    faces = np.zeros(len(kept), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    faces["n"], faces["v"] = 3, kept
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property float {name}" for name in names]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
@@ -583,14 +657,15 @@ def _sensor(
     pose = np.linalg.inv(moved.world_to_camera) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     box = world.bbox()
     size = float(np.linalg.norm(np.array(box.max) - np.array(box.min)))
-    reach = size + float(np.linalg.norm(moved.position))
+    # A power of 2: as a constant of the compiled code it should not differ from view to view.
+    reach = 2.0 ** math.ceil(math.log2(size + float(np.linalg.norm(moved.position))))
     form: dict[str, Any] = {
         "type": "perspective",
         "fov": math.degrees(2 * math.atan(camera.width / 2 / fx)),
         "fov_axis": "x",
         "principal_point_offset_x": (camera.width / 2 - camera.K[0, 2]) / camera.width,
         "principal_point_offset_y": (camera.height / 2 - camera.K[1, 2]) / camera.height,
-        "near_clip": 1e-4 * reach,
+        "near_clip": 5e-5 * reach,
         "far_clip": 10 * reach,
         "to_world": mi.ScalarTransform4f(pose),
         "film": {

@@ -188,6 +188,10 @@ class Geometry:
             self._traced[key] = self._trace(camera)
         return self._traced[key]
 
+    def forget(self) -> None:
+        """Let go of the answers that are kept."""
+        self._traced.clear()
+
     def _trace(self, camera: Camera) -> Hits:
         directions = camera.directions() @ camera.rotation
         hits = self.trace_rays(camera.position, directions.reshape(-1, 3))
@@ -283,14 +287,19 @@ class Geometry:
         rough = answer["t_hit"].numpy().astype(np.float64)
         hit = np.flatnonzero(face != MISS)
         face, rough = face[hit], rough[hit]
-        normal, d, o = self._face_normal[face], directions[hit], origins[hit]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            exact = np.einsum("ij,ij->i", normal, self._face_corner[face] - o) / np.einsum("ij,ij->i", normal, d)
-            refined = np.where(np.abs(exact - rough) <= REFINEMENT_LIMIT * rough, exact, rough)
+        refined = self._refined(rough, face, origins[hit], directions[hit])
         nearer = refined < t[hit]
         t[hit[nearer]] = refined[nearer]
         primitive[hit[nearer]] = face[nearer]
         return t, primitive
+
+    def _refined(self, rough: Array, face: npt.NDArray[np.int64], origins: Array, directions: Array) -> Array:
+        """Where rays meet the planes of the triangles that Open3D found, in float64."""
+        normal = self._face_normal[face]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            exact = np.einsum("ij,ij->i", normal, self._face_corner[face] - origins)
+            exact /= np.einsum("ij,ij->i", normal, directions)
+            return np.where(np.abs(exact - rough) <= REFINEMENT_LIMIT * rough, exact, rough)
 
     def _normal(self, primitive: npt.NDArray[np.int64], points: Array) -> Array:
         """(N, 3) unit geometric normals of either sign at ``points`` on ``primitive``; NaN for -1."""

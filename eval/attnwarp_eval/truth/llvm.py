@@ -1,0 +1,115 @@
+"""Which of Mitsuba's variants renders on this machine: compiled by LLVM where that works, interpreted elsewhere.
+
+``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster (docs/accuracy-and-time.md),
+but with some LLVMs (14 and 15) it ends the whole process instead of raising. So a child process tries it first.
+"""
+
+from __future__ import annotations
+
+import functools
+import glob
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+LLVM, SCALAR = "llvm_ad_rgb", "scalar_rgb"
+
+OLDEST = 16
+"""LLVMs before this are not tried: 14 is refused by Dr.Jit and 15 aborts in its code generator."""
+
+TRIES = 3
+"""Most libraries that are tried: each costs a process start, and a machine with LLVMs that all fail is rare."""
+
+PLACES = (
+    "{prefix}/lib/libLLVM*",  # conda
+    "/usr/lib/*-linux-gnu/libLLVM*",
+    "/usr/lib/llvm*/lib/libLLVM*",
+    "/usr/lib64/libLLVM*",
+    "/usr/lib64/llvm*/lib/libLLVM*",
+    "/usr/local/lib/libLLVM*",
+    "/opt/homebrew/opt/llvm*/lib/libLLVM*",
+    "/usr/local/opt/llvm*/lib/libLLVM*",
+)
+"""Where distributions, conda and Homebrew put the library. Dr.Jit's own search takes the first name that it finds,
+which may be an old one beside a newer."""
+
+PROBE = """
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except Exception:
+    pass
+import mitsuba as mi
+import numpy as np
+mi.set_variant("llvm_ad_rgb")
+pose = mi.ScalarTransform4f().look_at(origin=[0, 0, -4], target=[0, 0, 0], up=[0, 1, 0])
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3},
+    "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
+    "sky": {"type": "constant"}, "camera": {"type": "perspective", "fov": 10, "to_world": pose,
+    "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}}})
+mean = float(np.array(mi.render(scene, spp=64))[..., :3].mean())
+print("works" if 0.45 < mean < 0.55 else f"wrong picture: {mean}")
+"""
+"""A white-lit ball of albedo 0.5 fills the picture: its radiance is 0.5 everywhere."""
+
+
+@functools.cache
+def variant() -> str:
+    """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
+
+    Asked once in the life of a process. ``ATTNWARP_MITSUBA`` names the variant and saves the try;
+    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. A library found here is put into
+    ``DRJIT_LIBLLVM_PATH``, where Dr.Jit and child processes find it.
+    """
+    named = os.environ.get("ATTNWARP_MITSUBA")
+    if named:
+        return named
+    said = os.environ.get("DRJIT_LIBLLVM_PATH")
+    # With nothing found in the usual places Dr.Jit may still know one that is not.
+    tried: list[str | None] = [said] if said else [*libraries()[:TRIES]] or [None]
+    for library in tried:
+        if works(library):
+            if library:
+                os.environ["DRJIT_LIBLLVM_PATH"] = library
+            return LLVM
+    return SCALAR
+
+
+def libraries() -> list[str]:
+    """LLVM libraries in the usual places that may work: one path for each version, newest first."""
+    found: dict[tuple[int, ...], str] = {}
+    for place in PLACES:
+        for path in sorted(glob.glob(place.format(prefix=sys.prefix))):  # noqa: PTH207 - absolute patterns
+            known = version(os.path.realpath(path)) or version(path)
+            if known is not None and known[0] >= OLDEST and Path(path).is_file():
+                found.setdefault(known, os.path.realpath(path))
+    return [found[key] for key in sorted(found, reverse=True)]
+
+
+def version(path: str) -> tuple[int, ...] | None:
+    """What a library's file name says of its version: ``libLLVM-19.so``, ``libLLVM.so.19.1``, ``llvm-19/lib/libLLVM.so``.
+
+    None for a name that is none of a shared library of LLVM, or that has no number.
+    """
+    name = Path(path).name
+    shared = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?(?:\.so(?:\.(\d+(?:\.\d+)*))?|\.dylib)", name)
+    if shared is None:
+        return None
+    # libLLVM-14.0.6.so.1 ends in the number of its interface, so the number before .so counts first.
+    folder = re.search(r"/llvm[-@]?(\d+)(?:\.\d+)*/", path)
+    number = shared[1] or shared[2] or (folder[1] if folder else None)
+    return tuple(int(part) for part in number.split(".")) if number else None
+
+
+def works(library: str | None) -> bool:
+    """Whether a child process rendered a known picture with ``library`` (None: whichever Dr.Jit finds) and lived."""
+    environment = os.environ | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
+    try:
+        tried = subprocess.run(
+            [sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=60, check=False, env=environment
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return tried.returncode == 0 and tried.stdout.strip() == "works"
