@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -88,7 +89,7 @@ def collect(
         )  # fmt: skip
         entry = known.get(scene.name)
         if entry is None or entry["key"] != key or (settings.pictures and not (out / entry["picture"]).is_file()):
-            entry = {"key": key} | _entry(scene, out, settings, lambda text, n=number: progress(text, n))
+            entry = {"key": key} | _entry(scene, out, settings, functools.partial(_told, progress, number))
             known[scene.name] = entry
         entries.append(entry)
         # Scenes of an earlier call stay in the file; the table is of those asked for, as far as they are done.
@@ -179,10 +180,14 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
         ) from None
 
 
+def _told(progress: Callable[[str, int], None], number: int, text: str) -> None:
+    progress(text, number)
+
+
 def _write(out: Path, known: Mapping[str, Any], shown: Sequence[Mapping[str, Any]]) -> None:
     from attnwarp_eval.cost import environment
 
-    data = {"environment": environment(), "scenes": [known[name] for name in sorted(known)]}
+    data: dict[str, Any] = {"environment": environment(), "scenes": [known[name] for name in sorted(known)]}
     _replace(out / "effects.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
     _replace(out / "effects.md", _page(shown, data["environment"]))
 

@@ -22,7 +22,7 @@ from training.data import load
 from training.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair
 
 SEED = 3
-EPOCHS = 10
+EPOCHS = 6
 STEPS = 200
 BATCH = 16
 SIZE = 64
