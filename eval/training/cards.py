@@ -9,7 +9,7 @@ from typing import Any
 
 ABOUT = {
     "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million
-parameters for pictures of 128 x 128 px, a transformer of {text:.1f} million for text, byte-pair tokens.
+parameters for pictures of 112 x 112 px, a transformer of {text:.1f} million for text, byte-pair tokens.
 
 **Good for**: scores of renders and edits of scenes like those in `scenes/`: one thing on a ground, its colour, its material or pattern,
 the ground, the time of day; whether an edit went in the direction of the words; comparisons between methods on the same views.
@@ -30,7 +30,7 @@ size, then three transformer blocks; {size:.1f} million parameters.
 **Not good for**: telling photographs of the world apart, fine differences within a kind, exact correspondences: warps are checked against rays
 (`checks/`), not against these tokens. Its figures do not compare with those of DINOv2 (`--dino dinov2:FOLDER`).
 
-**Recipe**: `training/dino.py`. Self-distillation with multi-crop, a momentum teacher, centring and sharpening; no labels. The two large crops are two
+**Recipe**: `training/dino.py`. Self-distillation with multi-crop and a momentum teacher, whose targets are centred and sharpened by Sinkhorn's normalisation; no labels. The two large crops are two
 views of one thing, which at times stands on another ground or in another light. Patches of small crops are taught by the teacher's patches
 at the same place.""",
     "perceptual-small": """A distance of two pictures of one size, any size: differences of normalised features at four scales, weighted by channel

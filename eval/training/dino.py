@@ -27,9 +27,11 @@ EPOCHS = 12
 BATCH = 64
 PEAK = 1.2e-3
 LARGE, SMALL = 96, 48
-PROTOTYPES = 1024
+PROTOTYPES = 768
 DENSE_PROTOTYPES = 192
-STUDENT_TEMPERATURE, TEACHER_TEMPERATURE = 0.1, 0.05
+STUDENT_TEMPERATURE, TEACHER_TEMPERATURE = 0.1, 0.04
+SPREAD = 0.1
+"""Weight of the term that keeps class tokens apart."""
 DENSE = 0.5
 """Weight of the patches' loss beside the class token's."""
 
@@ -58,10 +60,37 @@ class Distiller(nn.Module):
         self.head = Head(self.net.dim, 512, PROTOTYPES)
         self.dense = Head(self.net.dim, 256, DENSE_PROTOTYPES)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, H, W) -> class scores (N, P), patch scores (N, P, h, w)."""
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(N, 3, H, W) -> class scores (N, P), patch scores (N, P, h, w), class tokens (N, D)."""
         cls, patches = self.net(x)
-        return self.head(cls), self.dense(patches.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        return self.head(cls), self.dense(patches.permute(0, 2, 3, 1)).permute(0, 3, 1, 2), cls
+
+
+def balanced(scores: Tensor, rounds: int = 3) -> Tensor:
+    """Centred and sharpened targets: every prototype is used alike over the batch, every row sums to one.
+
+    Sinkhorn and Knopp's normalisation in place of a running centre (Caron et al. 2020, section 3.1; Oquab et al. 2023): in
+    batches this small a running centre lags behind.
+
+    Args:
+        scores: (N, P) of the teacher.
+        rounds: of normalising columns, then rows.
+
+    Returns:
+        (N, P), rows that sum to 1.
+    """
+    q = torch.exp((scores - scores.max()) / TEACHER_TEMPERATURE)
+    for _ in range(rounds):
+        q = q / q.sum(dim=0, keepdim=True).clamp(min=1e-12)
+        q = q / q.sum(dim=1, keepdim=True).clamp(min=1e-12)
+    return q
+
+
+def spread(tokens: Tensor) -> Tensor:
+    """Minus the mean logarithm of the distance to the nearest neighbour (Sablayrolles et al. 2019, KoLeo)."""
+    unit = F.normalize(tokens.float(), dim=-1)
+    near = (unit @ unit.T).fill_diagonal_(-1).max(dim=1).values
+    return -torch.log((2 - 2 * near).clamp(min=1e-6).sqrt()).mean()
 
 
 def places(inner: Tensor, outer: Tensor, size: int) -> Tensor:
@@ -99,20 +128,8 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     student = channels_last(Distiller())
     teacher = copy.deepcopy(student)
     teacher.requires_grad_(False)
-    sizes = {"cls": PROTOTYPES, "dense": DENSE_PROTOTYPES}
-    center = nn.ParameterDict(
-        {name: nn.Parameter(torch.zeros(size), requires_grad=False) for name, size in sizes.items()}
-    )
     optimizer = torch.optim.AdamW(groups(student, 0.05), lr=PEAK)
     each = len(things) // BATCH
-
-    def soften(scores: Tensor, name: str, dim: int) -> Tensor:
-        shape = [1] * scores.ndim
-        shape[dim] = -1
-        middle = center[name].detach().view(shape)
-        mean = scores.mean(dim=[k for k in range(scores.ndim) if k != dim])
-        center[name].data.mul_(0.9).add_(mean, alpha=0.1)
-        return F.softmax((scores - middle) / TEACHER_TEMPERATURE, dim=dim)
 
     def epoch(number: int) -> dict[str, float]:
         rng = np.random.default_rng([SEED, number])
@@ -135,12 +152,15 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             large = [placed_crops(side, LARGE, rng, scale=(0.6, 1.0), tone=0.2) for side in sides]
             small = [placed_crops(side, SMALL, rng, scale=(0.25, 0.5), tone=0.2) for side in sides]
             with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-                t_cls, t_patch = teacher(torch.cat([x for x, _ in large]))
+                t_cls, t_patch, _ = teacher(torch.cat([x for x, _ in large]))
             with torch.autocast("cpu", torch.bfloat16):
-                s_large, _ = student(torch.cat([x for x, _ in large]))
-                s_small, s_small_patch = student(torch.cat([x for x, _ in small]))
-            target = soften(t_cls.float(), "cls", 1).chunk(2)
-            dense_target = soften(t_patch.float(), "dense", 1).chunk(2)
+                s_large, _, tokens = student(torch.cat([x for x, _ in large]))
+                s_small, s_small_patch, _ = student(torch.cat([x for x, _ in small]))
+            # Each side is balanced by itself: a thing must be one of many on either.
+            target = [balanced(t) for t in t_cls.float().chunk(2)]
+            n, p, h, w = t_patch.shape
+            flat = balanced(t_patch.float().permute(0, 2, 3, 1).reshape(-1, p))
+            dense_target = flat.view(n, h, w, p).permute(0, 3, 1, 2).chunk(2)
             by_crop = [F.log_softmax(s / STUDENT_TEMPERATURE, dim=1) for s in (*s_large.chunk(2), *s_small.chunk(2))]
             terms = [-(t * s).sum(1).mean() for k, t in enumerate(target) for j, s in enumerate(by_crop) if j != k]
             cls = torch.stack(terms).mean()
@@ -152,23 +172,22 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 loss = -(wanted * F.log_softmax(scores.float() / STUDENT_TEMPERATURE, dim=1)).sum(1)
                 dense_terms.append((loss * inside).sum() / inside.sum().clamp(min=1))
             dense = torch.stack(dense_terms).mean()
-            loss = cls + DENSE * dense
+            apart = torch.stack([spread(side) for side in tokens.chunk(2)]).mean()
+            loss = cls + DENSE * dense + SPREAD * apart
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(student.parameters(), 2.0)
             if number == 0:  # the prototypes stand still at first, which keeps the start from collapsing
                 student.head.prototypes.grad = student.dense.prototypes.grad = None
             optimizer.step()
-            keep = 1 - 0.01 * (0.5 + 0.5 * math.cos(math.pi * now / (epochs * each)))
+            keep = 1 - 0.02 * (0.5 + 0.5 * math.cos(math.pi * now / (epochs * each)))
             with torch.no_grad():
                 for mine, theirs in zip(teacher.parameters(), student.parameters(), strict=True):
                     mine.lerp_(theirs, 1 - keep)
-            entropy = -(target[0].mean(0) * (target[0].mean(0) + 1e-9).log()).sum()
-            sums += [float(cls.detach()), float(dense.detach()), float(entropy)]
-        return dict(zip(("class", "patches", "entropy"), sums / each, strict=True))
+            same = (target[0].argmax(1) == target[1].argmax(1)).float().mean()
+            sums += [float(cls.detach()), float(dense.detach()), float(same)]
+        return dict(zip(("class", "patches", "same prototype"), sums / each, strict=True))
 
     checkpoint = out / "dino-small.pt"
-    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer, "center": center}, epochs).train(
-        epoch
-    )
+    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer}, epochs).train(epoch)
     return checkpoint

@@ -71,11 +71,41 @@ class Pool(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, dim)."""
-        return self.project(self.norm(torch.cat([x.mean((2, 3)), x.amax((2, 3))], dim=1)))
+        return self.project(self.features(x))
+
+    def features(self, x: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, 2 C), what is projected."""
+        return self.norm(torch.cat([x.mean((2, 3)), x.amax((2, 3))], dim=1))
+
+
+class Block(nn.Module):
+    """A transformer block, normalised first."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.attend_norm = nn.LayerNorm(dim)
+        self.qkv = nn.Linear(dim, 3 * dim)
+        self.out = nn.Linear(dim, dim)
+        self.think_norm = nn.LayerNorm(dim)
+        self.think = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
+
+    def forward(self, x: Tensor, absent: Tensor | None = None) -> Tensor:
+        """(N, L, D) -> (N, L, D); what is ``absent``, (N, L) bool, is looked at by nobody."""
+        n, length, dim = x.shape
+        q, k, v = self.qkv(self.attend_norm(x)).view(n, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
+        # Written out: for a few hundred tokens on a CPU, two matrix products are several times faster than the fused kernel.
+        scores = q @ k.transpose(-1, -2) * (dim // self.heads) ** -0.5
+        if absent is not None:
+            scores = scores.masked_fill(absent[:, None, None], -torch.inf)
+        weights = scores.softmax(dim=-1)
+        y = (weights @ v).transpose(1, 2).reshape(n, length, dim)
+        x = x + self.out(y)
+        return x + self.think(self.think_norm(x))
 
 
 class TextTower(nn.Module):
-    """A small causal transformer over byte-pair tokens; the embedding is read at the last token.
+    """A small transformer over byte-pair tokens; the embedding is read at the last token.
 
     Args:
         vocabulary: number of tokens; token 0 is padding.
@@ -89,16 +119,17 @@ class TextTower(nn.Module):
         self.length = length
         self.words = nn.Embedding(vocabulary, width, padding_idx=0)
         self.position = nn.Parameter(0.01 * torch.randn(length, width))
-        layer = nn.TransformerEncoderLayer(width, heads, 4 * width, 0.0, "gelu", batch_first=True, norm_first=True)
-        self.layers = nn.TransformerEncoder(layer, depth, nn.LayerNorm(width), enable_nested_tensor=False)
+        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.norm = nn.LayerNorm(width)
         self.project = nn.Linear(width, dim)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """(N, L) int64, padded with 0 at the end -> (N, dim)."""
         x = self.words(tokens) + self.position[: tokens.shape[1]]
-        x = self.layers(x, src_key_padding_mask=tokens == 0)
+        for block in self.blocks:
+            x = block(x, tokens == 0)
         last = (tokens != 0).sum(dim=1).clamp(min=1) - 1
-        return self.project(x[torch.arange(len(x)), last])
+        return self.project(self.norm(x[torch.arange(len(x)), last]))
 
 
 class ClipSmall(nn.Module):
@@ -109,7 +140,7 @@ class ClipSmall(nn.Module):
         dim: of the shared space.
     """
 
-    size = 128
+    size = 112
     length = 40
 
     def __init__(self, vocabulary: int, dim: int = 192) -> None:
@@ -121,7 +152,7 @@ class ClipSmall(nn.Module):
         self.scale = nn.Parameter(torch.tensor(2.66))
 
     def images(self, x: Tensor) -> Tensor:
-        """(N, 3, 128, 128) in [0, 1] -> (N, dim)."""
+        """(N, 3, 112, 112) in [0, 1] -> (N, dim)."""
         return self.pool(self.vision(x)[-1])
 
     def texts(self, tokens: Tensor) -> Tensor:
@@ -129,35 +160,11 @@ class ClipSmall(nn.Module):
         return self.text(tokens)
 
 
-class Block(nn.Module):
-    """A transformer block, normalised first, with the residual branches scaled (Touvron et al. 2021, LayerScale)."""
-
-    def __init__(self, dim: int, heads: int) -> None:
-        super().__init__()
-        self.heads = heads
-        self.attend_norm = nn.LayerNorm(dim)
-        self.qkv = nn.Linear(dim, 3 * dim)
-        self.out = nn.Linear(dim, dim)
-        self.think_norm = nn.LayerNorm(dim)
-        self.think = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
-        self.attend_scale = nn.Parameter(0.1 * torch.ones(dim))
-        self.think_scale = nn.Parameter(0.1 * torch.ones(dim))
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(N, L, D) -> (N, L, D)."""
-        n, length, dim = x.shape
-        q, k, v = self.qkv(self.attend_norm(x)).view(n, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
-        # Written out: for a few hundred tokens on a CPU, two matrix products are several times faster than the fused kernel.
-        weights = (q @ k.transpose(-1, -2) * (dim // self.heads) ** -0.5).softmax(dim=-1)
-        y = (weights @ v).transpose(1, 2).reshape(n, length, dim)
-        x = x + self.attend_scale * self.out(y)
-        return x + self.think_scale * self.think(self.think_norm(x))
-
-
 class DinoSmall(nn.Module):
     """Convolutions to a sixteenth of the size, then a transformer with a class token (Caron et al. 2021), small.
 
-    The convolutions take the place of the patch embedding: a transformer alone needs far more pictures.
+    The convolutions take the place of the patch embedding: a transformer alone needs far more pictures. The class token
+    starts as mean and maximum of their features.
     """
 
     size = 128
@@ -168,17 +175,18 @@ class DinoSmall(nn.Module):
         self.dim = dim
         self.stages = Stages((32, 64, 128), (1, 2, 2))
         self.embed = nn.Conv2d(128, dim, 1)
-        self.cls = nn.Parameter(0.02 * torch.randn(1, 1, dim))
+        self.cls = Pool(128, dim)
         self.position = nn.Parameter(0.02 * torch.randn(1, dim, 8, 8))
         self.blocks = nn.ModuleList(Block(dim, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens (N, D, H / 16, W / 16)."""
-        y = self.embed(self.stages(x)[-1])
+        x = self.stages(x)[-1]
+        y = self.embed(x)
         h, w = y.shape[-2:]
         y = y + F.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
-        tokens = torch.cat([self.cls.expand(len(y), -1, -1), y.flatten(2).transpose(1, 2)], dim=1)
+        tokens = torch.cat([self.cls(x)[:, None], y.flatten(2).transpose(1, 2)], dim=1)
         for block in self.blocks:
             tokens = block(tokens)
         tokens = self.norm(tokens)
