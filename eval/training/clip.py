@@ -22,7 +22,7 @@ from training.data import Pictures, load
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
 SEED = 1
-EPOCHS = 10
+EPOCHS = 18
 BATCH = 128
 CROP = 96
 """Smaller than the 112 that the encoder sees: things then look a little larger in use than in training, which is known to

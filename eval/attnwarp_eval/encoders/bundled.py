@@ -96,6 +96,10 @@ class BundledClip(_OfSquares):
             found = [self.net.images(batch).double().numpy() for batch in self._batches(images)]
         return np.concatenate(found) if found else np.zeros((0, self.about.dim or 0))
 
+    def cut(self, text: str) -> int:
+        """How many tokens of a text are dropped because the network takes no more."""
+        return sum(len(rest.ids) - 1 for rest in self.tokenizer.encode(text).overflowing)
+
     def texts(self, texts: Sequence[str]) -> Array:
         """(N, D) float64 embeddings, not normalised; words that are not in the vocabulary are read in pieces."""
         said = checked_texts(texts)
