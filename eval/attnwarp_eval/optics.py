@@ -113,6 +113,9 @@ Material = Annotated[
 ]
 
 TEXTURED = (DiffuseMaterial, PlasticMaterial)
+
+VERTEX_COLORED = ("body", "mesh", "terrain", "scatter")
+"""Shapes whose colours lie in the vertices of their mesh."""
 """Materials whose colour is the object's texture; the others have a ``tint``."""
 
 
@@ -298,6 +301,12 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
             )
     bounces = spec.appearance.bounces
     for k, item in enumerate(spec.objects):
+        if isinstance(item.material, PlasticMaterial) and item.shape.type in VERTEX_COLORED:
+            # Mitsuba's roughplastic asks its texture for a mean, which colours of vertices have none of.
+            yield (
+                f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic can be a sphere, a box or a "
+                "rectangle; say diffuse or metal, or another shape", ("objects", k, "material"),
+            )  # fmt: skip
         needed, why = _bounces_needed(item.material)
         if not item.emission and bounces != "unlimited" and bounces < needed:
             yield (

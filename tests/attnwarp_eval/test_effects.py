@@ -125,6 +125,11 @@ def test_contradictions_are_refused_with_the_remedy():
     refused("every picture needs the geometry", [FLOOR], [SKY], effects={"forbid": ["geometry"]})
     refused("bounces: got 1, but object 'ball' is glass: .*say at least 3", [FLOOR, ball(GLASS)], [SKY])
     refused("bounces: got 1, but object 'ball' is mirror: .*say at least 2", [FLOOR, ball(MIRROR)], [SKY])
+    blob = {"type": "body", "parts": [{"type": "ellipsoid", "center": [0, 0, 1], "radii": [1, 1, 1]}]}
+    plastic = ball({"type": "plastic"})
+    refused("'ball' is plastic and its shape a body; plastic can be a sphere, a box or a rectangle",
+            [FLOOR, plastic | {"shape": blob}], [SKY])  # fmt: skip
+    assert plan(make([FLOOR, plastic], [SKY]))
     allowed = make([FLOOR, ball()], [SKY], effects={"pin": ["environment"], "forbid": ["medium", "interreflection"]})
     assert effects.detect(allowed)["environment"].source == "pinned"
 
