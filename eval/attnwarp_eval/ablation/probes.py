@@ -277,15 +277,9 @@ def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[s
 def _sensitivity(at: World, cell: Cell, meter: Meter, seconds: dict[str, list[float]]) -> Iterator[View]:
     """Every metric on right and on flawed results of the scene's edits. A view is named ``edit/view``."""
     from attnwarp_eval.ablation import sensitivity
-    from attnwarp_eval.encoders import load_encoder
 
-    encoders = {}
     with meter.stage("setup"):
-        for kind, expected in cell.spec["encoders"].items():
-            name = cell.encoders[kind]
-            encoders[kind] = load_encoder(name, kind)
-            if sensitivity.identity_of(encoders[kind]) != expected:
-                raise InputError(f"encoder {name!r} has changed since the run was planned; start the run again")
+        encoders = sensitivity.loaded(cell.encoders, cell.spec["encoders"])
     yield from sensitivity.measure(at, cell.spec, encoders, meter, seconds)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from attnwarp_eval.arrays import Array, Mask
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.encoders import Kind, load_encoder
+from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
     from attnwarp_eval.ablation.world import World
@@ -260,6 +261,26 @@ def identity_of(encoder: Any) -> dict[str, Any]:
     """:func:`identity` of an encoder that is loaded."""
     about = encoder.about.to_dict()
     return {key: about[key] for key in ("kind", "weights_sha256", "preprocessing", "size", "dim")}
+
+
+def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Encoders by kind.
+
+    Args:
+        names: by kind, as :func:`attnwarp_eval.encoders.load_encoder` takes them.
+        expected: by kind, the :func:`identity` that they had when the run was planned.
+
+    Raises:
+        InputError: one cannot be loaded, or is another one by now.
+    """
+    found = {}
+    for kind, wanted in expected.items():
+        found[kind] = load_encoder(names[kind])
+        if identity_of(found[kind]) != wanted:
+            raise InputError(
+                f"encoder {names[kind]!r}: its weights have changed since the run was planned; start the run again"
+            )
+    return found
 
 
 def measure(
