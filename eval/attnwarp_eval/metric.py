@@ -35,6 +35,11 @@ class Metric:
     description: str
     version: int = 1
 
+    @property
+    def is_count(self) -> bool:
+        """Whether it only describes how much was measured, and is no figure of quality."""
+        return self.unit in ("pixels", "views") and self.direction == "none"
+
 
 class Registry(dict[str, Metric]):
     """Metrics by name, which also answers to a result's key, whatever region or size stands behind the name."""

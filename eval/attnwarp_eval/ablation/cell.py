@@ -19,6 +19,7 @@ class Cell:
         scene, variant, probe, seed: labels for tables and error messages.
         labels: every variant name that leads to this same content.
         pictures: views of which pictures are kept.
+        encoders: by kind, the names that encoders are loaded by; which weights they are is in ``spec``.
     """
 
     spec: dict[str, Any]
@@ -28,6 +29,7 @@ class Cell:
     seed: int
     labels: tuple[str, ...] = field(default=())
     pictures: tuple[str, ...] = field(default=())
+    encoders: dict[str, str] = field(default_factory=dict)
 
     @cached_property
     def id(self) -> str:

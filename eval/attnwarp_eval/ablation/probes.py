@@ -65,17 +65,19 @@ def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> d
         raise InputError(f"scene {scene!r} has changed since the run was planned; start the run again")
     views, pictures = [], []
     curve: list[dict[str, Any]] = []
-    rounds: dict[str, list[list[float]]] = {}
+    rounds: dict[str, Any] = {}
     found: Iterator[View]
     if cell.probe == "fit":
         found = _fit(at, spec, meter, root, curve)
     elif cell.probe == "timing":
         rounds = _timing(at, scene, spec, meter)
         found = iter(())
+    elif cell.probe == "sensitivity":
+        found = _sensitivity(at, cell, meter, rounds)
     else:
         found = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe](at, scene, spec, meter)
     for name, figures, shown in found:
-        views.append({"view": name, "yaw": at.yaw[name], "metrics": _plain(figures)})
+        views.append({"view": name, "yaw": at.yaw[name.rpartition("/")[2]], "metrics": _plain(figures)})
         if name in cell.pictures:
             with meter.stage("pictures"):
                 pictures += _save_pictures(cell, name, at, shown, root)
@@ -272,6 +274,15 @@ def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[s
                 seconds["pair"][index].append(done - rendered)
     meter.count(rounds=spec["rounds"], contestants=len(contestants))
     return seconds
+
+
+def _sensitivity(at: World, cell: Cell, meter: Meter, seconds: dict[str, list[float]]) -> Iterator[View]:
+    """Every metric on right and on flawed results of the scene's edits. A view is named ``edit/view``."""
+    from attnwarp_eval.ablation import sensitivity
+
+    with meter.stage("setup"):
+        encoders = sensitivity.loaded(cell.encoders, cell.spec["encoders"])
+    yield from sensitivity.measure(at, cell.spec, encoders, meter, seconds)
 
 
 def _warp_truth(at: World, truth: TwoView, settings: WarpSettings, **images: Any) -> WarpedView:

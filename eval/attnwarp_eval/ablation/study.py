@@ -11,6 +11,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval.encoders import Kind
 from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,10 +19,13 @@ if TYPE_CHECKING:
     from attnwarp.settings import WarpSettings
     from attnwarp_eval.scene import Scene
 
-PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1, "timing": 1}
+PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1, "timing": 1, "sensitivity": 1}
 """Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get new ids."""
 
-ProbeName = Literal["calibration", "depth", "warp", "fit", "timing"]
+ProbeName = Literal["calibration", "depth", "warp", "fit", "timing", "sensitivity"]
+
+WITHOUT_VARIANTS = ("calibration", "sensitivity")
+"""Probes that judge the instrument and not a variant: one cell a scene."""
 
 
 class StudyError(InputError):
@@ -127,7 +131,9 @@ class Study(_Model):
     timing_rounds: Annotated[int, Field(ge=3)] = 15
     splats: Splats = Splats()
     fit: Fits = Fits()
-    variants: Annotated[dict[str, Variant], Field(min_length=1)]
+    encoders: dict[Kind, str] = Field(default_factory=dict, description="by kind, as load_encoder takes them")
+    edits: list[str] = Field(default_factory=list, description="edits by name; all of a scene's if empty")
+    variants: dict[str, Variant] = Field(default_factory=dict)
     probes: Annotated[dict[ProbeName, list[str]], Field(min_length=1)]
     ablations: list[Ablation] = Field(default_factory=list)
     yaw: Yaw = Yaw()
@@ -145,6 +151,13 @@ class Study(_Model):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Study:
+        needed = [probe for probe in self.probes if probe not in WITHOUT_VARIANTS]
+        if needed and not self.variants:
+            raise ValueError(f"variants: got none, expected at least one for probes.{needed[0]}")
+        if self.probes.get("sensitivity"):
+            raise ValueError(
+                "probes.sensitivity: got variants, expected []; it judges metrics, which no variant changes"
+            )
         for name, variant in self.variants.items():
             try:
                 variant.settings()
@@ -170,10 +183,16 @@ class Study(_Model):
             if self.variants[name].geometry != "splats":
                 raise ValueError(f"probes.timing: {name!r} renders nothing, so there is no time to take; leave it out")
         self._metrics_are_known()
+        self._encoders_are_known()
         for size in self.feature_sizes:
             if not 1 <= size <= self.size:
                 raise ValueError(f"feature_sizes: got {size}, expected 1 to {self.size}, the image size")
-        for name, values in (("scenes", self.scenes), ("seeds", self.seeds), ("views", self.views)):
+        for name, values in (
+            ("scenes", self.scenes),
+            ("seeds", self.seeds),
+            ("views", self.views),
+            ("edits", self.edits),
+        ):
             if len(set(values)) != len(values):
                 raise ValueError(f"{name}: something is named twice in {values}")
         return self
@@ -188,6 +207,17 @@ class Study(_Model):
                 raise ValueError(f"fronts.{i}.metric: no metric {front.metric!r}") from None
             if direction != "lower":
                 raise ValueError(f"fronts.{i}.metric: {front.metric!r} is not one of which less is better")
+
+    def _encoders_are_known(self) -> None:
+        from attnwarp_eval.encoders import kind_of
+
+        for kind, name in self.encoders.items():
+            try:
+                found = kind_of(name)
+            except InputError as error:
+                raise ValueError(f"encoders.{kind}: {error}") from None
+            if found != kind:
+                raise ValueError(f"encoders.{kind}: {name!r} is of kind {found!r}")
 
     def splats_of(self, variant: Variant) -> Splats:
         """The study's splats with the variant's own fields."""
@@ -206,9 +236,11 @@ class Study(_Model):
             scenes: the loaded scenes by name.
 
         Raises:
-            StudyError: a view that a scene lacks.
+            StudyError: a view or an edit that a scene lacks; an encoder that cannot be loaded.
         """
         found: dict[str, Cell] = {}
+        identities = self._identities()
+        self._edits_are_known(scenes)
         for scene_name in self.scenes:
             scene = scenes[scene_name]
             views = self._views_of(scene)
@@ -219,6 +251,12 @@ class Study(_Model):
             found[cell.id] = cell
             for probe, names in self.probes.items():
                 if probe == "calibration":
+                    continue
+                if probe == "sensitivity":
+                    for seed in self.seeds:
+                        spec = self._sensitivity(scene, views, identities, seed)
+                        cell = Cell(spec, scene_name, "metrics", probe, seed, ("metrics",), encoders=self._by_kind())
+                        found[cell.id] = cell
                     continue
                 if probe == "timing":
                     for seed in self.seeds:
@@ -265,6 +303,59 @@ class Study(_Model):
                 }
                 for name in names
             ],
+        }
+
+    def _edits_are_known(self, scenes: dict[str, Scene]) -> None:
+        known = list(dict.fromkeys(edit.name for scene in scenes.values() for edit in scene.edits))
+        for name in self.edits:
+            if name not in known:
+                raise StudyError(f"edits: no scene has an edit {name!r}{_did_you_mean(name, known)}")
+
+    def _by_kind(self) -> dict[str, str]:
+        return {kind: self.encoders[kind] for kind in sorted(self.encoders)}
+
+    def _identities(self) -> dict[str, dict[str, Any]]:
+        """Which encoders these are, by their weights: other weights give other cells, another folder does not."""
+        if "sensitivity" not in self.probes:
+            return {}
+        from attnwarp_eval.ablation import sensitivity
+
+        found = {}
+        for kind, name in self.encoders.items():
+            try:
+                found[kind] = sensitivity.identity(name, kind)
+            except InputError as error:
+                raise StudyError(f"encoders.{kind}: {error}") from None
+        return {str(kind): found[kind] for kind in sorted(found)}
+
+    def _sensitivity(
+        self, scene: Scene, views: list[str], encoders: dict[str, dict[str, Any]], seed: int
+    ) -> dict[str, Any]:
+        """One cell for all metrics of a scene: they judge the same pictures, and their times are taken in turn."""
+        from attnwarp_eval.ablation.sensitivity import tasks
+
+        known = [edit.name for edit in scene.edits]
+        if not known:
+            raise StudyError(
+                f"probes.sensitivity: scene {scene.name!r} names no edits, so there is no right result; leave it out, or "
+                "give it some (docs/edits.md)"
+            )
+        asked = tasks(scene, self.edits)
+        if not asked:
+            raise StudyError(
+                f"edits: scene {scene.name!r} has none of {', '.join(self.edits)}; there are {', '.join(known)}"
+            )
+        return {
+            "probe": "sensitivity",
+            "protocol": PROTOCOLS["sensitivity"],
+            "scene": scene.content_hash,
+            "size": self.size,
+            "views": views,
+            "seed": seed,
+            "spp": self.spp,
+            "rounds": self.timing_rounds,
+            "encoders": encoders,
+            "tasks": [task.to_dict() for task in asked],
         }
 
     def _views_of(self, scene: Scene) -> list[str]:

@@ -19,6 +19,7 @@ from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
+from attnwarp_eval.report.sensitivity import sensitivity
 from attnwarp_eval.report.words import number, spread
 from attnwarp_eval.statistics import Interval, interval
 
@@ -48,6 +49,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     sections = [
         _claims(results),
         calibration(results),
+        *sensitivity(results, root, timings=timings),
         *ablations(results),
         *fits(results, root, number, timings=timings),
         *_yaw(results, root),
@@ -187,7 +189,7 @@ def _how(results: Results, timings: bool) -> Section:
     rows = [
         [m.name, m.unit, m.direction, str(m.version), m.description]
         for m in (metric_of(name) for name in names)
-        if m.unit != "pixels"
+        if not m.is_count
     ]
     text = [
         "Behind a metric's name may stand a region (`interior`, `edge`: within 2 px of a depth or object edge) or the "

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp_eval.statistics import Interval, front
 
@@ -24,8 +25,15 @@ MARKERS = "osD^vP*X"
 
 
 @contextmanager
-def drawing(path: Path, columns: int = 1, height: float = 3.4) -> Iterator[list[Axes]]:
-    """A figure of ``columns`` axes side by side, saved on leaving without a date or random ids."""
+def drawing(
+    path: Path, columns: int = 1, height: float = 3.4, *, rows: int = 1, width: float | None = None
+) -> Iterator[list[Axes]]:
+    """A figure of ``rows`` x ``columns`` axes, row by row, saved on leaving without a date or random ids.
+
+    Args:
+        path: of the SVG.
+        height, width: of the whole figure, in inches; 5.4 a column if ``width`` is left out.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -42,8 +50,10 @@ def drawing(path: Path, columns: int = 1, height: float = 3.4) -> Iterator[list[
         "legend.fontsize": 8,
     }
     with matplotlib.rc_context(style):
-        figure, axes = plt.subplots(1, columns, figsize=(5.4 * columns, height), squeeze=False, layout="constrained")
-        yield list(axes[0])
+        figure, axes = plt.subplots(
+            rows, columns, figsize=(width or 5.4 * columns, height), squeeze=False, layout="constrained"
+        )
+        yield list(axes.flat)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, metadata={"Date": None, "Creator": None})
         plt.close(figure)
@@ -94,8 +104,54 @@ def lines(
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
 
 
-def cost_front(axes: Axes, points: Mapping[str, tuple[Interval, Interval]], *, x: str, y: str, title: str) -> list[str]:
+def heatmap(
+    axes: Axes,
+    values: npt.NDArray[np.float64],
+    *,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    framed: npt.NDArray[np.bool_],
+    title: str,
+) -> None:
+    """Shares as coloured cells with their numbers: blue toward 1, white at 0.5, red toward 0; undefined ones grey.
+
+    Args:
+        values: (R, C) in [0, 1], NaN where undefined.
+        rows, columns: R and C titles.
+        framed: (R, C) cells that get a frame.
+    """
+    import matplotlib as mpl
+    from matplotlib.patches import Rectangle
+
+    axes.grid(False)
+    colors = mpl.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
+    axes.pcolormesh(np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1)
+    for (i, j), value in np.ndenumerate(values):
+        shown = f"{value:.2f}" if np.isfinite(value) else "–"
+        dark = np.isfinite(value) and abs(value - 0.5) > 0.33
+        axes.text(j + 0.5, i + 0.5, shown, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+        if framed[i, j]:
+            axes.add_patch(Rectangle((j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"))
+    axes.set_xticks(np.arange(len(columns)) + 0.5, columns, rotation=30, ha="right")
+    axes.set_yticks(np.arange(len(rows)) + 0.5, rows)
+    axes.tick_params(length=0)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.invert_yaxis()
+    axes.set_title(title, loc="left", fontsize=9.5)
+
+
+def cost_front(
+    axes: Axes,
+    points: Mapping[str, tuple[Interval, Interval]],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    log: bool = True,
+) -> list[str]:
     """Error against seconds with intervals on both axes; the front as a staircase, dominated points in grey.
+
+    ``log``: whether the error's axis is logarithmic, as that of seconds always is.
 
     Returns:
         The names on the front, cheapest first.
@@ -122,7 +178,7 @@ def cost_front(axes: Axes, points: Mapping[str, tuple[Interval, Interval]], *, x
         axes.step(
             [cost[i] for i in kept], [error[i] for i in kept], where="post", color=PALETTE[0], linewidth=1, alpha=0.6
         )
-    axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log")
+    axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log" if log else "linear")
     axes.set_title(title, loc="left", fontsize=9.5)
     axes.margins(0.2)
     return [names[i] for i in kept]

@@ -156,7 +156,7 @@ class Results:
             names = sorted({name for view in record["views"] for name in view["metrics"]})
             for name in names:
                 metric = metric_of(name)
-                if metric.unit == "pixels":
+                if metric.is_count:
                     continue  # counts that describe; they stay in the cell's own file
                 values = {v["view"]: _shortened(v["metrics"].get(name)) for v in record["views"]}
                 known = [v for v in values.values() if v is not None]

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from attnwarp_eval.ablation import StudyError, load_study
+from attnwarp_eval.ablation import StudyError, load_study, sensitivity
 from attnwarp_eval.ablation.study import shipped_studies
 from attnwarp_eval.scene import load_scene
 
@@ -35,7 +35,9 @@ def cells(study):
 
 
 @pytest.mark.parametrize("name", list(shipped_studies()))
-def test_every_shipped_study_loads_and_names_scenes_that_exist(name):
+def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch):
+    # Which weights an encoder has is part of a cell's id; that they are there is tested where they are.
+    monkeypatch.setattr(sensitivity, "identity", lambda name, kind: {"weights_sha256": name})
     study = load_study(name)
     assert study.title
     assert len({c.id for c in cells(study)}) == len(cells(study)) > 0
@@ -77,6 +79,14 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ({"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": []}]}, "add it to probes.fit"),
         ({"fronts": [{"title": "t", "metric": "depth.foo", "variants": ["again"]}]}, "no metric 'depth.foo'"),
         ({"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]}, "less is better"),
+        (
+            {"encoders": {"clip": "clip-smal"}},
+            r"encoders.clip: encoder 'clip-smal': unknown; did you mean 'clip-small'",
+        ),
+        ({"encoders": {"clip": "dino-small"}}, "encoders.clip: 'dino-small' is of kind 'dino'"),
+        ({"encoders": {"vlm": "clip-small"}}, "encoders.vlm"),
+        ({"probes": {"sensitivity": ["again"]}}, r"probes.sensitivity: got variants, expected \[\]"),
+        ({"variants": {}, "probes": {"warp": []}}, "variants: got none, expected at least one for probes.warp"),
     ],
 )
 def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):
