@@ -199,7 +199,9 @@ def _flaws(
     count = len(records)
     table = [[row.title, *(spread(shares[row.key][c.name], count) for c in FLAWS)] for row in rows]
     columns = ["metric", *(c.title for c in FLAWS)]
-    return Section("Which metric can see what", text, [Table(columns, table, "Shares with intervals", folded=True)], [drawn])
+    return Section(
+        "Which metric can see what", text, [Table(columns, table, "Shares with intervals", folded=True)], [drawn]
+    )
 
 
 def _encoders(results: Results, spec: Mapping[str, Any]) -> str:
