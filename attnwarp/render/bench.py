@@ -86,10 +86,10 @@ def measure_peak(threads: int, milliseconds: float = 15) -> float:
     threads."""
     from attnwarp.render import _peak
 
-    operations = 2.0 * _peak.LANES * 64
+    operations = 2.0 * 16 * _peak.CHAINS * 64
     rounds = int(milliseconds * 1e-3 * 2e11 / operations)
-    jobs = [(rounds, np.empty(1, np.float32)) for _ in range(threads)]
-    _peak.multiply_add(1, jobs[0][1])
+    jobs = [(rounds, _peak.start()) for _ in range(threads)]
+    _peak.multiply_add(1, _peak.start())
     start = time.process_time()
     _threads.run(_peak.multiply_add, jobs)
     return operations * rounds * threads / (time.process_time() - start)
