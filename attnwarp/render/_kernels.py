@@ -71,6 +71,7 @@ PLACE = (1 << PLACE_BITS) - 1
 # A run of tiles: the first one, how many, and which columns of squares in the upper and in the lower half, from the
 # run's first one on, as first | last << 16.
 RUN = 4
+NOTES = 64
 NONE = 32767 | (-1 << 16)
 
 # Slots of a tile's buffer, each 64 floats.
@@ -100,20 +101,25 @@ C30, C31, C32, C33 = -0.5900435899266435, 2.890611442640554, -0.4570457994644658
 C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
 
 
-@intrinsic
-def _prefetch(typing: Any, array: Any, item: Any) -> Any:
-    """Ask for the cache line of ``array``'s item (counted flat) before it is needed."""
+def _asking(write: int) -> Any:
+    @intrinsic
+    def prefetch(typing: Any, array: Any, item: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            data = cgutils.create_struct_proxy(signature.args[0])(context, builder, args[0]).data
+            pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+            word = ir.IntType(32)
+            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
+            call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+            builder.call(call, [pointer, word(write), word(3), word(1)])
+            return word(0)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        data = cgutils.create_struct_proxy(signature.args[0])(context, builder, args[0]).data
-        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
-        word = ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
-        call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(call, [pointer, word(0), word(3), word(1)])
-        return word(0)
+        return nb.int32(array, nb.int64), codegen
 
-    return nb.int32(array, nb.int64), codegen
+    return prefetch
+
+
+# Ask for the cache line of an array's item (counted flat) before it is needed, to be read or to be written.
+_prefetch, _prefetch_to_write = _asking(0), _asking(1)
 
 
 @inlined
@@ -347,26 +353,19 @@ def project(first, last, order, view, m, q, s, o, values, channels, table, thin,
 
 
 @jit
-def radix_order(key):
+def radix_order(key, index, other, bits, spare):
     """Indices of the keys that are not NaN, ascending, equal ones in their order of input (LSD radix sort of bits);
-    and the places in them of keys that are equal to one beside them."""
-    n = 0
-    for i in range(key.shape[0]):
-        if key[i] == key[i]:
-            n += 1
-    index = np.empty(n, np.int32)
-    other = np.empty(n, np.int32)
-    bits = np.empty(n, np.uint32)
-    spare = np.empty(n, np.uint32)
+    and the places in them of keys that are equal to one beside them. All arrays are as long as ``key``; the results
+    lie in ``index`` and ``other``."""
     raw = key.view(np.uint32)
-    j = 0
+    n = 0
     for i in range(key.shape[0]):
         if key[i] == key[i]:
             b = raw[i] if key[i] != 0 else np.uint32(0)
             # Flipping makes the order of the bits that of the numbers: all bits of a negative, the sign of a positive.
-            bits[j] = ~b if b >> np.uint32(31) else b | np.uint32(0x80000000)
-            index[j] = i
-            j += 1
+            bits[n] = ~b if b >> np.uint32(31) else b | np.uint32(0x80000000)
+            index[n] = i
+            n += 1
     counts = np.empty(2048, np.int64)
     for shift in (0, 11, 22):
         counts[:] = 0
@@ -390,7 +389,7 @@ def radix_order(key):
     for i in range(n):
         other[ties] = i
         ties += (i > 0 and bits[i] == bits[i - 1]) or (i + 1 < n and bits[i] == bits[i + 1])
-    return index, other[:ties]
+    return index[:n], other[:ties]
 
 
 @inlined
@@ -410,8 +409,63 @@ def _overlaps(row, x1, x2, y1, y2, cut, most, filtered):
     return False
 
 
+@inlined
+def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change):
+    """The runs of a splat whose outline is no ellipse, by intervals; see :func:`outline`."""
+    x0, y0, slack = row[X0], row[Y0], 1e-4
+    for ty in range(tiles_y):
+        y1 = ty * TILE + 0.5 - y0 - slack
+        y2 = min(ty * TILE + TILE, height) - 0.5 - y0 + slack
+        run = 0
+        for tx in range(tiles_x + 1):
+            x1 = tx * TILE + 0.5 - x0 - slack
+            x2 = min(tx * TILE + TILE, width) - 0.5 - x0 + slack
+            if tx < tiles_x and _overlaps(row, x1, x2, y1, y2, cut, slim[WIDE + WMAX], slim[WIDE + FILTER] > 0):
+                run += 1
+            elif run > 0:
+                if used < spans.shape[0]:
+                    tile = ty * tiles_x + tx - run
+                    spans[used, 0], spans[used, 1] = tile, run
+                    spans[used, 2] = spans[used, 3] = (2 * run - 1) << 16
+                    change[tile] += 1
+                    change[tile + run] -= 1
+                counts[k] += 1
+                used += 1
+                run = 0
+    return used
+
+
 @bare
-def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, change, scratch):
+def _emit(notes, noted, columns, tiles_x, spans, used, counts, change):
+    """The runs of the ellipses that are noted: splat, first row of tiles, how many; and the columns of their squares.
+
+    Apart from what finds the columns: how many rows a splat has is no branch that waits for roots and divisions.
+    """
+    room = spans.shape[0]
+    for j in range(noted):
+        k, ty = notes[j, 0], notes[j, 1]
+        begin, at = used, u64(16 + j * 32)
+        for pair in range(notes[j, 2]):
+            u1, l1 = int(columns[at + u64(2 * pair)]), int(columns[at + u64(2 * pair + 1)])
+            u2, l2 = int(columns[at + u64(2 * pair + 16)]), int(columns[at + u64(2 * pair + 17)])
+            end = max(u2, l2)
+            if end >= 0:
+                tx = min(u1, l1) >> 1
+                run = (end >> 1) - tx + 1
+                if used < room:
+                    tile = (ty + pair) * tiles_x + tx
+                    spans[used, 0], spans[used, 1] = tile, run
+                    spans[used, 2] = NONE if u2 < 0 else (u1 - 2 * tx) | (u2 - 2 * tx) << 16
+                    spans[used, 3] = NONE if l2 < 0 else (l1 - 2 * tx) | (l2 - 2 * tx) << 16
+                    change[tile] += 1
+                    change[tile + run] -= 1
+                used += 1
+        counts[k] += used - begin
+    return used
+
+
+@bare
+def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, change, columns, notes):
     """Write the runs of tiles that the splats first..last (places in the order of depth) may show in to ``spans``.
 
     Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if the outline rho <=
@@ -419,17 +473,16 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
     at once. Splat k has ``counts[k]`` runs, which follow those of k - 1; a run is (first tile, number of tiles, columns
     of squares in the upper half, in the lower half), see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and
     taken away behind its end. Returns the rows needed; where they are more than fit, nothing of this counts.
+    ``columns`` (16 + 32 NOTES, float32) and ``notes`` (NOTES, 3) are for work.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
-    room = spans.shape[0]
     for k in range(16):
-        scratch[32 + k] = f32(4 * k)
-    steps = L.load(scratch, 32)
+        columns[k] = f32(4 * k)
+    steps = L.load(columns, 0)
     zero, far = f32(0.0), f32(1e9)
-    used = 0
+    used, noted = 0, 0
     for k in range(first, last):
-        begin = used
         row, slim = table[k], thin[k]
         x0, y0, cut = row[X0], row[Y0], f64(slim[WIDE + CUT]) * (1 + 1e-6)
         counts[k] = 0
@@ -451,28 +504,10 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
                 ey = (A * wy - B * wx) * inverse
                 h = cut * (1 + wx * ex + wy * ey)
         if not ellipse:
-            slack = 1e-4
-            for ty in range(tiles_y):
-                y1 = ty * TILE + 0.5 - y0 - slack
-                y2 = min(ty * TILE + TILE, height) - 0.5 - y0 + slack
-                run = 0
-                for tx in range(tiles_x + 1):
-                    x1 = tx * TILE + 0.5 - x0 - slack
-                    x2 = min(tx * TILE + TILE, width) - 0.5 - x0 + slack
-                    if tx < tiles_x and _overlaps(
-                        row, x1, x2, y1, y2, cut, slim[WIDE + WMAX], slim[WIDE + FILTER] > 0
-                    ):
-                        run += 1
-                    elif run > 0:
-                        if used < room:
-                            tile = ty * tiles_x + tx - run
-                            spans[used, 0], spans[used, 1] = tile, run
-                            spans[used, 2] = spans[used, 3] = (2 * run - 1) << 16
-                            change[tile] += 1
-                            change[tile + run] -= 1
-                        used += 1
-                        run = 0
-            counts[k] = used - begin
+            # In the order of the splats: what has been noted comes first.
+            used = _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
+            noted = 0
+            used = _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change)
             continue
         # The disc of the screen filter is joined to the ellipse.
         square = cut / 2 if flat else 0.0
@@ -490,46 +525,37 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
         middle, tip, stretch, square, round_ = f32(ex), f32(tip), f32(wide), f32(square), f32(radius)
         topmost = f32(top)
         while r1 <= r2:
+            if noted == NOTES:
+                used = _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
+                noted = 0
             # From the ellipse's middle; rows that the image ends within are taken whole.
             y1 = steps + f32(4 * r1 + 0.5 - 1e-4 - y0)
             y2 = y1 + f32(3 + 2e-4)
             e1, e2 = L.most(y1 - f32(ey), -topmost), L.least(y2 - f32(ey), topmost)
             # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
             t1, t2 = e1 * shrink, e2 * shrink
-            chord1 = L.root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
-            chord2 = L.root(L.most(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
+            chord1 = L.rough_root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
+            chord2 = L.rough_root(L.most(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
             right = L.where((e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2))
             left = L.where((e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2))
             meets = e1 <= e2
             left, right = L.where(meets, left + middle, far), L.where(meets, right + middle, -far)
             if flat:
                 near = L.most(L.most(y1, -y2), zero)
-                chord = L.root(L.most(square - near * near, zero))
+                chord = L.rough_root(L.most(square - near * near, f32(1e-12)))
                 meets = near < round_
                 left = L.where(meets, L.least(left, -chord), left)
                 right = L.where(meets, L.most(right, chord), right)
             left = L.up(L.most(left + f32(x0 - 0.5 - slack), zero))
             right = L.down(L.least(right + f32(x0 - 0.5 + slack), f32(width - 1)))
             shows = left <= right
-            L.store(scratch, 0, L.where(shows, L.down(left * f32(0.25)), f32(32767.0)))
-            L.store(scratch, 16, L.where(shows, L.down(right * f32(0.25)), f32(-1.0)))
-            for pair in range(min(8, r2 // 2 - r1 // 2 + 1)):
-                u1, l1 = int(scratch[u64(2 * pair)]), int(scratch[u64(2 * pair + 1)])
-                u2, l2 = int(scratch[u64(2 * pair + 16)]), int(scratch[u64(2 * pair + 17)])
-                tx = min(u1, l1) >> 1
-                run = (max(u2, l2) >> 1) - tx + 1
-                if run > 0 and max(u2, l2) >= 0:
-                    if used < room:
-                        tile = (r1 // 2 + pair) * tiles_x + tx
-                        spans[used, 0], spans[used, 1] = tile, run
-                        spans[used, 2] = NONE if u2 < 0 else (u1 - 2 * tx) | (u2 - 2 * tx) << 16
-                        spans[used, 3] = NONE if l2 < 0 else (l1 - 2 * tx) | (l2 - 2 * tx) << 16
-                        change[tile] += 1
-                        change[tile + run] -= 1
-                    used += 1
+            at = 16 + noted * 32
+            L.store(columns, at, L.where(shows, L.down(left * f32(0.25)), f32(32767.0)))
+            L.store(columns, at + 16, L.where(shows, L.down(right * f32(0.25)), f32(-1.0)))
+            notes[noted, 0], notes[noted, 1], notes[noted, 2] = k, r1 // 2, min(8, r2 // 2 - r1 // 2 + 1)
+            noted += 1
             r1 += 16
-        counts[k] = used - begin
-    return used
+    return _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
 
 
 @bare
@@ -551,8 +577,15 @@ def place_cursors(changes, live, cursors, starts):
 
 
 @inlined
+def _bits(code):
+    """A half run, as :func:`outline` writes it, as one bit for each column of squares; up to 31 tiles."""
+    begin, end = code & 0xFFFF, code >> 16
+    return ((2 << end) - (1 << begin)) if end >= 0 else 0
+
+
+@inlined
 def _columns(code, column):
-    """Bits 0 and 1: whether a half run, as :func:`outline` writes it, holds this column of squares and the next."""
+    """Bits 0 and 1: whether a half run holds this column of squares and the next."""
     begin, end = code & 0xFFFF, code >> 16
     return int((begin <= column) & (column <= end)) | int((begin <= column + 1) & (column + 1 <= end)) << 1
 
@@ -564,14 +597,23 @@ def scatter(first, last, spans, counts, live, every, cursor, entries):
     Args:
         spans: their runs, in order. every: whether all tiles are live.
     """
-    at = 0
+    at = u64(0)
     for place in range(first, last):
         for _ in range(counts[place]):
-            tile, run = spans[at, 0], spans[at, 1]
-            upper, lower = spans[at, 2], spans[at, 3]
-            at += 1
+            tile, run = u64(spans[at, 0]), spans[at, 1]
+            upper, lower = int(spans[at, 2]), int(spans[at, 3])
+            at += u64(1)
+            if every and run < 31:
+                top, bottom = _bits(upper), _bits(lower) << 2
+                for t in range(tile, tile + u64(run)):
+                    c = u64(cursor[t])
+                    entries[c] = place | ((top & 3) | (bottom & 12)) << PLACE_BITS
+                    cursor[t] = int(c) + 1
+                    top >>= 2
+                    bottom >>= 2
+                continue
             for k in range(run):
-                t = u64(tile + k)
+                t = tile + u64(k)
                 if every or live[t]:
                     bits = _columns(upper, 2 * k) | _columns(lower, 2 * k) << 2
                     entries[u64(cursor[t])] = place | bits << PLACE_BITS
@@ -662,10 +704,29 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
         tested, shaded, contributing = 0, 0, 0
         ty, tx = t // tiles_x, t % tiles_x
         ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
-        for p in range(PIXELS):
-            x, y = buf[XS * 64 + p] + ox, buf[YS * 64 + p] + oy
+        rows, cols = min(TILE, height - ty * TILE), min(TILE, width - tx * TILE)
+        for r in range(rows):
+            # They will be written when the tile is done: the memory has time until then.
+            to = (ty * TILE + r) * width + tx * TILE
+            _prefetch_to_write(alpha, to)
+            _prefetch_to_write(depth, to)
+            _prefetch_to_write(median, to)
+            _prefetch_to_write(l1, to)
+            _prefetch_to_write(l2, to)
+            _prefetch_to_write(normal, 3 * to)
+            _prefetch_to_write(normal, 3 * to + 3 * cols - 1)
+            _prefetch_to_write(color, channels * to)
+            _prefetch_to_write(color, channels * (to + cols) - 1)
+            if keep:
+                for k in range(5):
+                    _prefetch_to_write(state, k * height * width + to)
+        for p in range(0, PIXELS, 16):
+            L.store(buf, TT * 64 + p, f32(1.0))
+        if rows < TILE or cols < TILE:
             # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
-            buf[TT * 64 + p] = f32(1.0) if (x < width) & (y < height) else f32(0.0)
+            for p in range(PIXELS):
+                if not ((buf[XS * 64 + p] + f32(4.0) < cols) & (buf[YS * 64 + p] + f32(4.0) < rows)):
+                    buf[TT * 64 + p] = f32(0.0)
         for p in range(AA * 64, buf.shape[0], 16):
             L.store(buf, p, f32(0.0))
         ended, reached = 0, 0
@@ -701,19 +762,26 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                 c0, c1, c2 = L.load(buf, C_0 * 64 + s), L.load(buf, C_1 * 64 + s), L.load(buf, C_2 * 64 + s)
                 zref, iref = L.load(buf, ZREF * 64 + s), L.load(buf, IREF * 64 + s)
                 med, medk, final = L.load(buf, MED * 64 + s), L.load(buf, MEDK * 64 + s), L.load(buf, LAST * 64 + s)
+                # Once no pixel is, what only the first splats of a pixel decide is over: for a block at a time, so that
+                # it costs no branch that goes both ways.
+                undecided = L.some(half < T)
+                alive = stop < T
                 used = 0
                 while used < picked:
                     k = picks[u64(used)]
                     b = k * ROW
                     inside, a, z, iz = _shade(work, b, x, y, flat, peak)
-                    hit = inside & (stop < T)
+                    hit = inside & alive
                     w = L.where(hit, a * T, f32(0.0))
                     step = L.spread(work, b + STEP)
-                    opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
-                    med, medk = L.where(opens, z, med), L.where(opens, step, medk)
-                    final = L.where(hit, step, final)
-                    # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far away.
-                    zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
+                    if keep:
+                        final = L.where(hit, step, final)
+                    if undecided:
+                        opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
+                        med, medk = L.where(opens, z, med), L.where(opens, step, medk)
+                        # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far
+                        # away.
+                        zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
                     z, m = z - zref, iz - iref
                     wz, wm = w * z, w * m
                     pairs = pairs + wz * A - w * D
@@ -733,7 +801,8 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                     contributing += drawn
                     shaded += 16 if drawn > 0 else 0
                     used += 1
-                    if not L.some(stop < T):
+                    alive = stop < T
+                    if not L.some(alive):
                         ended |= 1 << q
                         reached = max(reached, e - begin + k + 1)
                         break
@@ -761,29 +830,42 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                         f = features[u64(entries[e + picks[u64(k)]] & PLACE), u64(c)]
                         sums = sums + L.load(work, SHARES + k * 16) * f
                     L.store(buf, (C_0 + c) * 64 + s, sums)
-            for k in range(size):
-                seen[e + k] = L.total(L.load(work, WEIGHTS + k * 16))
+            for k in range(0, size, 16):
+                b = WEIGHTS + k * 16
+                sums = L.totals(
+                    L.load(work, b), L.load(work, b + 16), L.load(work, b + 32), L.load(work, b + 48),
+                    L.load(work, b + 64), L.load(work, b + 80), L.load(work, b + 96), L.load(work, b + 112),
+                    L.load(work, b + 128), L.load(work, b + 144), L.load(work, b + 160), L.load(work, b + 176),
+                    L.load(work, b + 192), L.load(work, b + 208), L.load(work, b + 224), L.load(work, b + 240),
+                )  # fmt: skip
+                if k + 16 <= size:
+                    L.store(seen, e + k, sums)
+                else:
+                    L.store(work, SHARES, sums)
+                    for j in range(size - k):
+                        seen[u64(e + k + j)] = work[u64(SHARES + j)]
             e += size
         full[t] = ended == 15
         done[t] = reached if ended == 15 else end - begin
         tested_in[t] = tested
         shaded_in[t] = shaded
         drawn_in[t] = contributing
-        for p in range(PIXELS):
-            A, a1 = buf[AA * 64 + p], buf[M1 * 64 + p]
-            covered = buf[LAST * 64 + p] > 0
-            inverse = f32(1.0) / A if covered else f32(0.0)
-            spread = max(buf[M2 * 64 + p] - a1 * a1 * inverse, f32(0.0))
-            buf[AL * 64 + p] = spread
-            buf[M2 * 64 + p] = f32(ndc_scale) * A * spread
-            buf[M1 * 64 + p] = buf[IREF * 64 + p] + a1 * inverse
-            buf[DD * 64 + p] = buf[ZREF * 64 + p] + buf[DD * 64 + p] * inverse if covered else f32(np.nan)
-            buf[MED * 64 + p] = buf[MED * 64 + p] if covered else f32(np.nan)
-            buf[L1 * 64 + p] *= f32(2.0)
-        for c in range(channels):
-            for p in range(PIXELS):
-                buf[u64((C_0 + c) * 64 + p)] += (f32(1.0) - buf[AA * 64 + p]) * background[c]
-        rows, cols = min(TILE, height - ty * TILE), min(TILE, width - tx * TILE)
+        for p in range(0, PIXELS, 16):
+            A, a1 = L.load(buf, AA * 64 + p), L.load(buf, M1 * 64 + p)
+            covered = f32(0.0) < A
+            inverse = L.where(covered, L.inverse(A), f32(0.0))
+            spread = L.most(L.load(buf, M2 * 64 + p) - a1 * a1 * inverse, f32(0.0))
+            L.store(buf, AL * 64 + p, spread)
+            L.store(buf, M2 * 64 + p, A * spread * f32(ndc_scale))
+            L.store(buf, M1 * 64 + p, L.load(buf, IREF * 64 + p) + a1 * inverse)
+            mean = L.load(buf, ZREF * 64 + p) + L.load(buf, DD * 64 + p) * inverse
+            L.store(buf, DD * 64 + p, L.where(covered, mean, f32(np.nan)))
+            L.store(buf, MED * 64 + p, L.where(covered, L.load(buf, MED * 64 + p), f32(np.nan)))
+            L.store(buf, L1 * 64 + p, L.load(buf, L1 * 64 + p) * f32(2.0))
+            through = f32(1.0) - A
+            for c in range(channels):
+                at = (C_0 + c) * 64 + p
+                L.store(buf, at, L.load(buf, at) + through * background[c])
         if rows == TILE and cols == TILE and channels == 3:
             for k in range(16):
                 p = k // 8 * 32 + k % 2 * 16 + k // 2 % 4 * 4

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from attnwarp.render import _kernels as kernels
-from attnwarp.render import _threads, order
+from attnwarp.render import _pool, _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
 PIECE = 4096
@@ -91,7 +91,7 @@ class _Scene:
         self.tiles_y = -(-inputs.height // kernels.TILE)
         self.tiles = self.tiles_x * self.tiles_y
         self.visit = _visit(self.tiles_x, self.tiles_y)
-        key = np.empty(n, np.float32)
+        key = _pool.empty(n, np.float32)
         pieces = _threads.ranges(n, PIECE)
         listed = np.zeros((len(pieces), 1))
         _threads.run(
@@ -102,16 +102,16 @@ class _Scene:
             ],
         )
         self.listed = float(listed.sum())
-        self.order, ties = kernels.radix_order(key)
+        self.order, ties = kernels.radix_order(key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2))
         if len(ties):
             order.break_ties(
                 self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties
             )
         m = len(self.order)
-        self.thin = _aligned(2 * m * kernels.COLUMNS).reshape(m, 2 * kernels.COLUMNS)
+        self.thin = _pool.empty((m, 2 * kernels.COLUMNS), np.float32)
         self.table = self.thin.view(np.float64)
-        self.features = np.empty((m if self.channels > 3 else 0, self.channels), np.float32)
-        self.counts = np.empty(m, np.int32)
+        self.features = _pool.empty((m if self.channels > 3 else 0, self.channels), np.float32)
+        self.counts = _pool.empty(m, np.int32)
         self.ready = 0
         self.groups: list[tuple[int, int]] = []
         self.spans: list[np.ndarray] = []
@@ -132,7 +132,7 @@ class _Scene:
             for first, last in _threads.ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
         ]
         spans: list[np.ndarray] = [np.empty((0, kernels.RUN), np.int32)] * len(groups)
-        changes = np.zeros((len(groups), self.tiles + 1), np.int32)
+        changes = _pool.zeros((len(groups), self.tiles + 1), np.int32)
 
         def work(index: int) -> None:
             begin, end = groups[index]
@@ -140,13 +140,13 @@ class _Scene:
                 begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
                 self.channels, self.table, self.thin, self.features,
             )  # fmt: skip
-            scratch = np.empty(48, np.float32)
+            columns, notes = _aligned(16 + 32 * kernels.NOTES), np.empty((kernels.NOTES, 3), np.int64)
             room = 6 * (end - begin) + 256
             while True:
-                runs = np.empty((room, kernels.RUN), np.int32)
+                runs = _pool.empty((room, kernels.RUN), np.int32)
                 used = kernels.outline(
                     begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, runs, self.counts,
-                    changes[index], scratch,
+                    changes[index], columns, notes,
                 )  # fmt: skip
                 if used <= room:
                     break
@@ -164,9 +164,9 @@ class _Scene:
         """Lists of the splats that are set up, in the tiles that are ``live``: (tiles + 1) starts, and entries."""
         starts = np.zeros(self.tiles + 1, np.int64)
         changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
-        cursors = np.empty(changes.shape, np.int64)
+        cursors = _pool.empty(changes.shape, np.int64)
         kernels.place_cursors(changes, live, cursors, starts)
-        entries = np.empty(starts[-1], np.uint32)
+        entries = _pool.empty(int(starts[-1]), np.uint32)
         every = bool(live.all())
         _threads.run(
             kernels.scatter,
@@ -195,10 +195,10 @@ class _Composite(torch.autograd.Function):
         h, w = inputs.height, inputs.width
         near, far = inputs.ndc
         scale = (far * near / (far - near)) ** 2
-        color = np.empty((h, w, scene.channels), np.float32)
-        normal = np.empty((h, w, 3), np.float32)
-        alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
-        state = np.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
+        color = _pool.empty((h, w, scene.channels), np.float32)
+        normal = _pool.empty((h, w, 3), np.float32)
+        alpha, depth, median, l1, l2 = (_pool.empty((h, w), np.float32) for _ in range(5))
+        state = _pool.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
         done, tested, shaded, drawn = (np.zeros(scene.tiles, np.int64) for _ in range(4))
         full = np.zeros(scene.tiles, np.bool_)
         slots = kernels.SLOTS + max(0, scene.channels - 3)
@@ -210,7 +210,7 @@ class _Composite(torch.autograd.Function):
         while True:
             scene.set_up(count)
             starts, entries = scene.bin(live)
-            seen = np.empty(len(entries), np.float32)
+            seen = _pool.empty(len(entries), np.float32)
             _threads.run(
                 kernels.forward,
                 [
@@ -232,9 +232,9 @@ class _Composite(torch.autograd.Function):
                 break
             count = len(scene.order)
         scene.entries = _join(lists)
-        weight_of = np.zeros(len(scene.order), np.float32)
+        weight_of = _pool.zeros(len(scene.order), np.float32)
         kernels.gather_weights(scene.starts, done, scene.entries, _join(weights), weight_of)
-        weight = np.zeros(len(scene.means), np.float32)
+        weight = _pool.zeros(len(scene.means), np.float32)
         weight[scene.order] = weight_of
         counters.update(
             splats=len(scene.means),
@@ -262,15 +262,15 @@ class _Composite(torch.autograd.Function):
         n = len(scene.means)
         shapes = [(h, w, scene.channels), *[(h, w)] * 3, (h, w, 3), (h, w), (h, w), (n,)]
         g = [
-            np.zeros(shape, np.float32) if grad is None else _array(grad, np.float32)
+            _pool.zeros(shape, np.float32) if grad is None else _array(grad, np.float32)
             for grad, shape in zip(upstream, shapes, strict=True)
         ]
         g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight = g
         total = _gather_rows(
             scene, ctx, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight[scene.order]
         )
-        gm, gq, gs = np.zeros_like(scene.means), np.zeros_like(scene.quats), np.zeros_like(scene.scales)
-        go, gv = np.zeros_like(scene.opacities), np.zeros_like(scene.values)
+        parameters = (scene.means, scene.quats, scene.scales, scene.opacities, scene.values)
+        gm, gq, gs, go, gv = (_pool.zeros(part.shape, part.dtype) for part in parameters)
         pieces = _threads.ranges(scene.ready, PIECE)
         g_view = np.zeros((len(pieces), 12))
         _threads.run(
@@ -306,7 +306,7 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
     """
     n = scene.ready
     columns = kernels.GRADIENTS + 3 + max(3, scene.channels)
-    total = np.zeros((n, columns))
+    total = _pool.zeros((n, columns), np.float64)
     done, visit = ctx.done, scene.visit
     before = np.concatenate([[0], np.cumsum(done[visit])])
     room = ROWS_AT_ONCE
@@ -318,9 +318,9 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         last = min(last, scene.tiles)
         count = int(before[last] - before[first])
         if len(buffer) < count:
-            buffer = np.empty((max(count, min(room, int(before[-1]))), columns), np.float32)
+            buffer = _pool.empty((max(count, min(room, int(before[-1]))), columns), np.float32)
         rows = buffer[:count]
-        place = np.empty(scene.tiles, np.int64)
+        place = _pool.empty(scene.tiles, np.int64)
         place[visit] = before[:-1] - before[first]
         pieces = 8 * _threads.count()
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
