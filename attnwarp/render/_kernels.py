@@ -201,10 +201,52 @@ def depths(first, last, view, m, q, s, o, key, listed):
     listed[0] = guess
 
 
+@inlined
+def _reaches(view, c0, c1, c2, size, wanted):
+    """Whether a splat may show in a wanted tile, by a rectangle that holds it whatever its rotation.
+
+    c: its centre in camera axes. size: its largest sigma.
+    """
+    fx, skew, fy, near = view[FX], view[SKEW], view[FY], view[NEAR]
+    ic = 1 / c2
+    x, y = c0 * ic, c1 * ic
+    at_x, at_y = fx * x + skew * y + view[CX], fy * y + view[CY]
+    every = wanted[-1, -1] == (wanted.shape[0] - 1) * (wanted.shape[1] - 1)
+    if every & (at_x > 0) & (at_x < view[WIDTH]) & (at_y > 0) & (at_y < view[HEIGHT]) & (c2 > near):
+        return True
+    if view[FLAT] > 0:
+        # A sphere holds it: (c0 + d0) / (c2 + d2) - c0 / c2 is at most |d| (1 + |c0 / c2|) / (c2 - |d|). And 2.4
+        # pixels hold the disc of the screen filter.
+        reach = K.EXTENT_SIGMAS * size
+        if c2 - reach <= near:
+            return True
+        scale, blur = reach / (c2 - reach), 2.4
+    else:
+        # As the projection is linearised, no wider than |J| sigma; then blurred.
+        x_most, y_most = (
+            1.0 + abs(view[CX] / fx) + 2 * view[WIDTH] / fx,
+            1.0 + abs(view[CY] / fy) + 2 * view[HEIGHT] / fy,
+        )
+        x, y = min(max(x, -x_most), x_most), min(max(y, -y_most), y_most)
+        scale, blur = K.EXTENT_SIGMAS * size * ic, K.EXTENT_SIGMAS * math.sqrt(K.BLUR_3D)
+    tall = scale * fy * (1 + abs(y)) + blur
+    wide = scale * (fx * (1 + abs(x)) + abs(skew) * (1 + abs(y))) + blur
+    x1, x2, y1, y2 = at_x - wide, at_x + wide, at_y - tall, at_y + tall
+    if not ((x2 > 0) & (y2 > 0) & (x1 < view[WIDTH]) & (y1 < view[HEIGHT])):
+        return False
+    t1, t2 = int(max(x1, 0.0)) // TILE, int(min(x2, view[WIDTH] - 1)) // TILE + 1
+    r1, r2 = int(max(y1, 0.0)) // TILE, int(min(y2, view[HEIGHT] - 1)) // TILE + 1
+    return wanted[r2, t2] - wanted[r1, t2] - wanted[r2, t1] + wanted[r1, t1] > 0
+
+
 @jit
-def project(first, last, order, view, m, q, s, o, values, channels, table, thin, features):
+def project(first, last, order, view, m, q, s, o, values, channels, wanted, table, thin, features):
     """The splats order[first:last] to the rows first..last of the table, and of ``features`` (M, channels) if there
-    are more than three."""
+    are more than three.
+
+    ``wanted`` (tiles_y + 1, tiles_x + 1) holds how many tiles are wanted above and left of each tile's corner: a splat
+    that cannot show in a wanted one gets a negative CUT, and the rest of its row is left as it was.
+    """
     R = view[:9].copy().reshape(3, 3)
     fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
     flat, center = view[FLAT] > 0, view[CENTER] > 0
@@ -230,6 +272,9 @@ def project(first, last, order, view, m, q, s, o, values, channels, table, thin,
         c0 = R[0, 0] * m0 + R[0, 1] * m1 + R[0, 2] * m2 + view[TX]
         c1 = R[1, 0] * m0 + R[1, 1] * m1 + R[1, 2] * m2 + view[TX + 1]
         c2 = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[TX + 2]
+        if not _reaches(view, c0, c1, c2, max(s0, s1, s2), wanted):
+            thin[j, WIDE + CUT] = f32(-1.0)
+            continue
         _axes(q, i, Q)
         for r in range(3):
             for k in range(3):
@@ -323,8 +368,18 @@ def project(first, last, order, view, m, q, s, o, values, channels, table, thin,
             low = max(c2 - K.EXTENT_SIGMAS * spread, near)
             high = max(c2 + K.EXTENT_SIGMAS * spread, near)
         cut = 2 * math.log(opacity / K.ALPHA_MIN) if opacity >= K.ALPHA_MIN else -1.0
-        thin[j, WIDE + Z0], thin[j, WIDE + ZLO], thin[j, WIDE + ZHI], thin[j, WIDE + OPACITY] = depth, low, high, opacity
-        thin[j, WIDE + FILTER], thin[j, WIDE + SHUT], thin[j, WIDE + WMAX], thin[j, WIDE + CUT] = filtered, unfiltered, most, cut
+        thin[j, WIDE + Z0], thin[j, WIDE + ZLO], thin[j, WIDE + ZHI], thin[j, WIDE + OPACITY] = (
+            depth,
+            low,
+            high,
+            opacity,
+        )
+        thin[j, WIDE + FILTER], thin[j, WIDE + SHUT], thin[j, WIDE + WMAX], thin[j, WIDE + CUT] = (
+            filtered,
+            unfiltered,
+            most,
+            cut,
+        )
         thin[j, WIDE + IZ0], thin[j, WIDE + IZLO], thin[j, WIDE + IZHI] = 1 / depth, 1 / low, 1 / high
         # The outline is an ellipse only if the whole disc lies in front of the camera plane.
         bounded = not flat or (ahead and c2 - math.sqrt(max(cut, 0.0)) * spread > 1e-3 * c2)
@@ -436,11 +491,43 @@ def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, 
 
 
 @bare
-def _emit(notes, noted, columns, tiles_x, spans, used, counts, change):
-    """The runs of the ellipses that are noted: splat, first row of tiles, how many; and the columns of their squares.
+def _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change):
+    """The runs of the pieces of ellipses that are noted; see :func:`outline`.
 
-    Apart from what finds the columns: how many rows a splat has is no branch that waits for roots and divisions.
+    In steps, each for all notes: what finds the columns waits for no branch, and the branches (how many rows has a
+    splat) wait for no root or division.
     """
+    steps = L.load(columns, 0)
+    zero, far = f32(0.0), f32(1e9)
+    for j in range(noted):
+        at = j * 16
+        # From the ellipse's middle; rows that the image ends within are taken whole.
+        y1 = steps + L.spread(shapes, at)
+        y2 = y1 + f32(3 + 2e-4)
+        top, shrink, half = L.spread(shapes, at + 2), L.spread(shapes, at + 3), L.spread(shapes, at + 4)
+        lean, stretch, tip = L.spread(shapes, at + 5), L.spread(shapes, at + 6), L.spread(shapes, at + 7)
+        e1, e2 = L.most(y1 - L.spread(shapes, at + 1), -top), L.least(y2 - L.spread(shapes, at + 1), top)
+        t1, t2 = e1 * shrink, e2 * shrink
+        # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
+        chord1 = L.rough_root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
+        chord2 = L.rough_root(L.most(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
+        right = L.where((e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2))
+        left = L.where((e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2))
+        meets = e1 <= e2
+        middle = L.spread(shapes, at + 8)
+        left, right = L.where(meets, left + middle, far), L.where(meets, right + middle, -far)
+        if flat:
+            # The disc of the screen filter is joined to the ellipse.
+            near = L.most(L.most(y1, -y2), zero)
+            chord = L.rough_root(L.most(L.spread(shapes, at + 9) - near * near, f32(1e-12)))
+            meets = near < L.spread(shapes, at + 10)
+            left = L.where(meets, L.least(left, -chord), left)
+            right = L.where(meets, L.most(right, chord), right)
+        left = L.up(L.most(left + L.spread(shapes, at + 11), zero))
+        right = L.down(L.least(right + L.spread(shapes, at + 12), f32(width - 1)))
+        shows = left <= right
+        L.store(columns, 16 + j * 32, L.where(shows, L.down(left * f32(0.25)), f32(32767.0)))
+        L.store(columns, 32 + j * 32, L.where(shows, L.down(right * f32(0.25)), f32(-1.0)))
     room = spans.shape[0]
     for j in range(noted):
         k, ty = notes[j, 0], notes[j, 1]
@@ -452,8 +539,10 @@ def _emit(notes, noted, columns, tiles_x, spans, used, counts, change):
             if end >= 0:
                 tx = min(u1, l1) >> 1
                 run = (end >> 1) - tx + 1
+                tile = (ty + pair) * tiles_x + tx
+                if before[u64(tile)] == before[u64(tile + run)]:
+                    continue
                 if used < room:
-                    tile = (ty + pair) * tiles_x + tx
                     spans[used, 0], spans[used, 1] = tile, run
                     spans[used, 2] = NONE if u2 < 0 else (u1 - 2 * tx) | (u2 - 2 * tx) << 16
                     spans[used, 3] = NONE if l2 < 0 else (l1 - 2 * tx) | (l2 - 2 * tx) << 16
@@ -465,7 +554,7 @@ def _emit(notes, noted, columns, tiles_x, spans, used, counts, change):
 
 
 @bare
-def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, change, columns, notes):
+def outline(first, last, table, thin, view, tiles_x, tiles_y, before, spans, counts, change, columns, shapes, notes):
     """Write the runs of tiles that the splats first..last (places in the order of depth) may show in to ``spans``.
 
     Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if the outline rho <=
@@ -473,14 +562,14 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
     at once. Splat k has ``counts[k]`` runs, which follow those of k - 1; a run is (first tile, number of tiles, columns
     of squares in the upper half, in the lower half), see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and
     taken away behind its end. Returns the rows needed; where they are more than fit, nothing of this counts.
-    ``columns`` (16 + 32 NOTES, float32) and ``notes`` (NOTES, 3) are for work.
+    Runs without a tile that is wanted, by ``before`` (tiles + 1), the number of them before each, are left out.
+    ``columns`` (16 + 32 NOTES), ``shapes`` (16 NOTES), both float32, and ``notes`` (NOTES, 3) are for work: ellipses are
+    noted in pieces of 16 rows of squares, NOTES of them, and then worked off together.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     for k in range(16):
         columns[k] = f32(4 * k)
-    steps = L.load(columns, 0)
-    zero, far = f32(0.0), f32(1e9)
     used, noted = 0, 0
     for k in range(first, last):
         row, slim = table[k], thin[k]
@@ -505,11 +594,10 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
                 h = cut * (1 + wx * ex + wy * ey)
         if not ellipse:
             # In the order of the splats: what has been noted comes first.
-            used = _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
+            used = _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
             noted = 0
             used = _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change)
             continue
-        # The disc of the screen filter is joined to the ellipse.
         square = cut / 2 if flat else 0.0
         radius = math.sqrt(square)
         inverse = h / (A * C - B * B)
@@ -518,44 +606,24 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, spans, counts, cha
         low, high = y0 - 0.5 - 1e-4 + min(ey - top, -radius), y0 - 0.5 + 1e-4 + max(ey + top, radius)
         if high < 0 or low > height - 1:
             continue
-        r1 = int(math.ceil(max(low, 0.0))) // 8 * 2
+        r1 = math.ceil(max(low, 0.0)) // 8 * 2
         r2 = int(min(high, height - 1.0)) // 4
         slack = 1e-4 + 1e-6 * (wide + abs(ex) + abs(x0))
-        half, lean, shrink = f32(math.sqrt(A * h) / A), f32(-B / A), f32(1 / top)
-        middle, tip, stretch, square, round_ = f32(ex), f32(tip), f32(wide), f32(square), f32(radius)
-        topmost = f32(top)
+        half, lean, shrink = math.sqrt(A * h) / A, -B / A, 1 / top
         while r1 <= r2:
             if noted == NOTES:
-                used = _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
+                used = _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
                 noted = 0
-            # From the ellipse's middle; rows that the image ends within are taken whole.
-            y1 = steps + f32(4 * r1 + 0.5 - 1e-4 - y0)
-            y2 = y1 + f32(3 + 2e-4)
-            e1, e2 = L.most(y1 - f32(ey), -topmost), L.least(y2 - f32(ey), topmost)
-            # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
-            t1, t2 = e1 * shrink, e2 * shrink
-            chord1 = L.rough_root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
-            chord2 = L.rough_root(L.most(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
-            right = L.where((e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2))
-            left = L.where((e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2))
-            meets = e1 <= e2
-            left, right = L.where(meets, left + middle, far), L.where(meets, right + middle, -far)
-            if flat:
-                near = L.most(L.most(y1, -y2), zero)
-                chord = L.rough_root(L.most(square - near * near, f32(1e-12)))
-                meets = near < round_
-                left = L.where(meets, L.least(left, -chord), left)
-                right = L.where(meets, L.most(right, chord), right)
-            left = L.up(L.most(left + f32(x0 - 0.5 - slack), zero))
-            right = L.down(L.least(right + f32(x0 - 0.5 + slack), f32(width - 1)))
-            shows = left <= right
-            at = 16 + noted * 32
-            L.store(columns, at, L.where(shows, L.down(left * f32(0.25)), f32(32767.0)))
-            L.store(columns, at + 16, L.where(shows, L.down(right * f32(0.25)), f32(-1.0)))
+            at = u64(noted * 16)
+            shapes[at], shapes[at + u64(1)], shapes[at + u64(2)] = 4 * r1 + 0.5 - 1e-4 - y0, ey, top
+            shapes[at + u64(3)], shapes[at + u64(4)], shapes[at + u64(5)] = shrink, half, lean
+            shapes[at + u64(6)], shapes[at + u64(7)], shapes[at + u64(8)] = wide, tip, ex
+            shapes[at + u64(9)], shapes[at + u64(10)] = square, radius
+            shapes[at + u64(11)], shapes[at + u64(12)] = x0 - 0.5 - slack, x0 - 0.5 + slack
             notes[noted, 0], notes[noted, 1], notes[noted, 2] = k, r1 // 2, min(8, r2 // 2 - r1 // 2 + 1)
             noted += 1
             r1 += 16
-    return _emit(notes, noted, columns, tiles_x, spans, used, counts, change)
+    return _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
 
 
 @bare
@@ -591,12 +659,13 @@ def _columns(code, column):
 
 
 @bare
-def scatter(first, last, spans, counts, live, every, cursor, entries):
+def scatter(first, last, spans, counts, live, before, cursor, entries):
     """Write the entries of the splats first..last to the tiles that are live, each at its ``cursor``.
 
     Args:
-        spans: their runs, in order. every: whether all tiles are live.
+        spans: their runs, in order. before: (tiles + 1) live tiles before each.
     """
+    every = before[-1] == live.shape[0]
     at = u64(0)
     for place in range(first, last):
         for _ in range(counts[place]):
@@ -611,6 +680,8 @@ def scatter(first, last, spans, counts, live, every, cursor, entries):
                     cursor[t] = int(c) + 1
                     top >>= 2
                     bottom >>= 2
+                continue
+            if before[tile] == before[tile + u64(run)]:
                 continue
             for k in range(run):
                 t = tile + u64(k)
@@ -940,12 +1011,8 @@ def _rows_round(work, row, rows, line):
         f64(work[b + u64(7)]), f64(work[b + u64(8)]), work[b + u64(9)], work[b + u64(10)], work[b + u64(11)],
     )  # fmt: skip
     gl, rx, ry = f64(work[b + u64(15)]), f64(work[b + u64(18)]), f64(work[b + u64(19)])
-    rows[line, X0] = (
-        row[CA] * dx + row[CB] * dy - gl * row[LX] - 2 * (row[RXX] * rx + row[RXY] * ry)
-    )
-    rows[line, Y0] = (
-        row[CB] * dx + row[CC] * dy - gl * row[LY] - 2 * (row[RXY] * rx + row[RYY] * ry)
-    )
+    rows[line, X0] = row[CA] * dx + row[CB] * dy - gl * row[LX] - 2 * (row[RXX] * rx + row[RXY] * ry)
+    rows[line, Y0] = row[CB] * dx + row[CC] * dy - gl * row[LY] - 2 * (row[RXY] * rx + row[RYY] * ry)
     rows[line, CA], rows[line, CB], rows[line, CC] = f32(-0.5) * xx, -xy, f32(-0.5) * yy
     rows[line, LX], rows[line, LY] = work[b + u64(16)], work[b + u64(17)]
     rows[line, RXX], rows[line, RXY] = work[b + u64(20)], f32(2.0) * work[b + u64(21)]
@@ -1198,6 +1265,12 @@ def project_backward(first, last, order, view, m, q, sizes, o, values, channels,
         _prefetch(values, later * values.shape[1])
         i = order[place]
         g = total[place]
+        blamed = False
+        for k in range(g.shape[0]):
+            blamed |= g[k] != 0.0
+        if not blamed:
+            # Never seen, or not even projected: its row of the table may hold anything.
+            continue
         for k in range(sizes.shape[1]):
             s[k] = sizes[i, k]
             g_s[k] = 0.0

@@ -86,7 +86,7 @@ _operate(operator.truediv, lanes, lanes, lambda b, x, y: b.fdiv(x, y, flags=FUSE
 _operate(operator.lt, lanes, mask, lambda b, x, y: b.fcmp_ordered("<", x, y))
 _operate(operator.le, lanes, mask, lambda b, x, y: b.fcmp_ordered("<=", x, y))
 _operate(operator.eq, lanes, mask, lambda b, x, y: b.fcmp_ordered("==", x, y))
-_operate(operator.neg, lanes, lanes, lambda b, x: b.fneg(x))
+_operate(operator.neg, lanes, lanes, lambda b, x, *_: b.fneg(x))
 _operate(operator.and_, mask, mask, lambda b, x, y: b.and_(x, y))
 _operate(operator.or_, mask, mask, lambda b, x, y: b.or_(x, y))
 
@@ -286,7 +286,7 @@ def _fold(half: int) -> Any:
 _fold8, _fold4, _fold2, _fold1 = (_fold(half) for half in (8, 4, 2, 1))
 
 
-@register_jitable(inline="always")  # type: ignore[untyped-decorator]
+@register_jitable(inline="always")
 def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-untyped-def]
     """The sums of the lanes of sixteen vectors, as one vector: a transposition that adds on its way."""
     low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
@@ -294,7 +294,7 @@ def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-u
     return _fold1(low, high)
 
 
-@register_jitable(inline="always")  # type: ignore[untyped-decorator]
+@register_jitable(inline="always")
 def totals8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     """As :func:`totals` of eight; the sums stand twice."""
     low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))

@@ -102,11 +102,11 @@ class _Scene:
             ],
         )
         self.listed = float(listed.sum())
-        self.order, ties = kernels.radix_order(key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2))
+        self.order, ties = kernels.radix_order(
+            key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
+        )
         if len(ties):
-            order.break_ties(
-                self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties
-            )
+            order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties)
         m = len(self.order)
         self.thin = _pool.empty((m, 2 * kernels.COLUMNS), np.float32)
         self.table = self.thin.view(np.float64)
@@ -125,8 +125,12 @@ class _Scene:
         length = self.listed / self.tiles
         return len(self.order) if length < 4 * FRONT else -(-len(self.order) * FRONT // int(length))
 
-    def set_up(self, count: int) -> None:
-        """Project the nearest ``count`` splats and find the tiles that they may show in."""
+    def set_up(self, count: int, live: np.ndarray) -> None:
+        """Project the nearest ``count`` splats, and find the tiles that they may show in: splats that were not set up
+        before need only be right in those that are ``live``."""
+        wanted = np.zeros((self.tiles_y + 1, self.tiles_x + 1), np.int32)
+        wanted[1:, 1:] = live.reshape(self.tiles_y, self.tiles_x).cumsum(0).cumsum(1)
+        before = np.concatenate([[0], np.cumsum(live)])
         groups = [
             (self.ready + first, self.ready + last)
             for first, last in _threads.ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
@@ -138,15 +142,16 @@ class _Scene:
             begin, end = groups[index]
             kernels.project(
                 begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
-                self.channels, self.table, self.thin, self.features,
+                self.channels, wanted, self.table, self.thin, self.features,
             )  # fmt: skip
-            columns, notes = _aligned(16 + 32 * kernels.NOTES), np.empty((kernels.NOTES, 3), np.int64)
+            columns, shapes = _aligned(16 + 32 * kernels.NOTES), _aligned(16 * kernels.NOTES)
+            notes = np.empty((kernels.NOTES, 3), np.int64)
             room = 6 * (end - begin) + 256
             while True:
                 runs = _pool.empty((room, kernels.RUN), np.int32)
                 used = kernels.outline(
-                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, runs, self.counts,
-                    changes[index], columns, notes,
+                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, runs, self.counts,
+                    changes[index], columns, shapes, notes,
                 )  # fmt: skip
                 if used <= room:
                     break
@@ -167,11 +172,11 @@ class _Scene:
         cursors = _pool.empty(changes.shape, np.int64)
         kernels.place_cursors(changes, live, cursors, starts)
         entries = _pool.empty(int(starts[-1]), np.uint32)
-        every = bool(live.all())
+        before = np.concatenate([[0], np.cumsum(live)])
         _threads.run(
             kernels.scatter,
             [
-                (*group, spans, self.counts, live, every, cursors[k], entries)
+                (*group, spans, self.counts, live, before, cursors[k], entries)
                 for k, (group, spans) in enumerate(zip(self.groups, self.spans, strict=True))
             ],
         )
@@ -208,7 +213,7 @@ class _Composite(torch.autograd.Function):
         weights: list[np.ndarray] = []
         # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
         while True:
-            scene.set_up(count)
+            scene.set_up(count, live)
             starts, entries = scene.bin(live)
             seen = _pool.empty(len(entries), np.float32)
             _threads.run(
