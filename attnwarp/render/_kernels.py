@@ -1,11 +1,11 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """The numba kernels of the CPU backend; :mod:`attnwarp.render.cpu` calls them, and says how they fit together.
 
-The forward pass is written in vectors of 16 pixels (``_lanes.py``) with its sums in registers. The backward pass is
-written so that LLVM vectorises it: the innermost loop runs over the 64 pixels of a tile, holds no branch and no call,
-and touches one flat buffer at constant offsets, so that no alias check is needed. exp is a polynomial, since LLVM has
-no vector exp here. Every sum that crosses tiles is formed in a fixed order, so the bits never depend on the
-number of threads. No kernel starts threads: they release the GIL and are handed ranges of work.
+Compositing, forward and backward, is written in vectors of 16 pixels (``_lanes.py``), a square of 4 x 4, with its
+sums in registers: forward the sums of a square while a block of splats goes by, backward those of a splat while the
+squares of its tile go by. exp is a polynomial, since LLVM has no vector exp here. Every sum that crosses tiles is formed
+in a fixed order, or in whole numbers, so the bits never depend on the number of threads. No kernel starts threads: they
+release the GIL and are handed ranges of work.
 """
 
 from __future__ import annotations
@@ -68,6 +68,7 @@ WORK = SHARES + BLOCK * 16
 # squares of 4 x 4 pixels that the splat may show in.
 PLACE_BITS = 28
 PLACE = (1 << PLACE_BITS) - 1
+WEIGHT_UNIT = 2.0**-36
 # A run of tiles: the first one, how many, and which columns of squares in the upper and in the lower half, from the
 # run's first one on, as first | last << 16.
 RUN = 4
@@ -972,11 +973,22 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
 
 
 @bare
-def gather_weights(starts, done, entries, seen, weight):
-    """Add the entries' weights to their splats' (by place in the order of depth), tile by tile."""
+def settle(ended, starts, done, entries, seen, weight, offset, places, kept):
+    """Of the tiles that have ``ended``: add the entries' weights to their splats' (by place in the order of depth),
+    and, if there is room in ``kept``, keep what was worked off; tile t's from places[t] - ``offset`` on.
+
+    Weights are summed as whole numbers of WEIGHT_UNIT: the same bits in whatever order tiles end.
+    """
+    at = 0
+    keep = kept.shape[0] > 0
     for t in range(done.shape[0]):
-        for e in range(starts[t], starts[t] + done[t]):
-            weight[entries[e] & PLACE] += seen[e]
+        if ended[t]:
+            places[t] = offset + at
+            for e in range(starts[t], starts[t] + done[t]):
+                weight[entries[u64(e)] & PLACE] += int(f64(seen[u64(e)]) * (1 / WEIGHT_UNIT))
+                if keep:
+                    kept[at] = entries[u64(e)]
+                    at += 1
 
 
 # Slots of the backward pass: gradients of the loss in what a pixel sums up, and sums over the splats behind.

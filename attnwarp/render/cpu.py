@@ -1,9 +1,12 @@
 """The CPU backend: numba kernels over tiles of 8 x 8 pixels, float32 with a float64 set-up.
 
-1. ``project``: each splat's outline, depth and colour as seen by the camera, in float64.
-2. ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back.
-3. ``outline`` and ``scatter``: the splats of each tile, in that order; exact outlines, no bounding circles.
-4. ``forward``: composite tile by tile, in squares of 4 x 4 pixels, until every pixel is opaque.
+1. ``depths``, ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back. From here on a splat is known
+   by its place in this order.
+2. ``project``: each splat's outline, depth and colour as seen by the camera, in float64. In deep scenes of the nearest
+   ones only; the others follow if a tile is not opaque by then, and only those that can show in such a tile.
+3. ``outline`` and ``scatter``: the splats of each tile, and of its four squares of 4 x 4 pixels; exact outlines, no
+   bounding circles. Lists that would be too long together are made for some of the tiles after the others.
+4. ``forward``: composite tile by tile, square by square, until every pixel is opaque.
 5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
    rows of each splat, and ``project_backward`` takes them to the parameters and the pose.
 
@@ -31,6 +34,8 @@ NEIGHBOURS = 8
 """Edge of a block of tiles that are visited together."""
 FRONT = 512
 """Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
+ENTRIES = 8
+"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 8 bytes each."""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
@@ -165,6 +170,20 @@ class _Scene:
         self.spans += spans
         self.changes.append(changes)
 
+    def bands(self, live: np.ndarray) -> list[np.ndarray]:
+        """The tiles that are ``live``, in parts whose lists are not longer together than the picture and the splats
+        allow: memory stays proportional to these, whatever the splats cover."""
+        if not self.changes:
+            return []
+        lengths = np.cumsum(sum(changes.sum(axis=0, dtype=np.int64) for changes in self.changes)[:-1])
+        upto = np.cumsum((lengths * live)[self.visit])
+        most = ENTRIES * (self.tiles * kernels.PIXELS + len(self.order))
+        if upto[-1] <= most:
+            return [live]
+        band = np.empty(self.tiles, np.int64)
+        band[self.visit] = np.maximum(upto - 1, 0) // most
+        return [live & (band == k) for k in np.unique(band[live])]
+
     def bin(self, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lists of the splats that are set up, in the tiles that are ``live``: (tiles + 1) starts, and entries."""
         starts = np.zeros(self.tiles + 1, np.int64)
@@ -210,37 +229,38 @@ class _Composite(torch.autograd.Function):
         live = np.ones(scene.tiles, np.bool_)
         count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
-        weights: list[np.ndarray] = []
+        weight_of = _pool.zeros(len(scene.order), np.int64)
         # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
         while True:
             scene.set_up(count, live)
-            starts, entries = scene.bin(live)
-            seen = _pool.empty(len(entries), np.float32)
-            _threads.run(
-                kernels.forward,
-                [
-                    (*job, scene.visit, scene.view, scene.tiles_x, live, starts, entries, scene.table, scene.thin,
-                     scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
-                     done, tested, shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS),
-                     _aligned(kernels.WORK), np.empty(2 * kernels.BLOCK, np.int64))
-                    for job in scene.visits(starts)
-                ],
-            )  # fmt: skip
-            scene.starts[live] = sum(len(part) for part in lists) + starts[:-1][live]
-            lists.append(entries)
-            weights.append(seen)
-            worked_off += int(done[live].sum())
-            pairs += int(tested[live].sum())
-            composited += int(shaded[live].sum())
+            last = count == len(scene.order)
+            for band in scene.bands(live):
+                starts, entries = scene.bin(band)
+                seen = _pool.empty(len(entries), np.float32)
+                _threads.run(
+                    kernels.forward,
+                    [
+                        (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
+                         scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
+                         done, tested, shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS),
+                         _aligned(kernels.WORK), np.empty(2 * kernels.BLOCK, np.int64))
+                        for job in scene.visits(starts)
+                    ],
+                )  # fmt: skip
+                worked_off += int(done[band].sum())
+                pairs += int(tested[band].sum())
+                composited += int(shaded[band].sum())
+                ended = band if last else band & full
+                kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.uint32)
+                kernels.settle(ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept)
+                lists.append(kept)
             live = live & ~full
-            if count == len(scene.order) or not live.any():
+            if last or not live.any():
                 break
             count = len(scene.order)
         scene.entries = _join(lists)
-        weight_of = _pool.zeros(len(scene.order), np.float32)
-        kernels.gather_weights(scene.starts, done, scene.entries, _join(weights), weight_of)
         weight = _pool.zeros(len(scene.means), np.float32)
-        weight[scene.order] = weight_of
+        weight[scene.order] = weight_of * kernels.WEIGHT_UNIT
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
