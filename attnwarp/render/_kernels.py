@@ -504,7 +504,7 @@ def _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, us
         at = j * 16
         # From the ellipse's middle; rows that the image ends within are taken whole.
         y1 = steps + L.spread(shapes, at)
-        y2 = y1 + f32(3 + 2e-4)
+        y2 = y1 + L.spread(shapes, at + 13)
         top, shrink, half = L.spread(shapes, at + 2), L.spread(shapes, at + 3), L.spread(shapes, at + 4)
         lean, stretch, tip = L.spread(shapes, at + 5), L.spread(shapes, at + 6), L.spread(shapes, at + 7)
         e1, e2 = L.most(y1 - L.spread(shapes, at + 1), -top), L.least(y2 - L.spread(shapes, at + 1), top)
@@ -609,18 +609,21 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, before, spans, cou
             continue
         r1 = math.ceil(max(low, 0.0)) // 8 * 2
         r2 = int(min(high, height - 1.0)) // 4
+        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all sides.
         slack = 1e-4 + 1e-6 * (wide + abs(ex) + abs(x0))
+        slack_y = 1e-4 + 5e-7 * (top + abs(ey) + abs(y0))
         half, lean, shrink = math.sqrt(A * h) / A, -B / A, 1 / top
         while r1 <= r2:
             if noted == NOTES:
                 used = _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
                 noted = 0
             at = u64(noted * 16)
-            shapes[at], shapes[at + u64(1)], shapes[at + u64(2)] = 4 * r1 + 0.5 - 1e-4 - y0, ey, top
+            shapes[at], shapes[at + u64(1)], shapes[at + u64(2)] = 4 * r1 + 0.5 - slack_y - y0, ey, top
             shapes[at + u64(3)], shapes[at + u64(4)], shapes[at + u64(5)] = shrink, half, lean
             shapes[at + u64(6)], shapes[at + u64(7)], shapes[at + u64(8)] = wide, tip, ex
             shapes[at + u64(9)], shapes[at + u64(10)] = square, radius
             shapes[at + u64(11)], shapes[at + u64(12)] = x0 - 0.5 - slack, x0 - 0.5 + slack
+            shapes[at + u64(13)] = 3 + 2 * slack_y
             notes[noted, 0], notes[noted, 1], notes[noted, 2] = k, r1 // 2, min(8, r2 // 2 - r1 // 2 + 1)
             noted += 1
             r1 += 16

@@ -7,6 +7,8 @@ that lies in it is gone, whoever holds it: results that the caller keeps are nev
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,8 +33,9 @@ class _Lease:
         address = -(-raw.ctypes.data // ALIGNMENT) * ALIGNMENT
         self.__array_interface__ = {"shape": (size,), "typestr": "|u1", "data": (address, False), "version": 3}
 
-    def __del__(self) -> None:
-        _give(self.raw)
+    def __del__(self, ending: Callable[[], bool] = sys.is_finalizing) -> None:
+        if not ending():
+            _give(self.raw)
 
 
 def _give(raw: np.ndarray) -> None:
