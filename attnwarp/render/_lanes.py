@@ -13,11 +13,12 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
+import llvmlite.binding as llvm
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_jitable, register_model
 
 WIDTH = 16
 FUSED = ("contract",)
@@ -84,6 +85,8 @@ _operate(operator.mul, lanes, lanes, lambda b, x, y: b.fmul(x, y, flags=FUSED))
 _operate(operator.truediv, lanes, lanes, lambda b, x, y: b.fdiv(x, y, flags=FUSED))
 _operate(operator.lt, lanes, mask, lambda b, x, y: b.fcmp_ordered("<", x, y))
 _operate(operator.le, lanes, mask, lambda b, x, y: b.fcmp_ordered("<=", x, y))
+_operate(operator.eq, lanes, mask, lambda b, x, y: b.fcmp_ordered("==", x, y))
+_operate(operator.neg, lanes, lanes, lambda b, x, *_: b.fneg(x))
 _operate(operator.and_, mask, mask, lambda b, x, y: b.and_(x, y))
 _operate(operator.or_, mask, mask, lambda b, x, y: b.or_(x, y))
 
@@ -169,6 +172,72 @@ def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 @intrinsic
+def inverse(typing: Any, x: Any) -> Any:
+    """1 / x to the last bit or two, and NaN where x is 0, infinite or below 1e-38.
+
+    With AVX-512 an estimate of 14 bits and one step of Newton's: three times as fast as a division.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        x, one = args[0], ir.Constant(FLOATS, [1.0] * WIDTH)
+        if not llvm.get_host_cpu_features().get("avx512f"):
+            return builder.fdiv(one, x)
+        kind = ir.FunctionType(FLOATS, [FLOATS, FLOATS, ir.IntType(WIDTH)])
+        estimate = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.rcp14.ps.512")
+        r = builder.call(estimate, [x, ir.Constant(FLOATS, ir.Undefined), ir.IntType(WIDTH)(-1)])
+        kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
+        fused = cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32")
+        miss = builder.call(fused, [builder.fneg(x), r, one])
+        return builder.call(fused, [r, miss, r])
+
+    return lanes(lanes), codegen
+
+
+@intrinsic
+def rough_root(typing: Any, x: Any) -> Any:
+    """A square root of x > 0 that is right or too large by at most 1.3e-4 of itself: several times as fast."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        x = args[0]
+        if not llvm.get_host_cpu_features().get("avx512f"):
+            kind = ir.FunctionType(FLOATS, [FLOATS])
+            return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x])
+        kind = ir.FunctionType(FLOATS, [FLOATS, FLOATS, ir.IntType(WIDTH)])
+        estimate = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.rsqrt14.ps.512")
+        r = builder.call(estimate, [x, ir.Constant(FLOATS, ir.Undefined), ir.IntType(WIDTH)(-1)])
+        return builder.fmul(builder.fmul(x, ir.Constant(FLOATS, [1 + 2.0**-14] * WIDTH)), r)
+
+    return lanes(lanes), codegen
+
+
+def _unary(name: str, document: str) -> Any:
+    @intrinsic
+    def operation(typing: Any, x: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            kind = ir.FunctionType(FLOATS, [FLOATS])
+            return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32"), args)
+
+        return lanes(lanes), codegen
+
+    operation.__doc__ = document
+    return operation
+
+
+down = _unary("floor", "Largest whole number that is not above x, in each lane.")
+up = _unary("ceil", "Smallest whole number that is not below x, in each lane.")
+
+
+@intrinsic
+def flipped(typing: Any, chosen: Any) -> Any:
+    """The lanes that are not chosen."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.not_(args[0])
+
+    return mask(mask), codegen
+
+
+@intrinsic
 def times_power(typing: Any, x: Any, shifted: Any) -> Any:
     """x 2^k, where ``shifted`` is k + 1.5 2^23, so that k is its lowest bits; no range is checked."""
 
@@ -195,6 +264,41 @@ def total(typing: Any, x: Any) -> Any:
         return builder.extract_element(x, ir.IntType(32)(0))
 
     return types.float32(lanes), codegen
+
+
+def _fold(half: int) -> Any:
+    places = [[g * 2 * half + k for g in range(WIDTH // half)] for k in range(half)]
+    # Of both vectors, one after the other: the first and the second ``half`` of every group of 2 ``half``.
+    low = sorted(place for row in places for place in row)
+    high = [place + half for place in low]
+
+    @intrinsic
+    def fold(typing: Any, x: Any, y: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            first, second = (builder.shuffle_vector(*args, ir.Constant(INTS, which)) for which in (low, high))
+            return builder.fadd(first, second)
+
+        return lanes(lanes, lanes), codegen
+
+    return fold
+
+
+_fold8, _fold4, _fold2, _fold1 = (_fold(half) for half in (8, 4, 2, 1))
+
+
+@register_jitable(inline="always")
+def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-untyped-def]
+    """The sums of the lanes of sixteen vectors, as one vector: a transposition that adds on its way."""
+    low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
+    high = _fold2(_fold4(_fold8(i, j), _fold8(k, m)), _fold4(_fold8(n, o), _fold8(p, q)))
+    return _fold1(low, high)
+
+
+@register_jitable(inline="always")
+def totals8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """As :func:`totals` of eight; the sums stand twice."""
+    low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
+    return _fold1(low, low)
 
 
 @intrinsic

@@ -8,8 +8,14 @@ The share of the peak is that of processor time on both sides, so that a busy ma
 longer, hardly changes it; on a quiet one it is the share of wall time but for the moments in which a thread waits.
 
 A splat-pixel pair counts as 45 floating-point operations (an intersection, a Gaussian, and the sums of colour, normal,
-depth and distortion). Two shares of the peak are given: of the pairs evaluated, 16 for each splat whose intersection
-with a 4 x 4 square of pixels was computed, and of those composited, in squares that the splat draws to.
+depth and distortion). The share of the peak is that of the pairs evaluated, 16 for each splat whose intersection with a
+4 x 4 square of pixels was computed; beside it stands that of those composited, in squares that the splat draws to.
+
+Two models are fitted over the cases by least squares of the relative error, and reported with R^2 (of the plain
+residuals) and 95 % intervals: processor time of the forward pass = a pairs + b splats + c pixels (and, for comparison,
+= a + b pairs alone); and memory, the most bytes held beyond what was held before the call, = a splats + b pixels. An
+interval holds if the cases were a random draw of such scenes, which a grid of cases is not; it says how well the
+cases determine the number.
 """
 
 from __future__ import annotations
@@ -21,17 +27,19 @@ import platform
 import resource
 import statistics
 import time
-from collections.abc import Sequence
+import tracemalloc
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from scipy import stats
 
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
-from attnwarp.render import _threads
+from attnwarp.render import _pool, _threads
 from attnwarp.render.api import render
 
 FLOPS_PER_PAIR = 45
@@ -52,6 +60,8 @@ class Case:
     both_cpu: list[float] = field(default_factory=list)
     peak: list[float] = field(default_factory=list)
     counters: dict[str, int] = field(default_factory=dict)
+    forward_bytes: int = 0
+    both_bytes: int = 0
     gsplat_seconds: float | None = None
 
     @property
@@ -86,13 +96,26 @@ def measure_peak(threads: int, milliseconds: float = 15) -> float:
     threads."""
     from attnwarp.render import _peak
 
-    operations = 2.0 * _peak.LANES * 64
+    operations = 2.0 * 16 * _peak.CHAINS * 64
     rounds = int(milliseconds * 1e-3 * 2e11 / operations)
-    jobs = [(rounds, np.empty(1, np.float32)) for _ in range(threads)]
-    _peak.multiply_add(1, jobs[0][1])
+    jobs = [(rounds, _peak.start()) for _ in range(threads)]
+    _peak.multiply_add(1, _peak.start())
     start = time.process_time()
     _threads.run(_peak.multiply_add, jobs)
     return operations * rounds * threads / (time.process_time() - start)
+
+
+def _differentiate(splats: Gaussians, view: Camera) -> None:
+    """A forward and a backward pass. Upstream gradients of ones: the loss is not what is measured."""
+    traced = render(splats, view, backend="cpu")
+    outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_l1]
+    ones = torch.ones(view.height, view.width)
+    torch.autograd.backward(outputs, [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs])
+
+
+def _with_leaves(splats: Gaussians) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return Gaussians(splats.kind, *(getattr(splats, name).clone().requires_grad_() for name in names))
 
 
 def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
@@ -102,28 +125,68 @@ def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
     case.forward.append(time.perf_counter() - start)
     case.forward_cpu.append(time.process_time() - start_cpu)
     case.counters = result.counters
-    names = ("means", "quats", "scales", "opacities", "sh")
-    leaves = [getattr(splats, name).clone().requires_grad_() for name in names]
-    again = Gaussians(splats.kind, *leaves)
-    ones = torch.ones(view.height, view.width)
+    del result
+    again = _with_leaves(splats)
     start, start_cpu = time.perf_counter(), time.process_time()
-    traced = render(again, view, backend="cpu")
-    outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_l1]
-    # Upstream gradients of ones: the loss is not what is measured.
-    grads = [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs]
-    torch.autograd.backward(outputs, grads)
+    _differentiate(again, view)
     case.both.append(time.perf_counter() - start)
     case.both_cpu.append(time.process_time() - start_cpu)
     case.peak.append(measure_peak(_threads.count()))
 
 
-def fit_line(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float]:
-    """Intercept, slope and R^2 of least squares in relative error (each point weighs 1 / y^2)."""
-    a, b = np.asarray(x, float), np.asarray(y, float)
-    design = np.stack([1 / b, a / b], axis=1)
-    (intercept, slope), *_ = np.linalg.lstsq(design, np.ones(len(b)), rcond=None)
-    residual = b - (intercept + slope * a)
-    return float(intercept), float(slope), float(1 - residual.var() / b.var())
+def measure_memory(case: Case, splats: Gaussians, view: Camera) -> None:
+    """The most that one forward pass, and one with a backward pass, hold at once: results, gradients and all."""
+    again = _with_leaves(splats)
+
+    def most(work: Any) -> int:
+        # What the pool holds from before would not be counted.
+        _pool.clear()
+        gc.collect()
+        tracemalloc.start()
+        work()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    case.forward_bytes = most(lambda: render(splats, view, backend="cpu"))
+    case.both_bytes = most(lambda: _differentiate(again, view))
+
+
+def fit(columns: Mapping[str, Sequence[float]], y: Sequence[float]) -> dict[str, Any] | None:
+    """Least squares in relative error (each case weighs 1 / y^2) of ``y`` as a sum of multiples of ``columns``.
+
+    Returns:
+        For each column its factor and the ends of its 95 % interval (Student's t); "r2" of the plain residuals, and
+        "typical_error", the median of the relative ones. None if there are too few cases, or columns that are
+        multiples of one another.
+    """
+    b = np.asarray(y, float)
+    design = np.stack([np.asarray(c, float) for c in columns.values()], axis=1) / b[:, None]
+    freedom = len(b) - design.shape[1]
+    if freedom < 1 or np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
+        return None
+    factors, *_ = np.linalg.lstsq(design, np.ones(len(b)), rcond=None)
+    residual = 1 - design @ factors
+    variance = residual @ residual / freedom * np.diag(np.linalg.inv(design.T @ design))
+    reach = stats.t.ppf(0.975, freedom) * np.sqrt(variance)
+    return {
+        **{name: [float(f), float(f - r), float(f + r)] for name, f, r in zip(columns, factors, reach, strict=True)},
+        "r2": float(1 - np.var(residual * b) / np.var(b)),
+        "typical_error": float(np.median(np.abs(residual))),
+    }
+
+
+def fits(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The models of time (ns) and memory (bytes) over the rows of the table."""
+    one, splats = [1.0] * len(rows), [r["splats"] for r in rows]
+    pairs, pixels = [r["pairs"] for r in rows], [r["size"] ** 2 for r in rows]
+    time_ns = [1e6 * r["forward_cpu_ms"] for r in rows]
+    return {
+        "time": fit({"pairs": pairs, "splats": splats, "pixels": pixels}, time_ns),
+        "time_by_pairs_alone": fit({"call": one, "pairs": pairs}, time_ns),
+        "memory_forward": fit({"splats": splats, "pixels": pixels}, [r["forward_bytes"] for r in rows]),
+        "memory_both": fit({"splats": splats, "pixels": pixels}, [r["forward_backward_bytes"] for r in rows]),
+    }
 
 
 def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
@@ -137,21 +200,32 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
         for case, splats, view in built:
             gc.collect()
             time_once(case, splats, view)
+    for case, splats, view in built:
+        measure_memory(case, splats, view)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     if gsplat:
         judge(built, gsplat)
     rows = [row(case) for case in cases]
-    line = fit_line([r["pairs"] + 0.0 for r in rows], [r["forward_cpu_ms"] for r in rows]) if len(rows) > 2 else None
     return {
-        "machine": platform.processor() or platform.machine(),
+        "machine": _processor(),
         "threads": _threads.count(),
         "rounds": rounds,
         "first_call_seconds": round(warm_up, 2),
         "peak_memory_mib": round(memory, 1),
         "fma_peak_gflops_per_thread": round(statistics.median(p for case in cases for p in case.peak) / 1e9, 1),
-        "fit_ms": None if line is None else {"intercept": line[0], "per_million_pairs": line[1] * 1e6, "r2": line[2]},
+        "fits": fits(rows),
         "cases": rows,
     }
+
+
+def _processor() -> str:
+    """Its name, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 def judge(built: list[tuple[Case, Gaussians, Camera]], most: int) -> None:
@@ -198,6 +272,8 @@ def row(case: Case) -> dict[str, Any]:
         "composited": case.counters["composited"],
         "fma_share": round(pairs * share, 4),
         "fma_share_composited": round(case.counters["composited"] * share, 4),
+        "forward_bytes": case.forward_bytes,
+        "forward_backward_bytes": case.both_bytes,
         "gsplat_torch_ms": None if case.gsplat_seconds is None else round(1e3 * case.gsplat_seconds, 1),
         "times_gsplat": None if case.gsplat_seconds is None else round(case.gsplat_seconds / forward, 1),
     }
@@ -213,8 +289,8 @@ def table(result: dict[str, Any]) -> str:
         head,
         "",
         "| kind | size | splats | max sigma | forward ms (best; cpu) | fwd + bwd ms (cpu) | bwd / fwd | Mpairs | Gpairs/s "
-        "| of FMA peak (composited) | gsplat torch ms | times faster |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| of FMA peak (composited) | MiB (fwd + bwd) | gsplat torch ms | times faster |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in result["cases"]:
         gsplat = ("", "")
@@ -231,14 +307,28 @@ def table(result: dict[str, Any]) -> str:
             f"{r['pairs'] / 1e6:.1f}",
             f"{r['gigapairs_per_second']:.2f}",
             f"{100 * r['fma_share']:.1f} % ({100 * r['fma_share_composited']:.1f} %)",
+            f"{r['forward_bytes'] / 2**20:.0f} ({r['forward_backward_bytes'] / 2**20:.0f})",
             *gsplat,
         ]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
-    if result["fit_ms"]:
-        f = result["fit_ms"]
-        line = f"{f['intercept']:.2f} ms + {f['per_million_pairs']:.3f} ms per million pairs, R^2 {f['r2']:.3f}"
-        lines += ["", f"forward, processor time = {line}"]
+    lines += ["", *_sentences(result["fits"])]
     return "\n".join(lines)
+
+
+def _sentences(models: Mapping[str, Any]) -> list[str]:
+    def terms(model: Mapping[str, Any], unit: str) -> str:
+        factors = [(name, value) for name, value in model.items() if isinstance(value, list)]
+        said = [f"{f:.3g} {unit} a {name.rstrip('s')} [{low:.3g}, {high:.3g}]" for name, (f, low, high) in factors]
+        fitted = f"R^2 {model['r2']:.3f}, half of the cases within {100 * model['typical_error']:.0f} %"
+        return f"{' + '.join(said)}; {fitted}"
+
+    names = {
+        "time": ("forward, processor time", "ns"),
+        "time_by_pairs_alone": ("the same by pairs alone", "ns"),
+        "memory_forward": ("memory, forward", "bytes"),
+        "memory_both": ("memory, forward and backward", "bytes"),
+    }
+    return [f"- {said} = {terms(models[key], unit)}" for key, (said, unit) in names.items() if models[key]]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,9 +1,12 @@
 """The CPU backend: numba kernels over tiles of 8 x 8 pixels, float32 with a float64 set-up.
 
-1. ``project``: each splat's outline, depth and colour as seen by the camera, in float64.
-2. ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back.
-3. ``outline`` and ``scatter``: the splats of each tile, in that order; exact outlines, no bounding circles.
-4. ``forward``: composite tile by tile, in squares of 4 x 4 pixels, until every pixel is opaque.
+1. ``depths``, ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back. From here on a splat is known
+   by its place in this order.
+2. ``project``: each splat's outline, depth and colour as seen by the camera, in float64. In deep scenes of the nearest
+   ones only; the others follow if a tile is not opaque by then, and only those that can show in such a tile.
+3. ``outline`` and ``scatter``: the splats of each tile, and of its four squares of 4 x 4 pixels; exact outlines, no
+   bounding circles. Lists that would be too long together are made for some of the tiles after the others.
+4. ``forward``: composite tile by tile, square by square, until every pixel is opaque.
 5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
    rows of each splat, and ``project_backward`` takes them to the parameters and the pose.
 
@@ -12,6 +15,7 @@ Threads follow ``torch.set_num_threads``; the result has the same bits for any n
 
 from __future__ import annotations
 
+import functools
 import itertools
 from typing import Any
 
@@ -19,12 +23,19 @@ import numpy as np
 import torch
 
 from attnwarp.render import _kernels as kernels
-from attnwarp.render import _threads, order
+from attnwarp.render import _pool, _threads, order
 from attnwarp.render.reference import Inputs, Outputs
 
-BIN_CHUNKS = 8
+PIECE = 4096
+"""Splats in one job of what is done splat by splat."""
+GROUP, GROUPS = 1024, 16
+"""Splats that are set up and binned by one job: at least so many, and in about so many jobs."""
+NEIGHBOURS = 8
+"""Edge of a block of tiles that are visited together."""
 FRONT = 512
 """Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
+ENTRIES = 8
+"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 8 bytes each."""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
@@ -50,12 +61,24 @@ def _join(parts: list[np.ndarray]) -> np.ndarray:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
+@functools.lru_cache(maxsize=64)
+def _visit(tiles_x: int, tiles_y: int) -> np.ndarray:
+    """All tiles, block by block: neighbours list the same splats, which then are still in the cache."""
+    y, x = np.divmod(np.arange(tiles_x * tiles_y), tiles_x)
+    return np.lexsort([x, y, x // NEIGHBOURS, y // NEIGHBOURS])
+
+
 class _Scene:
-    """One view's splats, projected, ordered and binned: what the forward pass leaves to the backward pass."""
+    """One view's splats, ordered, projected and binned: what the forward pass leaves to the backward pass.
+
+    Splats are known by their place in the order of depth; only as many of them are projected as may be seen.
+    """
 
     def __init__(self, inputs: Inputs) -> None:
-        self.means, self.quats = _array(inputs.means, np.float64), _array(inputs.quats, np.float64)
-        self.scales, self.opacities = _array(inputs.scales, np.float64), _array(inputs.opacities, np.float64)
+        parts = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
+        # Kernels are compiled for both, but not for all mixtures.
+        exact = np.float32 if all(part.dtype == torch.float32 for part in parts) else np.float64
+        self.means, self.quats, self.scales, self.opacities = (_array(part, exact) for part in parts)
         self.values = _array(inputs.values.flatten(1), np.float32)
         self.background = _array(inputs.background, np.float32)
         self.channels = inputs.channels
@@ -69,72 +92,119 @@ class _Scene:
             inputs.kind == "2d", inputs.depth == "center", inputs.antialiased, inputs.harmonic,
         )  # fmt: skip
         self.view = view
-        self.table = _aligned(2 * n * kernels.COLUMNS).view(np.float64).reshape(n, kernels.COLUMNS)
-        self.features = np.empty((n, 3 + max(3, self.channels)), np.float32)
-        key = np.empty(n, np.float32)
         self.tiles_x = -(-inputs.width // kernels.TILE)
         self.tiles_y = -(-inputs.height // kernels.TILE)
         self.tiles = self.tiles_x * self.tiles_y
-        pieces = _threads.ranges(n, kernels.CHUNK)
-        begins, counts = np.empty(n, np.int64), np.empty(n, np.int64)
-        spans: list[np.ndarray] = [np.empty((0, 2), np.int32)] * len(pieces)
-
-        def set_up(index: int) -> None:
-            first, last = pieces[index]
-            kernels.project(
-                first, last, view, self.means, self.quats, self.scales, self.opacities, self.values, self.channels,
-                self.table, self.features, key,
-            )  # fmt: skip
-            room = 4 * kernels.CHUNK
-            while True:
-                rows = np.empty((room, 2), np.int32)
-                used = kernels.outline(
-                    first, last, key, self.table, view, self.tiles_x, self.tiles_y, rows, begins, counts
-                )
-                if used <= room:
-                    break
-                room = used
-            spans[index] = rows[:used]
-
-        _threads.run(set_up, [(k,) for k in range(len(pieces))])
-        self.order = kernels.radix_order(key)
-        order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values])
-        self.spans = np.concatenate([np.empty((0, 2), np.int32), *spans])
-        self.base = np.concatenate([[0], np.cumsum([len(rows) for rows in spans], dtype=np.int64)])
-        self.begins, self.counts = begins, counts
-        # Filled by bin(), tile by tile of the lists that were used in the end.
+        self.visit = _visit(self.tiles_x, self.tiles_y)
+        key = _pool.empty(n, np.float32)
+        pieces = _threads.ranges(n, PIECE)
+        listed = np.zeros((len(pieces), 1))
+        _threads.run(
+            kernels.depths,
+            [
+                (*piece, view, self.means, self.quats, self.scales, self.opacities, key, listed[k])
+                for k, piece in enumerate(pieces)
+            ],
+        )
+        self.listed = float(listed.sum())
+        self.order, ties = kernels.radix_order(
+            key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
+        )
+        if len(ties):
+            order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties)
+        m = len(self.order)
+        self.thin = _pool.empty((m, 2 * kernels.COLUMNS), np.float32)
+        self.table = self.thin.view(np.float64)
+        self.features = _pool.empty((m if self.channels > 3 else 0, self.channels), np.float32)
+        self.counts = _pool.empty(m, np.int32)
+        self.ready = 0
+        self.groups: list[tuple[int, int]] = []
+        self.spans: list[np.ndarray] = []
+        self.changes: list[np.ndarray] = []
+        # Filled in the end, tile by tile of the lists that were used.
         self.starts = np.zeros(self.tiles, np.int64)
-        self.entries = np.empty(0, np.int32)
+        self.entries = np.empty(0, np.uint32)
 
     def front(self) -> int:
         """How many of the nearest splats to begin with: all, unless they would make lists far longer than needed."""
-        length = int(self.spans[:, 1].sum(dtype=np.int64)) / self.tiles
+        length = self.listed / self.tiles
         return len(self.order) if length < 4 * FRONT else -(-len(self.order) * FRONT // int(length))
 
-    def bin(self, count: int, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lists of the nearest ``count`` splats in the tiles that are ``live``: (tiles + 1) starts, and entries."""
-        size = max(256, -(-count // BIN_CHUNKS))
-        pieces = _threads.ranges(count, size)
-        cursors = np.zeros((max(1, len(pieces)), self.tiles + 1), np.int64)
+    def set_up(self, count: int, live: np.ndarray) -> None:
+        """Project the nearest ``count`` splats, and find the tiles that they may show in: splats that were not set up
+        before need only be right in those that are ``live``."""
+        wanted = np.zeros((self.tiles_y + 1, self.tiles_x + 1), np.int32)
+        wanted[1:, 1:] = live.reshape(self.tiles_y, self.tiles_x).cumsum(0).cumsum(1)
+        before = np.concatenate([[0], np.cumsum(live)])
+        groups = [
+            (self.ready + first, self.ready + last)
+            for first, last in _threads.ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
+        ]
+        spans: list[np.ndarray] = [np.empty((0, kernels.RUN), np.int32)] * len(groups)
+        changes = _pool.zeros((len(groups), self.tiles + 1), np.int32)
+
+        def work(index: int) -> None:
+            begin, end = groups[index]
+            kernels.project(
+                begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
+                self.channels, wanted, self.table, self.thin, self.features,
+            )  # fmt: skip
+            columns, shapes = _aligned(16 + 32 * kernels.NOTES), _aligned(16 * kernels.NOTES)
+            notes = np.empty((kernels.NOTES, 3), np.int64)
+            room = 6 * (end - begin) + 256
+            while True:
+                runs = _pool.empty((room, kernels.RUN), np.int32)
+                used = kernels.outline(
+                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, runs, self.counts,
+                    changes[index], columns, shapes, notes,
+                )  # fmt: skip
+                if used <= room:
+                    break
+                room = used
+                changes[index] = 0
+            spans[index] = runs[:used]
+
+        _threads.run(work, [(k,) for k in range(len(groups))])
+        self.ready = count
+        self.groups += groups
+        self.spans += spans
+        self.changes.append(changes)
+
+    def bands(self, live: np.ndarray) -> list[np.ndarray]:
+        """The tiles that are ``live``, in parts whose lists are not longer together than the picture and the splats
+        allow: memory stays proportional to these, whatever the splats cover."""
+        if not self.changes:
+            return []
+        lengths = np.cumsum(sum(changes.sum(axis=0, dtype=np.int64) for changes in self.changes)[:-1])
+        upto = np.cumsum((lengths * live)[self.visit])
+        most = ENTRIES * (self.tiles * kernels.PIXELS + len(self.order))
+        if upto[-1] <= most:
+            return [live]
+        band = np.empty(self.tiles, np.int64)
+        band[self.visit] = np.maximum(upto - 1, 0) // most
+        return [live & (band == k) for k in np.unique(band[live])]
+
+    def bin(self, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lists of the splats that are set up, in the tiles that are ``live``: (tiles + 1) starts, and entries."""
         starts = np.zeros(self.tiles + 1, np.int64)
-        entries = np.empty(0, np.int32)
-        before = np.concatenate([[0], np.cumsum(live, dtype=np.int64)])
-        for fill in (False, True):
-            jobs = [
-                (*piece, self.order, self.base, self.begins, self.counts, self.spans, live, before, fill, cursors[k],
-                 entries)
-                for k, piece in enumerate(pieces)
-            ]  # fmt: skip
-            _threads.run(kernels.scatter, jobs)
-            if not fill:
-                kernels.place_cursors(cursors, starts)
-                entries = np.empty(starts[-1], np.int32)
+        changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
+        cursors = _pool.empty(changes.shape, np.int64)
+        kernels.place_cursors(changes, live, cursors, starts)
+        entries = _pool.empty(int(starts[-1]), np.uint32)
+        before = np.concatenate([[0], np.cumsum(live)])
+        _threads.run(
+            kernels.scatter,
+            [
+                (*group, spans, self.counts, live, before, cursors[k], entries)
+                for k, (group, spans) in enumerate(zip(self.groups, self.spans, strict=True))
+            ],
+        )
         return starts, entries
 
-    def tile_ranges(self, starts: np.ndarray) -> list[tuple[int, int]]:
-        """Consecutive tiles in pieces of about equal work."""
+    def visits(self, starts: np.ndarray) -> list[tuple[int, int]]:
+        """Consecutive places in ``visit``, in pieces of about equal work."""
         pieces = 8 * _threads.count()
-        cost = starts + 32 * np.arange(self.tiles + 1)
+        cost = np.cumsum(np.diff(starts)[self.visit] + 16)
         cuts = np.unique(np.searchsorted(cost, np.linspace(0, cost[-1], pieces + 1)[1:-1]))
         edges = [0, *(int(c) for c in cuts if 0 < c < self.tiles), self.tiles]
         return list(itertools.pairwise(edges))
@@ -149,44 +219,48 @@ class _Composite(torch.autograd.Function):
         h, w = inputs.height, inputs.width
         near, far = inputs.ndc
         scale = (far * near / (far - near)) ** 2
-        color = np.empty((h, w, scene.channels), np.float32)
-        normal = np.empty((h, w, 3), np.float32)
-        alpha, depth, median, l1, l2 = (np.empty((h, w), np.float32) for _ in range(5))
-        state = np.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
+        color = _pool.empty((h, w, scene.channels), np.float32)
+        normal = _pool.empty((h, w, 3), np.float32)
+        alpha, depth, median, l1, l2 = (_pool.empty((h, w), np.float32) for _ in range(5))
+        state = _pool.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
         done, tested, shaded, drawn = (np.zeros(scene.tiles, np.int64) for _ in range(4))
         full = np.zeros(scene.tiles, np.bool_)
         slots = kernels.SLOTS + max(0, scene.channels - 3)
         live = np.ones(scene.tiles, np.bool_)
         count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
-        weights: list[np.ndarray] = []
+        weight_of = _pool.zeros(len(scene.order), np.int64)
         # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
         while True:
-            starts, entries = scene.bin(count, live)
-            seen = np.empty(len(entries), np.float32)
-            _threads.run(
-                kernels.forward,
-                [
-                    (*job, scene.view, scene.tiles_x, live, starts, entries, scene.table, scene.features,
-                     scene.background, scale, color, alpha, depth, median, normal, l1, l2, state, done, tested,
-                     shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS), _aligned(kernels.WORK),
-                     np.empty(kernels.BLOCK, np.int64))
-                    for job in scene.tile_ranges(starts)
-                ],
-            )  # fmt: skip
-            scene.starts[live] = sum(len(part) for part in lists) + starts[:-1][live]
-            lists.append(entries)
-            weights.append(seen)
-            worked_off += int(done[live].sum())
-            pairs += int(tested[live].sum())
-            composited += int(shaded[live].sum())
+            scene.set_up(count, live)
+            last = count == len(scene.order)
+            for band in scene.bands(live):
+                starts, entries = scene.bin(band)
+                seen = _pool.empty(len(entries), np.float32)
+                _threads.run(
+                    kernels.forward,
+                    [
+                        (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
+                         scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
+                         done, tested, shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS),
+                         _aligned(kernels.WORK), np.empty(2 * kernels.BLOCK, np.int64))
+                        for job in scene.visits(starts)
+                    ],
+                )  # fmt: skip
+                worked_off += int(done[band].sum())
+                pairs += int(tested[band].sum())
+                composited += int(shaded[band].sum())
+                ended = band if last else band & full
+                kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.uint32)
+                kernels.settle(ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept)
+                lists.append(kept)
             live = live & ~full
-            if count == len(scene.order) or not live.any():
+            if last or not live.any():
                 break
             count = len(scene.order)
         scene.entries = _join(lists)
-        weight = np.zeros(len(scene.means), np.float32)
-        kernels.gather_weights(scene.starts, done, scene.entries, _join(weights), weight)
+        weight = _pool.zeros(len(scene.means), np.float32)
+        weight[scene.order] = weight_of * kernels.WEIGHT_UNIT
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
@@ -213,22 +287,22 @@ class _Composite(torch.autograd.Function):
         n = len(scene.means)
         shapes = [(h, w, scene.channels), *[(h, w)] * 3, (h, w, 3), (h, w), (h, w), (n,)]
         g = [
-            np.zeros(shape, np.float32) if grad is None else _array(grad, np.float32)
+            _pool.zeros(shape, np.float32) if grad is None else _array(grad, np.float32)
             for grad, shape in zip(upstream, shapes, strict=True)
         ]
         g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight = g
-        total = _gather_rows(scene, ctx, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight)
-        gm, gq, gs = np.zeros_like(scene.means), np.zeros_like(scene.quats), np.zeros_like(scene.scales)
-        go, gv = np.zeros(n), np.zeros_like(scene.values)
-        visible = np.zeros(n, np.bool_)
-        visible[scene.order] = True
-        pieces = _threads.ranges(n, kernels.CHUNK)
+        total = _gather_rows(
+            scene, ctx, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight[scene.order]
+        )
+        parameters = (scene.means, scene.quats, scene.scales, scene.opacities, scene.values)
+        gm, gq, gs, go, gv = (_pool.zeros(part.shape, part.dtype) for part in parameters)
+        pieces = _threads.ranges(scene.ready, PIECE)
         g_view = np.zeros((len(pieces), 12))
         _threads.run(
             kernels.project_backward,
             [
-                (*piece, scene.view, scene.means, scene.quats, scene.scales, scene.opacities, scene.values,
-                 scene.channels, visible, scene.table, total, gm, gq, gs, go, gv, g_view[k])
+                (*piece, scene.order, scene.view, scene.means, scene.quats, scene.scales, scene.opacities,
+                 scene.values, scene.channels, scene.table, total, gm, gq, gs, go, gv, g_view[k])
                 for k, piece in enumerate(pieces)
             ],
         )  # fmt: skip
@@ -255,11 +329,11 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
 
     One row for each splat of each tile would be more than should be held at once, so groups of tiles take turns.
     """
-    n = len(scene.means)
-    columns = kernels.GRADIENTS + scene.features.shape[1]
-    total = np.zeros((n, columns))
-    done = ctx.done
-    before = np.concatenate([[0], np.cumsum(done)])
+    n = scene.ready
+    columns = kernels.GRADIENTS + 3 + max(3, scene.channels)
+    total = _pool.zeros((n, columns), np.float64)
+    done, visit = ctx.done, scene.visit
+    before = np.concatenate([[0], np.cumsum(done[visit])])
     room = ROWS_AT_ONCE
     buffer = np.empty((0, columns), np.float32)
     slots = kernels.BACK_SLOTS + max(0, scene.channels - 3)
@@ -269,18 +343,19 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         last = min(last, scene.tiles)
         count = int(before[last] - before[first])
         if len(buffer) < count:
-            buffer = np.empty((max(count, min(room, int(before[-1]))), columns), np.float32)
+            buffer = _pool.empty((max(count, min(room, int(before[-1]))), columns), np.float32)
         rows = buffer[:count]
-        place = before[:-1] - before[first]
+        place = _pool.empty(scene.tiles, np.int64)
+        place[visit] = before[:-1] - before[first]
         pieces = 8 * _threads.count()
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
         edges = sorted({first, *(int(c) for c in cuts if first < c < last), last})
         _threads.run(
             kernels.backward,
             [
-                (begin, end, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table, scene.features,
-                 scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream, place, rows,
-                 _aligned(slots * kernels.PIXELS), _aligned(kernels.ROW))
+                (begin, end, visit, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table,
+                 scene.thin, scene.features, scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream,
+                 place, rows, _aligned(slots * kernels.PIXELS), _aligned(kernels.BACK_WORK))
                 for begin, end in itertools.pairwise(edges)
             ],
         )  # fmt: skip
@@ -289,7 +364,7 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         _threads.run(
             kernels.reduce_rows,
             [
-                (low, high, first, last, scene.starts, done, scene.entries, place, rows, total)
+                (low, high, first, last, visit, scene.starts, done, scene.entries, place, rows, total)
                 for low, high in _threads.ranges(n, max(1, share))
             ],
         )

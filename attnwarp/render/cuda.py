@@ -6,13 +6,11 @@ differently:
 
 - Depth is that of the splat's centre. "intersection" and "peak" are refused; ask for depth="center".
 - A 2D splat is cut off by a box of 3.33 times its one-sigma extent, which is too small in perspective (colour errors
-up to
-  1.6e-2), its screen filter sits in the middle of that box, and only centres are tested against ``near``, so that a
-  splat that crosses the camera plane is drawn wrong. These cannot be emulated from outside: kind "2d" is refused unless
+  up to 1.6e-2), its screen filter sits in the middle of that box, and only centres are tested against ``near``, so that
+  a splat that crosses the camera plane is drawn wrong. These cannot be emulated from outside: kind "2d" is refused unless
   ``ATTNWARP_GSPLAT_2D=1`` is set in the environment, which says that they are accepted.
 - alpha is clamped at 0.999 or 0.99 depending on the version, and the splat that brings the transmittance below 1e-4 is
-left out.
-  Both differ by less than 1 % of a pixel, behind opaque splats.
+  left out. Both differ by less than 1 % of a pixel, behind opaque splats.
 - There is no median depth and no distortion_l1 of a feature: both are NaN everywhere.
 - Splats of equal depth are drawn in the order of the input.
 - ``weight`` carries no gradient.

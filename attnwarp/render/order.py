@@ -6,7 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 
-def break_ties(order: npt.NDArray[np.int64], depth: npt.NDArray[np.float32], content: list[np.ndarray]) -> None:
+def break_ties(
+    order: npt.NDArray[np.int64],
+    depth: npt.NDArray[np.float32],
+    content: list[np.ndarray],
+    places: npt.NDArray[np.int64] | None = None,
+) -> None:
     """Put splats of equal depth into an order that depends on what they are, in place.
 
     Depths count as equal when they round to the same float32: a plane of splats seen by a rotated camera differs in
@@ -16,23 +21,21 @@ def break_ties(order: npt.NDArray[np.int64], depth: npt.NDArray[np.float32], con
         order: (M,) indices of splats, sorted by ``depth``; changed in place.
         depth: (N,) float32 depth of each splat.
         content: arrays of (N,) or (N, k) values that describe a splat, most significant first.
+        places: where in ``order`` a depth equals one beside it, ascending, if that is known.
     """
-    if len(order) < 2:
+    if places is None:
+        same = np.flatnonzero(np.diff(depth[order]) == 0)
+        places = np.union1d(same, same + 1)
+    if not len(places):
         return
-    sorted_depth = depth[order]
-    same = sorted_depth[1:] == sorted_depth[:-1]
-    if not same.any():
-        return
-    tied = np.zeros(len(order), dtype=bool)
-    tied[1:] |= same
-    tied[:-1] |= same
-    places = np.flatnonzero(tied)
     splats = order[places]
-    keys: list[np.ndarray] = [depth[splats]]
-    for array in content:
-        rows = array[splats].reshape(len(splats), -1)
-        keys += list(rows.T)
-    order[places] = splats[np.lexsort(keys[::-1])]
+    # Most ties are broken by what comes first: the rest is only looked at if it has to be.
+    for arrays in (content[:1], content):
+        keys = [depth[splats], *(row for array in arrays for row in array[splats].reshape(len(splats), -1).T)]
+        by = np.lexsort(keys[::-1])
+        if not np.all([key[by[1:]] == key[by[:-1]] for key in keys], axis=0).any():
+            break
+    order[places] = splats[by]
 
 
 def front_to_back(depth: npt.NDArray[np.float32], content: list[np.ndarray]) -> npt.NDArray[np.int64]:

@@ -225,12 +225,14 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(make
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 def test_a_deep_scene_worked_off_from_the_front_is_the_same(kind, make_camera, make_splats, monkeypatch) -> None:
-    """Begun with the nearest splats only; tiles that are not opaque by then start again. Same bits either way."""
+    """Begun with the nearest splats only; tiles that are not opaque by then start again; and lists too long to be held
+    at once made for some tiles after the others. Same bits either way."""
     camera = make_camera(3, 50, 40)
     start = make_splats(3, kind, 2000, camera)
     results = []
-    for front in (cpu.FRONT, 60, 3):
+    for front, entries in ((cpu.FRONT, cpu.ENTRIES), (60, 8), (3, 1), (cpu.FRONT, 0.5), (60, 1e-3)):
         monkeypatch.setattr(cpu, "FRONT", front)
+        monkeypatch.setattr(cpu, "ENTRIES", entries)
         means = start.means.clone().requires_grad_()
         view = render(dataclasses.replace(start, means=means), camera)
         (view.color.sum() + view.depth.nan_to_num().sum()).backward()

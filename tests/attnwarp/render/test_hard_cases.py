@@ -228,3 +228,26 @@ def test_case_39_a_floor_that_crosses_the_camera_plane_is_drawn_right(backend, f
     # Nothing nearer than the near plane, per pixel.
     near = render(floor, camera, backend=backend, near=3.0)
     assert torch.equal(near.valid & seen, seen & (exact >= 3.0))
+
+
+@pytest.mark.parametrize("kind", ["2d", "3d"])
+@pytest.mark.parametrize("far", [30.0, 1e3, 3e4])
+def test_the_outline_of_a_huge_splat_far_outside_of_the_picture_is_not_lost(kind, far) -> None:
+    """Its edge crosses the picture; outlines are found in float32 and must then be taken wider."""
+    camera = Camera.look_at([0, 0, 0], [0, 0, 1], width=64, height=48, fov_y=40, up=[0, -1, 0])
+    random = np.random.default_rng(0)
+    crossed = 0
+    for _ in range(12):
+        angle = random.uniform(0, 2 * np.pi)
+        means = torch.tensor([[far * np.cos(angle), far * np.sin(angle), 5.0]]).double()
+        # At the picture's middle the distance is about 3.2 sigmas: alpha is near 1/255.
+        sigma = far / random.uniform(3.0, 3.3)
+        scales = torch.full((1, 2 if kind == "2d" else 3), sigma, dtype=torch.float64)
+        splat = Gaussians(kind, means, torch.tensor([[1.0, 0, 0, 0]]).double(), scales, torch.ones(1).double(),
+                          torch.zeros(1, 1, 3).double())  # fmt: skip
+        truth = render(splat, camera, backend="reference").alpha
+        seen = render(splat, camera, backend="cpu").alpha.double()
+        inner = truth > constants.ALPHA_MIN * (1 + 1e-4)
+        crossed += bool(inner.any()) and not bool(inner.all())
+        assert float((seen - truth)[inner].abs().max() if inner.any() else 0) < 1e-6
+    assert crossed > 0 or far > 50 or kind == "3d"  # a blob out there covers all of the picture or nothing
