@@ -22,7 +22,7 @@ from training.data import Pictures, load
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
 SEED = 1
-EPOCHS = 18
+EPOCHS = 20
 BATCH = 128
 CROP = 96
 """Smaller than the 112 that the encoder sees: things then look a little larger in use than in training, which is known to
@@ -228,7 +228,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(out / "clip-small.tokenizer.json"))
     model = channels_last(ClipSmall(tokenizer.get_vocab_size()))
-    sets = [load(data, "train"), load(data, "train-rendered")]
+    sets = [load(data, name) for name in ("train", "train-rendered", "train-moved")]
     # A unit of the shuffle is all pictures of one view of a world: its looks belong into one batch.
     units = [(k, rows) for k, pictures in enumerate(sets) for rows in _units(pictures)]
     each = sum(len(rows) for _, rows in units) // BATCH

@@ -23,13 +23,16 @@ from training.common import Run, channels_last, groups, placed_crops, rate
 from training.data import Pictures, load
 
 SEED = 2
-EPOCHS = 12
+EPOCHS = 9
 BATCH = 64
 PEAK = 1.2e-3
 LARGE, SMALL = 96, 48
 PROTOTYPES = 768
 DENSE_PROTOTYPES = 192
 STUDENT_TEMPERATURE, TEACHER_TEMPERATURE = 0.1, 0.04
+CONTRAST_FROM = 5
+"""Epoch from which two views of a thing are also told from those of the batch's others: the targets alone stopped helping there
+(48 % of things found among 64 after two epochs, 49 % after five)."""
 SPREAD = 0.1
 """Weight of the term that keeps class tokens apart."""
 DENSE = 0.5
@@ -84,6 +87,17 @@ def balanced(scores: Tensor, rounds: int = 3) -> Tensor:
         q = q / q.sum(dim=0, keepdim=True).clamp(min=1e-12)
         q = q / q.sum(dim=1, keepdim=True).clamp(min=1e-12)
     return q
+
+
+def contrast(one: Tensor, other: Tensor) -> Tensor:
+    """Cross-entropy of finding each thing's other view in the batch (van den Oord et al. 2018), both ways.
+
+    Args:
+        one, other: (N, D) class tokens of the first and the second view.
+    """
+    logits = F.normalize(one.float(), dim=-1) @ F.normalize(other.float(), dim=-1).T / STUDENT_TEMPERATURE
+    mine = torch.arange(len(one))
+    return 0.5 * (F.cross_entropy(logits, mine) + F.cross_entropy(logits.T, mine))
 
 
 def spread(tokens: Tensor) -> Tensor:
@@ -174,6 +188,8 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             dense = torch.stack(dense_terms).mean()
             apart = torch.stack([spread(side) for side in tokens.chunk(2)]).mean()
             loss = cls + DENSE * dense + SPREAD * apart
+            if number >= CONTRAST_FROM:
+                loss = loss + contrast(*tokens.chunk(2))
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(student.parameters(), 2.0)
