@@ -127,7 +127,8 @@ def test_the_paired_test_agrees_with_scipy():
 
 @pytest.mark.parametrize("name", ["diffuse", "refraction", "medium", "depth_of_field"])
 def test_the_plan_of_a_scene_is_certified(name):
-    found = proof.prove(SCENES[name](), seconds=20)
+    # A budget for a busy machine; a quiet one needs a few seconds of it.
+    found = proof.prove(SCENES[name](), seconds=180)
     assert found.verdict == "certified", list(found.lines())
     assert found.rungs[0].name == "structure" and found.detectable
 
