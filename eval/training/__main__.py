@@ -146,7 +146,7 @@ def _facts(name: str, encoder: Any) -> dict[str, Any]:
     net, recipe = encoder.net, _recipe(name)
     facts = {
         "dim": encoder.about.dim, "size": millions(net), "torch": torch.__version__.partition("+")[0], "epochs": recipe.EPOCHS, "seed": recipe.SEED,
-        "train": 6 * SPLITS["train"].worlds, "rendered": SPLITS["train-rendered"].worlds, "objects": len(OBJECTS),
+        "pictures": f"{6 * SPLITS['train'].worlds + 4 * SPLITS['train-moved'].worlds} by ray casting", "objects": len(OBJECTS),
         "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
     }  # fmt: skip
     if name == "clip-small":

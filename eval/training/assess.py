@@ -82,7 +82,8 @@ def as_float(images: npt.NDArray[np.uint8]) -> list[Image]:
 
 def _unit(x: npt.ArrayLike) -> Array:
     x = np.asarray(x, dtype=np.float64)
-    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+    # What has no length has no direction: it stays zero, as like to everything as to nothing.
+    return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
 
 
 # clip-small ----------------------------------------------------------------------------------------------------------
@@ -158,7 +159,8 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
                     asked=asked,
                 )
             )
-        found.append(_retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}"))
+        if len(np.unique(pictures.world)) >= 64:
+            found.append(_retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}"))
     found.append(_direction(encoder, embedded["test"], sets["test"]))
     found.append(_viewpoint(embedded["test"], sets["test"], labels))
     return found
@@ -207,6 +209,8 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
         # One seed for all sentences: they differ in what they say, not in how.
         texts = encoder.texts([sentence(said, np.random.default_rng(seed)) for said in (old, *targets)])
         away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
+        if not (images[after] != images[before]).any():
+            continue  # what was changed is not in the picture: there is no direction
         moved = _unit(images[after] - images[before])
         right.append((away @ moved).argmax() == 0)
         worlds.append(world)
@@ -247,8 +251,9 @@ def nearest(features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3
     right = []
     for world in worlds:
         others = rng.choice([w for w in worlds if w != world], 63, replace=False)
-        gallery = [index[world, 0, 0], *(index[int(w), 0, 0] for w in others)]
-        right.append(bool((unit[gallery] @ unit[index[world, 1, look]]).argmax() == 0))
+        # The right one last: the first of equals wins, so a tie is no find.
+        gallery = [*(index[int(w), 0, 0] for w in others), index[world, 0, 0]]
+        right.append(bool((unit[gallery] @ unit[index[world, 1, look]]).argmax() == 63))
     return right, worlds
 
 
