@@ -19,8 +19,9 @@ outside its words. It knows {objects} things, {colors} colours, {finishes} surfa
 that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
 
-**Recipe**: `training/clip.py`. Contrast over batches of 192 pictures and 384 sentences, half of which have one attribute wrong; looks
+**Recipe**: `training/clip.py`. Contrast over batches of 128 pictures and 256 sentences, half of which have one attribute wrong; looks
 of one world, which differ in one attribute, lie in one batch; sentences that happen to be true of another picture are no negatives.
+Beside it contrast with the words for one attribute at a time, and linear heads on the picture's features that are left behind.
 Rare words and invented ones are scattered into captions so that unknown words do little harm.""",
     "dino-small": """A class token and 8 x 8 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to a sixteenth of the
 size, then three transformer blocks; {size:.1f} million parameters.
@@ -32,7 +33,7 @@ size, then three transformer blocks; {size:.1f} million parameters.
 
 **Recipe**: `training/dino.py`. Self-distillation with multi-crop and a momentum teacher, whose targets are centred and sharpened by Sinkhorn's normalisation; no labels. The two large crops are two
 views of one thing, which at times stands on another ground or in another light. Patches of small crops are taught by the teacher's patches
-at the same place.""",
+at the same place. From the sixth epoch on a thing's two views are also told from the batch's other things.""",
     "perceptual-small": """A distance of two pictures of one size, any size: differences of normalised features at four scales, weighted by channel
 and averaged, as LPIPS, plus the difference of the pictures themselves averaged over 4 x 4 px; {size:.2f} million parameters. Its square root times 5 is
 about the strength of a distortion on the scale of `training/distort.py`: 1 is faint, 5 ruined.
@@ -50,7 +51,7 @@ photographs that scikit-image ships and of rendered worlds.""",
 
 DATA = """**Data**: pictures of random worlds, {pictures} (`training/worlds.py`, `training/objects.py`), with captions that are
 true of them by construction; {photos}nothing was downloaded. Never seen in training: every shape of the tests, one in ten pairs of object and colour,
-every world of the tests."""
+every world of the tests. One exception: dinosaurs with plates come in one shape."""
 
 
 def card(
