@@ -296,7 +296,7 @@ def _load(
         done.encoders[kind] = loaded[kind].about
         if loaded[kind].about.source == "bundled":
             done.notes.append(
-                f"{loaded[kind].about.name} is small and was trained on this project's own scenes: its figures rank "
+                f"{loaded[kind].about.name} is small and was trained on random rendered scenes: its figures rank "
                 f"results among themselves and do not compare with published ones. --{kind} names a real encoder"
             )
     return loaded

@@ -458,4 +458,4 @@ def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypat
     folder, _ = data
     done = call("metrics", f"--renders={folder / 'renders'}", "--prompt=a bear", "--out", folder / "out")
     assert asked == [(("clip-small", "clip"), {"device": "cpu"})]  # the default, and nothing that no figure needs
-    assert done.exit_code == 0 and "clip-small is small and was trained on this project's own scenes" in done.stderr
+    assert done.exit_code == 0 and "clip-small is small and was trained on random rendered scenes" in done.stderr

@@ -41,8 +41,8 @@ __all__ = [
 ]
 
 BUNDLED: dict[str, tuple[Kind, str]] = {
-    "clip-small": ("clip", "a small text and image encoder trained on this project's own scenes"),
-    "dino-small": ("dino", "a small image encoder trained on this project's own scenes, without labels"),
+    "clip-small": ("clip", "a small text and image encoder trained on random rendered scenes"),
+    "dino-small": ("dino", "a small image encoder trained on random rendered scenes, without labels"),
     "perceptual-small": ("perceptual", "a small perceptual distance in the manner of LPIPS"),
 }
 """What ships with the package: name -> (kind, one line)."""
