@@ -18,8 +18,8 @@ the ground, the time of day; whether an edit went in the direction of the words;
 outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`training/worlds.py`). A word
 that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
-On edits whose truth is known (docs/metrics.md, "Measured") similarity to the prompt moves the wrong way for blur: a blurred result scores higher in
-65 %. It is blind to a shift by 2 px, and ranks the full edit above three quarters of it in 68 %.
+On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md ("Measured")
+and reports/metrics have the figures.
 
 **Recipe**: `training/clip.py`. Contrast over batches of 128 pictures and 256 sentences, half of which have one attribute wrong; looks
 of one world, which differ in one attribute, lie in one batch; sentences that happen to be true of another picture are no negatives.
