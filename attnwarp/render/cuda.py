@@ -90,9 +90,13 @@ def composite(inputs: Inputs, rasterizer: object) -> Outputs:
     ones = torch.ones(len(means), 1, device=means.device, requires_grad=True)
     inverse = 1 / z
     geometry = torch.stack([z, inverse, inverse * inverse], dim=-1)
-    features = torch.cat([colors.float(), normals.float(), geometry.float(), ones], dim=-1)
-    sums, alpha = rasterizer(inputs, features)
-    (weight,) = torch.autograd.grad(sums[..., -1].sum(), ones, retain_graph=True)
+    wanted = torch.is_grad_enabled()
+    with torch.enable_grad():  # the weights are a gradient, whether or not the caller wants any
+        features = torch.cat([colors.float(), normals.float(), geometry.float(), ones], dim=-1)
+        sums, alpha = rasterizer(inputs, features)
+        (weight,) = torch.autograd.grad(sums[..., -1].sum(), ones, retain_graph=wanted)
+    if not wanted:
+        sums, alpha = sums.detach(), alpha.detach()
     c = inputs.channels
     drawn = alpha.detach() > 0
     safe = torch.where(drawn, alpha, 1.0)

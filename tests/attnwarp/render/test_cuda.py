@@ -38,6 +38,22 @@ def test_outputs_are_made_from_composited_features(kind, make_camera, make_splat
     assert bool(made.median_depth.isnan().all()) and bool(made.distortion_l1.isnan().all())
 
 
+def test_weights_need_no_gradients_from_the_caller(make_camera, make_splats) -> None:
+    camera = make_camera(3, 18, 14)
+    splats = make_splats(3, "3d", 30, camera)
+    splats = splats.select(torch.tensor([i for i in range(30) if i not in (0, 1, 7)]))
+    inputs = dataclasses.replace(prepared(splats, camera), means=splats.means.clone().requires_grad_())
+    expected = reference.render(inputs)
+    with torch.no_grad():
+        made = cuda.composite(inputs, brute_force)
+    assert not made.color.requires_grad and not made.weight.requires_grad
+    assert float((made.weight - expected.weight.detach()).abs().max()) < 1e-5
+    assert float((made.color - expected.color.detach()).abs().max()) < 1e-5
+    # With gradients they still reach the splats.
+    (grad,) = torch.autograd.grad(cuda.composite(inputs, brute_force).color.sum(), inputs.means)
+    assert float(grad.abs().sum()) > 0
+
+
 def test_what_gsplat_computes_differently_is_refused(make_camera, make_splats, monkeypatch) -> None:
     camera = make_camera(3, 8, 8)
     flat, solid = make_splats(3, "2d", 5, camera), make_splats(3, "3d", 5, camera)
