@@ -228,3 +228,14 @@ def test_colours_of_a_mesh_with_needles_are_those_of_its_texture(monkeypatch):
         renderer.forget()
     base = picture.max()
     assert np.isfinite(picture).all() and picture.min() > 0 and base < 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    # Two rectangles in one plane, of which either may be seen; spheres that only touch the ground.
+    [("coplanar", "scalar_rgb"), ("spheres", "llvm_ad_rgb")],
+)
+def test_renderings_are_compared_in_scalar_where_surfaces_coincide(fresh_probe, name, expected):
+    fresh_probe.setattr(llvm, "libraries", lambda: ["/a/libLLVM.so.19.1"])
+    children(fresh_probe, lambda _: (0, "works\n"))
+    assert renderer.comparable(load_scene(name)) == expected
