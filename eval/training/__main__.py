@@ -22,7 +22,7 @@ NAMES = ("clip-small", "dino-small", "perceptual-small")
 
 @app.command()
 def data(folder: Data = DATA, threads: Threads = 2) -> None:
-    """Render the pictures (half an hour on two cores)."""
+    """Render the pictures (an hour on two cores)."""
     from training.data import SPLITS, make
 
     for name in SPLITS:
@@ -134,6 +134,8 @@ def _seconds(encoder: Any, rounds: int = 7) -> float:
 
 
 def _facts(name: str, encoder: Any) -> dict[str, Any]:
+    import importlib
+
     import torch
 
     from training.data import SPLITS
@@ -144,14 +146,16 @@ def _facts(name: str, encoder: Any) -> dict[str, Any]:
         return sum(p.numel() for p in net.parameters()) / 1e6
 
     net, recipe = encoder.net, _recipe(name)
+    cast = 6 * SPLITS["train"].worlds + 4 * (SPLITS["train-moved"].worlds + SPLITS["train-shapes"].worlds)
     facts = {
         "dim": encoder.about.dim, "size": millions(net), "torch": torch.__version__.partition("+")[0], "epochs": recipe.EPOCHS, "seed": recipe.SEED,
-        "pictures": f"{6 * SPLITS['train'].worlds + 4 * SPLITS['train-moved'].worlds} by ray casting", "objects": len(OBJECTS),
+        "pictures": f"{cast} by ray casting", "objects": len(OBJECTS),
         "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
     }  # fmt: skip
     if name == "clip-small":
         facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}
         facts["pictures"] += f", {SPLITS['train-rendered'].worlds} by Mitsuba"
+        facts["warm_epochs"] = importlib.import_module("training.naming").EPOCHS
     if name == "perceptual-small":
         facts["pictures"] = f"{6 * SPLITS['train'].worlds // 7} by ray casting"
         facts["photos"] = (

@@ -21,9 +21,10 @@ compare with those of OpenAI's CLIP, whose name stands beside a figure when it w
 On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md ("Measured")
 and reports/metrics have the figures.
 
-**Recipe**: `training/clip.py`. Contrast over batches of 128 pictures and 256 sentences, half of which have one attribute wrong; looks
-of one world, which differ in one attribute, lie in one batch; sentences that happen to be true of another picture are no negatives.
-Beside it contrast with the words for one attribute at a time, and linear heads on the picture's features that are left behind.
+**Recipe**: `training/naming.py`, then `training/clip.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image
+tower's features; three in ten pictures have their colours scrambled, and of these the thing alone is asked. Then contrast over batches of 128 pictures and 256
+sentences, half of which have one attribute wrong; looks of one world, which differ in little, lie in one batch; sentences that happen to be
+true of another picture are no negatives. Beside it contrast with the words for one attribute at a time, and the heads, which are left behind.
 Rare words and invented ones are scattered into captions so that unknown words do little harm.""",
     "dino-small": """A class token and 8 x 8 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to a sixteenth of the
 size, then three transformer blocks; {size:.1f} million parameters.
@@ -35,7 +36,8 @@ size, then three transformer blocks; {size:.1f} million parameters.
 
 **Recipe**: `training/dino.py`. Self-distillation with multi-crop and a momentum teacher, whose targets are centred and sharpened by Sinkhorn's normalisation; no labels. The two large crops are two
 views of one thing, which at times stands on another ground or in another light. Patches of small crops are taught by the teacher's patches
-at the same place. From the sixth epoch on a thing's two views are also told from the batch's other things.""",
+at the same place. Beside it a thing's two views are told
+from the batch's other things.""",
     "perceptual-small": """A distance of two pictures of one size, any size: differences of normalised features at four scales, weighted by channel
 and averaged, as LPIPS, plus the difference of the pictures themselves averaged over 4 x 4 px; {size:.2f} million parameters. Its square root times 5 is
 about the strength of a distortion on the scale of `training/distort.py`: 1 is faint, 5 ruined.

@@ -2,7 +2,7 @@
 
 A batch holds the looks of a world side by side, which differ in one attribute, and for every sentence another with one
 attribute wrong. A sentence that happens to be true of another picture of the batch is no negative: both know what
-they show, so such pairs are left out of the sum.
+they show, so such pairs are left out of the sum. The image tower comes from :mod:`training.naming`, which taught it shapes.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
-from torch import nn
 
 from attnwarp_eval.encoders.nets import ClipSmall
 from training.common import Run, channels_last, crops, groups, rate
-from training.data import Pictures, load
+from training.naming import Heads, pictures_of, warm_start
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
 SEED = 1
-EPOCHS = 20
+EPOCHS = 8
 BATCH = 128
 CROP = 96
-"""Smaller than the 112 that the encoder sees: things then look a little larger in use than in training, which is known to
-help after random crops (Touvron et al. 2019), and costs less."""
-PEAK = 1.5e-3
+SCALE = (0.6, 0.95)
+"""Shares of a picture's side that a crop of 96 px shows: things are as large in it, on average, as in the whole picture at the
+encoder's size, of which the crop leaves out background that costs time."""
+PEAK = 1e-3
+VISION = 0.4
+"""Share of the learning rate for the image tower, which has learned much already."""
 VOCABULARY = 1024
 
 Ints = npt.NDArray[np.int64]
@@ -200,40 +202,28 @@ def naming_loss(
     return total / (len(spans) + 1)
 
 
-class Heads(nn.Module):
-    """One linear guess for every attribute, from the picture's features; used in training alone.
-
-    A text tower that does not yet tell nouns apart gives pictures no reason to, and the other way round: without these, shapes were
-    not learned at all in the time that colours and grounds took to be learned well.
-    """
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.counts = {0: len(OBJECTS), 1: len(FINISHES), 2: len(COLORS), 4: len(GROUNDS), 5: len(TIMES)}
-        self.guess = nn.Linear(dim, sum(self.counts.values()))
-
-    def forward(self, x: torch.Tensor, shown: Ints) -> torch.Tensor:
-        """Cross-entropy of (N, dim) features with what is shown, (N, 6), meant over the attributes."""
-        parts = self.guess(x).float().split(list(self.counts.values()), dim=1)
-        total = torch.zeros(())
-        for (column, _), logits in zip(self.counts.items(), parts, strict=True):
-            total = total + F.cross_entropy(logits, torch.from_numpy(shown[:, column]), ignore_index=-1)
-        return total / len(parts)
-
-
 def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     """Train clip-small; the checkpoint's path."""
+    out.mkdir(parents=True, exist_ok=True)
+    sets = pictures_of(data)
+    warm = warm_start(sets, out)
     torch.manual_seed(SEED)
     tokenizer = make_tokenizer()
-    out.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(out / "clip-small.tokenizer.json"))
     model = channels_last(ClipSmall(tokenizer.get_vocab_size()))
-    sets = [load(data, name) for name in ("train", "train-rendered", "train-moved")]
-    # A unit of the shuffle is all pictures of one view of a world: its looks belong into one batch.
-    units = [(k, rows) for k, pictures in enumerate(sets) for rows in _units(pictures)]
-    each = sum(len(rows) for _, rows in units) // BATCH
     heads = Heads(model.pool.project.in_features)
-    optimizer = torch.optim.AdamW([*groups(model, 0.05), *groups(heads, 0.05)], lr=PEAK, betas=(0.9, 0.98))
+    stored = torch.load(warm, weights_only=True)
+    model.vision.load_state_dict(stored["vision"])
+    model.pool.norm.load_state_dict(stored["norm"])
+    heads.load_state_dict(stored["heads"])
+    units = [(k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)]
+    each = sum(len(rows) for _, rows in units) // BATCH
+    seen = [*groups(model.vision, 0.05), *groups(heads, 0.05)]
+    optimizer = torch.optim.AdamW(
+        [*seen, *groups(model.pool, 0.05), *groups(model.text, 0.05), {"params": [model.scale], "weight_decay": 0.0}],
+        betas=(0.9, 0.98),
+    )
+    peaks = [PEAK * VISION] * len(seen) + [PEAK] * (len(optimizer.param_groups) - len(seen))
 
     def epoch(number: int) -> dict[str, float]:
         rng = np.random.default_rng([SEED, number])
@@ -242,11 +232,11 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         model.train()
         sums = np.zeros(3)
         for step in range(each):
-            for group in optimizer.param_groups:
-                group["lr"] = rate(number * each + step, epochs * each, PEAK, 200)
+            for group, peak in zip(optimizer.param_groups, peaks, strict=True):
+                group["lr"] = rate(number * each + step, epochs * each, peak, 200)
             rows = flat[step * BATCH : (step + 1) * BATCH]
-            images = crops(np.stack([sets[k].images[r] for k, r in rows]), CROP, rng, scale=(0.72, 1.0))
-            shown = np.stack([sets[k].attributes[r] for k, r in rows])
+            images = crops(np.stack([sets[k].pictures.images[r] for k, r in rows]), CROP, rng, scale=SCALE)
+            shown = np.stack([sets[k].pictures.attributes[r] for k, r in rows])
             said = [told(tuple(int(v) for v in row), rng) for row in shown]
             false = [wrong(s, rng) for s in said]
             texts = [_scattered(sentence(s, rng, fillers=True), rng) for s in [*said, *false]]
@@ -269,9 +259,3 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     checkpoint = out / "clip-small.pt"
     Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs).train(epoch)
     return checkpoint
-
-
-def _units(pictures: Pictures) -> list[Ints]:
-    keys = pictures.world * 8 + pictures.view
-    order = np.argsort(keys, kind="stable")
-    return list(np.split(order, np.flatnonzero(np.diff(keys[order])) + 1))

@@ -11,7 +11,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from training.worlds import FINISHES, GROUNDS, OBJECTS, TIMES, Look, attributes, change, draw_look, draw_world
+from training.worlds import (
+    FINISHES,
+    GROUNDS,
+    OBJECTS,
+    TIMES,
+    TRAIN_SHAPES,
+    Look,
+    attributes,
+    change,
+    draw_look,
+    draw_world,
+)
 
 DATA_PROTOCOL = 1
 """Raised whenever the same seed would give other pictures."""
@@ -30,6 +41,8 @@ class Split:
         shard: worlds in a file.
         pairs: colours of the objects: "seen" in training, "new", or "any".
         new_shapes: whether the shapes are ones that training never sees.
+        own_shapes: whether every world has a shape of its own, which training may see; else worlds share
+            :data:`training.worlds.TRAIN_SHAPES` of each thing.
         path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the ray caster (two
             views of each look).
         moved: whether all looks of a world have its surface, on other grounds at other times; else there are three, of
@@ -42,6 +55,7 @@ class Split:
     shard: int = 50
     pairs: str = "seen"
     new_shapes: bool = False
+    own_shapes: bool = False
     path_traced: bool = False
     moved: bool = False
     bare: bool = False
@@ -50,7 +64,8 @@ class Split:
 SPLITS = {
     "train": Split(0, 2500),
     "train-moved": Split(6_000_000, 2000, moved=True),
-    "train-rendered": Split(1_000_000, 500, path_traced=True),
+    "train-shapes": Split(9_000_000, 4000, own_shapes=True, moved=True),
+    "train-rendered": Split(1_000_000, 1000, path_traced=True),
     "test": Split(2_000_000, 400, pairs="any", new_shapes=True),
     "test-new-pairs": Split(3_000_000, 200, pairs="new", new_shapes=True),
     "test-bare": Split(7_000_000, 200, pairs="any", new_shapes=True, bare=True),
@@ -114,6 +129,8 @@ def render_world(
 
     # Objects come in turn, so that every word is seen as often.
     world = draw_world(seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS), bare=split.bare)
+    if split.own_shapes:
+        world = replace(world, instance=TRAIN_SHAPES + seed - split.first)
     looks = looks_of(seed, world.thing, split)
     if split.path_traced:
         from attnwarp_eval.colors import to_srgb
