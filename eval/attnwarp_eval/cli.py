@@ -219,7 +219,7 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
 def list_() -> None:
     """The scenes that can be named."""
     from attnwarp_eval.errors import InputError
-    from attnwarp_eval.scene import list_scenes, load_scene
+    from attnwarp_eval.scene_file import list_scenes, load_scene
 
     broken = []
     for name in list_scenes():
@@ -235,7 +235,7 @@ def list_() -> None:
 def show(scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")]) -> None:
     """What a scene contains, and how its pictures are made."""
     with clear_errors():
-        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.scene_file import load_scene
         from attnwarp_eval.show import describe
 
         typer.echo(describe(load_scene(scene)))
@@ -253,7 +253,7 @@ def render(
     from rich.console import Console
 
     with clear_errors():
-        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.scene_file import load_scene
         from attnwarp_eval.show import render_views
 
         loaded = load_scene(scene).with_size(size, size)
@@ -279,7 +279,7 @@ def export(
 
     with clear_errors():
         from attnwarp_eval import fitting
-        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.scene_file import load_scene
 
         loaded = load_scene(scene)
         with Console(stderr=True).status("points") as status:
@@ -299,8 +299,8 @@ def edits(
     import json
 
     with clear_errors():
-        from attnwarp_eval import edits as known
-        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval import edited as known
+        from attnwarp_eval.scene_file import load_scene
 
         loaded = load_scene(scene)
         typer.echo(json.dumps(known.to_dict(loaded), indent=2) if as_json else known.describe(loaded))
@@ -330,16 +330,16 @@ def effects(
         _effects_of_all(out, prove, budget)
         return
     with clear_errors():
-        from attnwarp_eval import effects as planning
+        from attnwarp_eval import effects as light
         from attnwarp_eval.proof import prove as hold
-        from attnwarp_eval.scene import load_scene
+        from attnwarp_eval.scene_file import load_scene
 
         loaded = load_scene(str(scene))
-        about = planning.report(loaded, cost=planning.measure(loaded))
+        about = light.report(loaded, cost=light.measure(loaded))
         proof = hold(loaded, seconds=budget) if prove else None
     if proof is not None:
         about["proof"] = proof.to_dict()
-    lines = [json.dumps(about, indent=2)] if as_json else list(planning.describe(loaded, about))
+    lines = [json.dumps(about, indent=2)] if as_json else list(light.describe(loaded, about))
     if proof is not None and not as_json:
         lines += ["", *proof.lines()]
     typer.echo("\n".join(lines))
@@ -353,7 +353,7 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
 
     with clear_errors():
         from attnwarp_eval.effects_table import Settings, collect
-        from attnwarp_eval.scene import list_scenes
+        from attnwarp_eval.scene_file import list_scenes
 
         names = list_scenes()
         console = Console(stderr=True)
@@ -421,7 +421,7 @@ def time_(
     from rich.table import Table
 
     with clear_errors():
-        from attnwarp_eval.scene import list_scenes
+        from attnwarp_eval.scene_file import list_scenes
         from attnwarp_eval.truth import suite
 
         console, times = Console(stderr=True), []

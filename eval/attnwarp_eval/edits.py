@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.optics import TEXTURED, contradictions
+from attnwarp_eval.optics import TEXTURED
+from attnwarp_eval.scene_spec import AnswerSpec, EditSpec, ObjectChange, ObjectSpec, SceneSpec
 from attnwarp_eval.textures import linear_rgb
-
-if TYPE_CHECKING:
-    from attnwarp_eval.scene import AnswerSpec, EditSpec, ObjectChange, ObjectSpec, Scene, SceneSpec
-    from attnwarp_eval.truth import Hits
+from attnwarp_eval.transport import contradictions
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear sRGB (Rec. 709)."""
@@ -148,64 +146,3 @@ def problems(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
                 continue
             for message, _ in contradictions(result):
                 yield f"edits[{k}]: makes a scene that contradicts itself: {message}", ("edits", k)
-
-
-def touched(scene: Scene, name: str, answer: str | None = None) -> list[int]:
-    """Object ids whose surfaces an edit changes; other things change by their light alone."""
-    edit = scene.edit(name)
-    does = pick(edit, answer) or edit
-    return [scene.object_names.index(change.object) for change in does.changes]
-
-
-def edit_mask(scene: Scene, name: str, hits: Hits, answer: str | None = None) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the light.
-
-    Args:
-        hits: of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
-    """
-    edit = scene.edit(name)
-    if (pick(edit, answer) or edit).lights is not None:
-        return np.ones(hits.object_id.shape, dtype=bool)
-    return np.isin(hits.object_id, touched(scene, name, answer))
-
-
-def describe(scene: Scene) -> str:
-    """A scene's edits in words."""
-    if not scene.edits:
-        return f"{scene.name} names no edits"
-    lines = [f"{scene.name}: {scene.title}"]
-    for edit in scene.edits:
-        lines += ["", f"{edit.name}: {edit.instruction}", f"  from  {edit.source}", f"  to    {edit.target}"]
-        for does in edit.answers or (edit,):
-            what = [f"{change.object} ({', '.join(_kinds(change))})" for change in does.changes]
-            if does.lights is not None:
-                what.append("the light")
-            label = f"answer {does.name}" if edit.ambiguous else "changes"
-            lines.append(f"  {label}: {', '.join(what)}")
-    return "\n".join(lines)
-
-
-def _kinds(change: ObjectChange) -> Iterator[str]:
-    for name in ("texture", "material", "recolor", "paint"):
-        if getattr(change, name):
-            yield name
-
-
-def to_dict(scene: Scene) -> dict[str, Any]:
-    """A scene's edits as JSON can hold them, with the content hash of each result."""
-    return {
-        "scene": scene.name,
-        "content": scene.content_hash,
-        "edits": [
-            {
-                "name": edit.name, "instruction": edit.instruction, "source": edit.source, "target": edit.target,
-                "ambiguous": edit.ambiguous,
-                "results": [
-                    {"answer": one.name if one else None, "target": one.target if one else edit.target,
-                     "content": scene.edited(edit.name, one.name if one else None).content_hash}
-                    for one in edit.answers or (None,)
-                ],
-            }
-            for edit in scene.edits
-        ],
-    }  # fmt: skip

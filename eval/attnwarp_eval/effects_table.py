@@ -14,12 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.cache import content_key
-from attnwarp_eval.effects import everything_on, measure, plan
+from attnwarp_eval.effects import detect, measure
 from attnwarp_eval.optics import NOT_SIMULATED
+from attnwarp_eval.plan import everything_on, plan
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.transport import called_for
 
 if TYPE_CHECKING:
     from attnwarp_eval.report.model import Table
-    from attnwarp_eval.scene import Scene
 
 PROTOCOL = 1
 """Raised whenever an entry would come out otherwise."""
@@ -75,7 +77,7 @@ def collect(
     """
     import mitsuba
 
-    from attnwarp_eval.scene import load_scene
+    from attnwarp_eval.scene_file import load_scene
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, forget
 
@@ -101,7 +103,6 @@ def collect(
 def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]) -> dict[str, Any]:
     from dataclasses import asdict
 
-    from attnwarp_eval.effects import detect
     from attnwarp_eval.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
@@ -299,8 +300,6 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
 
 def said_by(scene: Scene) -> dict[str, Any]:
     """What a run keeps of a scene's effects: those its file calls for, with the words, and the plan."""
-    from attnwarp_eval.optics import called_for
-
     words = called_for(scene.spec)
     return {
         "needed": {name: text for name, text in words.items() if name not in NOT_SIMULATED},

@@ -1,5 +1,16 @@
 """The one kind of error that is a person's to mend: the command line shows its message and exits with code 2."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+
 
 class InputError(ValueError):
     """An input that cannot be used. The message names the file, what came, what was expected, and the remedy."""
+
+
+def suggest(word: str, known: Sequence[str]) -> str:
+    """The end of a message: the known word nearest to a misspelt one; empty where none is near."""
+    near = difflib.get_close_matches(word, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene import Scene, SceneError, SkySpec
+from attnwarp_eval.scene import Scene, SceneError
+from attnwarp_eval.scene_spec import SkySpec
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth.shading import sky_radiance
 

@@ -91,8 +91,8 @@ def study(
         ValueError: an edit with one result.
     """
     from attnwarp_eval import metrics
-    from attnwarp_eval.edits import edit_mask
-    from attnwarp_eval.scene import load_scene
+    from attnwarp_eval.edited import edit_mask
+    from attnwarp_eval.scene_file import load_scene
     from attnwarp_eval.truth import Geometry, appearance, to_srgb, two_view
 
     scene = load_scene(name).with_size(size, size)

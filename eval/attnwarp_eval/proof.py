@@ -16,16 +16,16 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.effects import Plan, detect, everything_on, plan
+from attnwarp_eval.effects import detect
 from attnwarp_eval.optics import NOT_SIMULATED
-
-if TYPE_CHECKING:
-    from attnwarp_eval.scene import Scene
+from attnwarp_eval.plan import Plan, everything_on, plan
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
 Array = npt.NDArray[np.float64]
 Verdict = Literal["certified", "refused", "can't tell"]
@@ -291,8 +291,6 @@ def prove(
         ValueError: fewer than 10 seeds a side.
         SceneError: file and loaded scene disagree about the effects.
     """
-    from attnwarp_eval.truth.mitsuba import comparable, render_plan
-
     if seeds < 10:
         raise ValueError(f"seeds: got {seeds}, expected at least 10 a side")
     start = time.perf_counter()

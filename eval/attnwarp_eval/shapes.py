@@ -613,7 +613,7 @@ def read_mesh(path: Path) -> Mesh:
     Raises:
         ValueError: the format is not known, or the file holds no triangles.
     """
-    from attnwarp_eval.truth._open3d import open3d
+    from attnwarp_eval._open3d import open3d
 
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ValueError(f"{path}: mesh format {path.suffix!r} is not read; use one of {', '.join(MESH_SUFFIXES)}")

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval.plan import plan
 from attnwarp_eval.scene import Scene
 
 Image = npt.NDArray[Any]
@@ -17,8 +18,6 @@ Image = npt.NDArray[Any]
 
 def describe(scene: Scene) -> str:
     """A scene in words: objects, lights, cameras, and how its pictures are planned."""
-    from attnwarp_eval.effects import plan
-
     spec = scene.spec
     lines = [
         f"{scene.name}: {scene.title}",

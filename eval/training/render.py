@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene import Scene, SceneSpec, SkySpec, SunSpec
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_spec import SceneSpec, SkySpec, SunSpec
 from attnwarp_eval.textures import albedo, linear_rgb
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.raycast import Hits

@@ -1,6 +1,7 @@
 """Small scenes that each call for one effect, shared by the tests of planning and of proof."""
 
-from attnwarp_eval.scene import Scene, SceneSpec
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_spec import SceneSpec
 
 PLAIN = {"type": "plain", "color": "#c0b090"}
 FLOOR = {"name": "floor", "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [6, 6]}, "texture": PLAIN}

@@ -8,7 +8,7 @@ from effect_scenes import FLOOR, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli import app
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.truth import accuracy, suite
 
 

@@ -11,7 +11,7 @@ from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, warp_surfaces
 from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval import checks
 from attnwarp_eval.features import SolidField
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.truth import Geometry, two_view
 
 SIZE = 128

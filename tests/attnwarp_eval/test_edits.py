@@ -6,9 +6,12 @@ import json
 import numpy as np
 import pytest
 
+from attnwarp_eval import edited as shown
 from attnwarp_eval import edits
 from attnwarp_eval.colors import to_linear
-from attnwarp_eval.scene import Scene, SceneError, SceneSpec, load_scene
+from attnwarp_eval.scene import Scene, SceneError
+from attnwarp_eval.scene_file import load_scene
+from attnwarp_eval.scene_spec import SceneSpec
 from attnwarp_eval.textures import linear_rgb
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth.shading import object_albedo
@@ -53,7 +56,7 @@ def test_edits_are_no_part_of_the_scene_that_they_edit(name):
 def test_an_edit_leaves_shapes_and_every_other_object_as_they_were(name):
     scene = shipped(name)
     for edit, answer in results(scene):
-        edited, touched = scene.edited(edit.name, answer), edits.touched(scene, edit.name, answer)
+        edited, touched = scene.edited(edit.name, answer), shown.touched(scene, edit.name, answer)
         light = (edits.pick(edit, answer) or edit).lights
         assert bool(touched) != (light is not None)
         assert (edited.spec.lights == scene.spec.lights) == (light is None)
@@ -81,7 +84,7 @@ def test_outside_the_edited_object_the_albedo_is_identical_and_inside_it_is_not(
             for s, g in ((scene, before), (edited, after))
         )
         same = (a == b).all(-1)
-        mask = edits.edit_mask(scene, edit, hits, answer)[seen]
+        mask = shown.edit_mask(scene, edit, hits, answer)[seen]
         if scene.edit(edit).lights:
             assert mask.all() and same.all()
         else:

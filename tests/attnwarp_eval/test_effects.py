@@ -9,10 +9,12 @@ from effect_scenes import FLOOR, GLASS, LAMP, MIRROR, PLAIN, POINT, SCENES, SKY,
 from typer.testing import CliRunner
 
 from attnwarp.camera import Camera
-from attnwarp_eval import effects, optics, proof
+from attnwarp_eval import effects, proof, transport
 from attnwarp_eval.cli import app
-from attnwarp_eval.effects import Pass, Plan, plan
-from attnwarp_eval.scene import Scene, SceneError, SceneSpec, load_scene
+from attnwarp_eval.plan import Pass, Plan, beam, plan
+from attnwarp_eval.scene import Scene, SceneError
+from attnwarp_eval.scene_file import load_scene
+from attnwarp_eval.scene_spec import SceneSpec
 from attnwarp_eval.textures import linear_rgb
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth import mitsuba as renderer
@@ -56,8 +58,10 @@ def test_evidence_names_the_words_of_the_file_and_what_mitsuba_made_of_them():
 
 
 def test_a_file_and_a_loaded_scene_that_disagree_are_refused(monkeypatch):
-    scene, real = SCENES["refraction"](), optics.called_for
-    monkeypatch.setattr(optics, "called_for", lambda spec: {k: v for k, v in real(spec).items() if k != "refraction"})
+    scene, real = SCENES["refraction"](), transport.called_for
+    monkeypatch.setattr(
+        transport, "called_for", lambda spec: {k: v for k, v in real(spec).items() if k != "refraction"}
+    )
     with pytest.raises(SceneError, match=r"shows refraction .* that the file does not"):
         effects.detect(scene)
 
@@ -375,14 +379,14 @@ def test_following_only_the_beam_upon_the_glass_shows_the_same_caustic_with_less
 
 
 def test_a_cone_upon_the_smooth_objects_holds_them():
-    axis, angle = effects.beam(SCENES["caustics"](), 0)
+    axis, angle = beam(SCENES["caustics"](), 0)
     position, center, radius = np.array(POINT["position"]), np.array([0, 0, 0.7]), 0.6
     distance = np.linalg.norm(center - position)
     assert np.allclose(axis, center - position)
     assert angle > np.degrees(np.arcsin(radius / distance))
-    assert effects.beam(make([FLOOR, ball(GLASS)], [SUN], 8), 0) is None
+    assert beam(make([FLOOR, ball(GLASS)], [SUN], 8), 0) is None
     inside = POINT | {"position": [0.5, 0, 1.3]}
-    assert effects.beam(make([FLOOR, ball(GLASS)], [inside], 8), 0) is None
+    assert beam(make([FLOOR, ball(GLASS)], [inside], 8), 0) is None
 
 
 @pytest.mark.parametrize("name", ["point", "spot", "square", "globe"])
@@ -437,7 +441,7 @@ def test_the_command_line_prints_effects_and_plan_for_people_and_as_json():
 
 @pytest.mark.slow
 def test_file_and_loaded_scene_agree_on_every_scene_that_ships():
-    from attnwarp_eval.scene import list_scenes
+    from attnwarp_eval.scene_file import list_scenes
 
     for name in list_scenes():
         effects.detect(load_scene(name))

@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 
 from attnwarp_eval import effects, effects_table
 from attnwarp_eval.cli import app
-from attnwarp_eval.effects import plan
 from attnwarp_eval.effects_table import Settings, collect, plan_words, said_by, side_by_side
+from attnwarp_eval.plan import plan
 from attnwarp_eval.report.effects import effects as section
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 
 
 @pytest.fixture

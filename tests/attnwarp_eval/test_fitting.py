@@ -12,7 +12,7 @@ from attnwarp_eval.ablation import run as runner
 from attnwarp_eval.ablation.store import Store
 from attnwarp_eval.ablation.study import StudyError, load_study
 from attnwarp_eval.report import write_report
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.truth import Geometry
 
 STUDY = """

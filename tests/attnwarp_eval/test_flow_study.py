@@ -7,7 +7,7 @@ import pytest
 
 from attnwarp_eval import flow_study
 from attnwarp_eval.metric import metric
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 
 
 def test_a_turned_camera_keeps_the_point_it_looks_at_and_its_distance():

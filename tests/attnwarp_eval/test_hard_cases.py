@@ -8,7 +8,7 @@ import pytest
 
 from attnwarp.camera import Camera
 from attnwarp_eval.bodies import BodySpec
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Box, Mesh, MeshNotice, Rectangle, Sphere
 from attnwarp_eval.splats import surface_splats
 from attnwarp_eval.truth import AMBIGUOUS, Geometry, appearance, two_view

@@ -8,8 +8,8 @@ from effect_scenes import FLOOR, SCENES, SKY, SUN, make
 
 from attnwarp.camera import Camera
 from attnwarp_eval import proof
-from attnwarp_eval.effects import plan
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.plan import plan
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Mesh
 from attnwarp_eval.truth import appearance, llvm
 from attnwarp_eval.truth import mitsuba as renderer

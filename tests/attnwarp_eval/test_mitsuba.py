@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
-from attnwarp_eval.effects import Pass, Plan, plan
-from attnwarp_eval.scene import Scene, SceneSpec, load_scene
+from attnwarp_eval.plan import Pass, Plan, plan
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_file import load_scene
+from attnwarp_eval.scene_spec import SceneSpec
 from attnwarp_eval.textures import linear_rgb
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth import mitsuba as renderer

@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from attnwarp_eval import shapes
 from attnwarp_eval.bodies import BodySpec
 from attnwarp_eval.nature import ScatterSpec, TerrainSpec
-from attnwarp_eval.scene import SceneError, load_scene
+from attnwarp_eval.scene import SceneError
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Block, Capsule, Disc, Ellipsoid, Relief, Torus, body_distance
 
 

@@ -8,7 +8,7 @@ from effect_scenes import FLOOR, SCENES, SKY, SUN, WALL, ball, make
 from scipy import stats
 
 from attnwarp_eval import proof
-from attnwarp_eval.effects import everything_on, plan, without
+from attnwarp_eval.plan import everything_on, plan, without
 from attnwarp_eval.truth.mitsuba import render_plan
 
 SHAPE = (12, 16, 16, 3)

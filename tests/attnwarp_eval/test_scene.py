@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from attnwarp_eval.scene import Scene, SceneError, list_scenes, load_scene
+from attnwarp_eval.scene import Scene, SceneError
+from attnwarp_eval.scene_file import list_scenes, load_scene
 from attnwarp_eval.shapes import MeshNotice
 from attnwarp_eval.truth import Geometry, two_view
 
@@ -212,9 +213,7 @@ def test_the_content_hash_tells_scenes_apart_and_nothing_else(tmp_path):
     another_camera = load_scene(write(tmp_path, SMALL.replace("yaw: 30", "yaw: 31"), "d.yaml"))
     assert another_camera.content_hash != scene.content_hash and another_camera.world_hash == scene.world_hash
     # Another process agrees: no hash of Python's, whose seed changes, is in it.
-    code = (
-        f"from attnwarp_eval.scene import load_scene; print(load_scene({str(tmp_path / 'small.yaml')!r}).content_hash)"
-    )
+    code = f"from attnwarp_eval.scene_file import load_scene; print(load_scene({str(tmp_path / 'small.yaml')!r}).content_hash)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == scene.content_hash
 

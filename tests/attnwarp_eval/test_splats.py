@@ -4,7 +4,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Box, Rectangle, Sphere
 from attnwarp_eval.splats import quaternions_from_normals, sample_surface, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band

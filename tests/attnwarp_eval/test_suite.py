@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
-from attnwarp_eval.scene import list_scenes, load_scene
+from attnwarp_eval.scene_file import list_scenes, load_scene
 from attnwarp_eval.textures import albedo
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, VISIBLE, Geometry, two_view
 

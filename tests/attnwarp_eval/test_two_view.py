@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Box, Capsule, Ellipsoid, Rectangle, Sphere, mesh_body
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Geometry, edge_band, two_view
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from attnwarp_eval.colors import to_linear
-from attnwarp_eval.effects import plan
+from attnwarp_eval.plan import plan
 from attnwarp_eval.truth.mitsuba import render_plan
 from training import render, worlds
 from training.clip import make_tokenizer, true_of, wrong

@@ -62,7 +62,7 @@ def plan(study: Study, store: Store) -> Plan:
     Raises:
         InputError: something the study names cannot be used.
     """
-    from attnwarp_eval.scene import load_scene
+    from attnwarp_eval.scene_file import load_scene
 
     scenes: dict[str, Scene] = {}
     for name in study.scenes:

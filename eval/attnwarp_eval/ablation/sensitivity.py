@@ -24,7 +24,8 @@ from attnwarp_eval.errors import InputError
 if TYPE_CHECKING:
     from attnwarp_eval.ablation.world import World
     from attnwarp_eval.cost import Meter
-    from attnwarp_eval.scene import AnswerSpec, EditSpec, Scene
+    from attnwarp_eval.scene import Scene
+    from attnwarp_eval.scene_spec import AnswerSpec, EditSpec
     from attnwarp_eval.truth import TwoView
 
 ANSWERS = 3
@@ -100,7 +101,7 @@ def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
         scene: with its edits.
         names: of the edits; all of the scene's if empty. Names that the scene lacks are passed over.
     """
-    from attnwarp_eval.edits import touched
+    from attnwarp_eval.edited import touched
 
     found = []
     for place, edit in enumerate(scene.edits):
@@ -134,7 +135,8 @@ def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
 
 def _objects(scene: Scene, edit: EditSpec) -> set[int]:
     """Objects whose surfaces an edit (its first answer) changes; none for an edit of the light."""
-    from attnwarp_eval.edits import pick, touched
+    from attnwarp_eval.edited import touched
+    from attnwarp_eval.edits import pick
 
     return set() if (pick(edit) or edit).lights is not None else set(touched(scene, edit.name))
 
@@ -329,7 +331,7 @@ def measure(
 
 def _shots(at: World, task: Task, spec: Mapping[str, Any]) -> dict[str, Shot]:
     """The source and every target by name."""
-    from attnwarp_eval.edits import edit_mask
+    from attnwarp_eval.edited import edit_mask
     from attnwarp_eval.truth import appearance
 
     names = [at.source.name, *spec["views"]]

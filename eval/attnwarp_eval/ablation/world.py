@@ -14,7 +14,8 @@ from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.features import SolidField
-from attnwarp_eval.scene import Scene, load_scene
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.truth import Geometry, TwoView, appearance, edge_band, two_view
 
 if TYPE_CHECKING:

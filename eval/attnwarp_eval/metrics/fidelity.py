@@ -31,7 +31,7 @@ def fidelity(
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
         truth_srgb: the same view of the scene as it should be after the edit
             (:meth:`attnwarp_eval.scene.Scene.edited`).
-        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.edits.edit_mask`). All True for an edit of the light,
+        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.edited.edit_mask`). All True for an edit of the light,
             which leaves nothing outside: those figures are NaN.
         original_srgb: the view before the edit; without it nothing is said about preservation.
         distance: a perceptual distance; without it there is none. Inside, the rest of the picture is made equal to the

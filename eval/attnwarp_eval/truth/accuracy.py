@@ -140,7 +140,7 @@ def pictures(
         reference: how many pictures of how many samples the converged one is the mean of. Its own noise is estimated
             from their spread and taken out of the errors.
     """
-    from attnwarp_eval.effects import everything_on, plan
+    from attnwarp_eval.plan import everything_on, plan
     from attnwarp_eval.truth.llvm import LLVM, SCALAR, variant
     from attnwarp_eval.truth.mitsuba import render_plan, use
 
@@ -249,7 +249,7 @@ def depth(
         rays: pixels held against every triangle in float64.
         rounds: of the timing.
     """
-    from attnwarp_eval.truth._open3d import open3d
+    from attnwarp_eval._open3d import open3d
     from attnwarp_eval.truth.raycast import Geometry
 
     class Unrefined(Geometry):
@@ -430,7 +430,7 @@ def measure(
         progress: told what is at work.
     """
     from attnwarp_eval.errors import InputError
-    from attnwarp_eval.scene import load_scene
+    from attnwarp_eval.scene_file import load_scene
     from attnwarp_eval.truth.mitsuba import forget
 
     panels = []

@@ -1,4 +1,4 @@
-"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.effects` plans them.
+"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.plan` plans them.
 
 Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else ``scalar_rgb``, which works
 everywhere: see :mod:`attnwarp_eval.truth.llvm`.
@@ -14,14 +14,13 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
-from attnwarp_eval.effects import Pass, Plan, beam, plan, sampler, smooth_objects
 from attnwarp_eval.optics import (
     GlassMaterial,
     InteriorSpec,
@@ -31,13 +30,14 @@ from attnwarp_eval.optics import (
     PointSpec,
     SpotSpec,
 )
+from attnwarp_eval.plan import Pass, Plan, beam, plan, sampler, smooth_objects
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_spec import ObjectSpec, SkySpec, SunSpec
 from attnwarp_eval.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.textures import albedo, linear_rgb
 from attnwarp_eval.truth.llvm import SCALAR, variant
+from attnwarp_eval.truth.raycast import Geometry
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
-
-if TYPE_CHECKING:
-    from attnwarp_eval.scene import ObjectSpec, Scene, SkySpec, SunSpec
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -184,8 +184,6 @@ def comparable(scene: Scene) -> str:
     Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that depends on how an
     integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on the scene alone.
     """
-    from attnwarp_eval.truth.raycast import Geometry
-
     if variant() == SCALAR:
         return SCALAR
     tied, _ = Geometry(scene).ties(scene.source)
@@ -589,8 +587,6 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
 
 
 def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> dict[str, Any]:
-    from attnwarp_eval.scene import SunSpec
-
     mi = _mitsuba()
     if isinstance(light, SunSpec):
         color = (light.irradiance * np.array(linear_rgb(light.color))).tolist()

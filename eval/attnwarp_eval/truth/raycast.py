@@ -10,18 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval._open3d import open3d
+from attnwarp_eval.scene import Scene
 from attnwarp_eval.shapes import Box, Mesh, Rectangle, Shape, Sphere
-from attnwarp_eval.truth._open3d import open3d
 from attnwarp_eval.truth.analytic import nearest_hit
-
-if TYPE_CHECKING:
-    from attnwarp_eval.scene import Scene
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -12,18 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.optics import PointSpec, SpotSpec
+from attnwarp_eval.scene import Scene
+from attnwarp_eval.scene_spec import SkySpec, SunSpec
 from attnwarp_eval.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.textures import albedo, linear_rgb
 from attnwarp_eval.truth.raycast import Geometry
-
-if TYPE_CHECKING:
-    from attnwarp_eval.scene import Scene, SkySpec, SunSpec
 
 Array = npt.NDArray[np.float64]
 
@@ -78,8 +76,6 @@ def irradiance(
             1 % in the median and 9 % at the 95th percentile (points in deep shade), without bias. As many points are
             taken on each lamp.
     """
-    from attnwarp_eval.scene import SkySpec, SunSpec
-
     total = np.zeros((len(points), 3))
     for light in scene.spec.lights:
         if isinstance(light, SunSpec):

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 
 STAGES = ("meshes", "geometry", "first picture", "other pictures")
 

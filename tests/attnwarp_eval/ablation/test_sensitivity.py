@@ -15,7 +15,7 @@ from attnwarp_eval.ablation.sensitivity import CONDITIONS, RIGHT, Shot, opposite
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.encoders import EncoderInfo
 from attnwarp_eval.errors import InputError
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.truth import appearance
 
 SCENE = {

@@ -5,7 +5,7 @@ import yaml
 
 from attnwarp_eval.ablation import StudyError, load_study, sensitivity
 from attnwarp_eval.ablation.study import shipped_studies
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 
 SMALL = {
     "name": "small",

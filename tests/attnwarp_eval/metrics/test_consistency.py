@@ -12,7 +12,7 @@ from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.features import SolidField
 from attnwarp_eval.metric import metric
-from attnwarp_eval.scene import load_scene
+from attnwarp_eval.scene_file import load_scene
 from attnwarp_eval.shapes import Rectangle
 from attnwarp_eval.truth import Geometry, appearance, two_view
 
