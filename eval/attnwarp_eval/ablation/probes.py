@@ -21,8 +21,8 @@ from attnwarp.visibility import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, rend
 from attnwarp.warp import TAP_SPREAD
 from attnwarp_eval import checks, fitting
 from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval.ablation.parts import Splats
 from attnwarp_eval.ablation.store import write_atomic
-from attnwarp_eval.ablation.study import Splats
 from attnwarp_eval.ablation.world import World, splats, world
 from attnwarp_eval.content import digest
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from attnwarp_eval.ablation.cell import Cell
+from attnwarp_eval.ablation.parts import Ablation, Fits, Front, Part, Pictures, Splats, Variant, Yaw
 from attnwarp_eval.encoders import Kind
 from attnwarp_eval.errors import InputError
 
 if TYPE_CHECKING:
     from attnwarp.fit import FitSettings
-    from attnwarp.settings import WarpSettings
     from attnwarp_eval.scene import Scene
 
 PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1, "timing": 1, "sensitivity": 1}
@@ -32,90 +32,7 @@ class StudyError(InputError):
     """A study that cannot be run; the message names the file, what came and what to do."""
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Splats(_Model):
-    """Gaussians sampled on the scene's surfaces."""
-
-    kind: Literal["2d", "3d"] = "2d"
-    count: Annotated[int, Field(ge=1, le=5_000_000)] = 40_000
-    position_noise: Annotated[float, Field(ge=0)] = 0.0
-    normal_noise: Annotated[float, Field(ge=0, le=90)] = 0.0
-
-    @field_validator("kind", mode="before")
-    @classmethod
-    def _as_text(cls, value: Any) -> Any:
-        return value.lower() if isinstance(value, str) else value
-
-
-class Fits(_Model):
-    """Splats fitted to true pictures from all around the scene; the ``fit`` probe measures them on views held out."""
-
-    views: Annotated[int, Field(ge=9, le=10_000)] = 64
-    points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
-    noise: Annotated[float, Field(ge=0)] = 0.5
-    settings: dict[str, Any] = Field(default_factory=dict, description="fields of attnwarp.fit.FitSettings")
-
-
-class Variant(_Model):
-    """One row of a table: where depth comes from, and how the warp is made.
-
-    ``fit`` changes fields of the study's fit settings; only the ``fit`` probe reads it.
-    """
-
-    preset: str = "corrected"
-    set: dict[str, Any] = Field(default_factory=dict)
-    geometry: Literal["splats", "truth"] = "splats"
-    splats: dict[str, Any] = Field(default_factory=dict)
-    fit: dict[str, Any] = Field(default_factory=dict)
-
-    def settings(self) -> WarpSettings:
-        """The preset with this variant's own fields."""
-        from attnwarp import _check
-        from attnwarp.settings import PRESETS, WarpSettings
-
-        _check.one_of(self.preset, list(PRESETS), "preset")
-        return WarpSettings.from_dict({**PRESETS[self.preset].to_dict(), **self.set})
-
-
-class Ablation(_Model):
-    """A table of the report: variants against a baseline, paired on scene and view."""
-
-    title: str
-    probe: Literal["depth", "warp", "fit"] = "warp"
-    baseline: str
-    variants: list[str]
-    note: str = ""
-
-
-class Front(_Model):
-    """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants.
-
-    Seconds come from the ``timing`` probe where it has all of them, taken in turn; else from the cells themselves.
-    """
-
-    title: str
-    probe: Literal["depth", "warp", "fit"] = "warp"
-    metric: str
-    variants: list[str]
-
-
-class Yaw(_Model):
-    """The variants whose masks the report shows by yaw."""
-
-    variants: list[str] = Field(default_factory=list)
-
-
-class Pictures(_Model):
-    """Which variants and views are kept as pictures."""
-
-    variants: list[str] = Field(default_factory=list)
-    views: list[str] = Field(default_factory=list)
-
-
-class Study(_Model):
+class Study(Part):
     """A study: scenes x variants x seeds x probes, and what the report shows of them."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -124,7 +41,7 @@ class Study(_Model):
     size: Annotated[int, Field(ge=16, le=4096)] = 512
     scenes: Annotated[list[str], Field(min_length=1)]
     views: list[str] = Field(default_factory=list, description="target views by name; all of them if empty")
-    seeds: Annotated[list[int], Field(min_length=1)] = [0]
+    seeds: Annotated[list[int], Field(min_length=1)] = Field(default_factory=lambda: [0])
     spp: Annotated[int, Field(ge=1)] = 16
     feature_sizes: list[int] = Field(default_factory=list, description="image size, 1/8 and 1/16 of it if left out")
     feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8

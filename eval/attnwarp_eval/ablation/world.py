@@ -20,7 +20,7 @@ from attnwarp_eval.truth import Geometry, TwoView, appearance, edge_band, two_vi
 
 if TYPE_CHECKING:
     from attnwarp import Gaussians
-    from attnwarp_eval.ablation.study import Splats
+    from attnwarp_eval.ablation.parts import Splats
 
 
 SPLATS_PROTOCOL = 1

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from attnwarp_eval.ablation.parts import Splats, Variant
 from attnwarp_eval.ablation.store import Store, StoreError
-from attnwarp_eval.ablation.study import Splats, Variant
 from attnwarp_eval.checks import metric as metric_of
 from attnwarp_eval.checks.occlusion import COUNTS
 from attnwarp_eval.content import canonical_json
