@@ -17,7 +17,7 @@ from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers,
 
 from attnwarp_eval.encoders.nets import ClipSmall
 from training.common import Run, channels_last, crops, groups, rate
-from training.naming import Heads, pictures_of, warm_start
+from training.naming import Heads, pictures_of, scrambled, warm_start
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
 SEED = 1
@@ -28,6 +28,9 @@ SCALE = (0.6, 0.95)
 """Shares of a picture's side that a crop of 96 px shows: things are as large in it, on average, as in the whole picture at the
 encoder's size, of which the crop leaves out background that costs time."""
 PEAK = 1e-3
+SCRAMBLED = 0.25
+"""Share of pictures whose colours are scrambled: they have no part in the contrast, and their thing alone is asked by name. Without them
+things in colours that training never showed them in were named in 88.8 %, and 95.7 % over all."""
 VISION = 0.4
 """Share of the learning rate for the image tower, which has learned much already."""
 VOCABULARY = 1024
@@ -237,16 +240,20 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             rows = flat[step * BATCH : (step + 1) * BATCH]
             images = crops(np.stack([sets[k].pictures.images[r] for k, r in rows]), CROP, rng, scale=SCALE)
             shown = np.stack([sets[k].pictures.attributes[r] for k, r in rows])
-            said = [told(tuple(int(v) for v in row), rng) for row in shown]
+            which = rng.uniform(size=BATCH) < SCRAMBLED
+            images = scrambled(images, which, rng)
+            shown[which, 1:] = -1
+            kept = np.flatnonzero(~which)
+            said = [told(tuple(int(v) for v in row), rng) for row in shown[kept]]
             false = [wrong(s, rng) for s in said]
             texts = [_scattered(sentence(s, rng, fillers=True), rng) for s in [*said, *false]]
-            truth = torch.from_numpy(true_of(np.array([*said, *false]), shown))
+            truth = torch.from_numpy(true_of(np.array([*said, *false]), shown[kept]))
             with torch.autocast("cpu", torch.bfloat16):
                 features = model.pool.features(model.vision(images)[-1])
                 embedded = model.pool.project(features)
                 guessed = heads(features, shown)
             embedded = F.normalize(embedded.float(), dim=-1)
-            apart = contrast(model, embedded, tokens(tokenizer, texts), truth)
+            apart = contrast(model, embedded[torch.from_numpy(kept)], tokens(tokenizer, texts), truth)
             named = naming_loss(model, embedded, shown, tokenizer, rng)
             loss = apart + named + guessed
             optimizer.zero_grad(set_to_none=True)
