@@ -43,7 +43,9 @@ def test_outputs_are_made_from_composited_features(kind, make_camera, make_splat
         assert torch.equal(a.isnan(), b.isnan()), name
         # Features pass through float32, as on the GPU.
         assert float((a - b).abs().nan_to_num().max()) < 1e-5, name
+    # What the docstrings of the door say is not there.
     assert bool(made.median_depth.isnan().all()) and bool(made.distortion_l1.isnan().all())
+    assert made.counters == {"splats": 27} and not made.weight.requires_grad
 
 
 def test_weights_need_no_gradients_from_the_caller(make_camera, make_splats) -> None:
