@@ -51,8 +51,19 @@ def clear_errors() -> Iterator[None]:
     """Turn errors about a person's input into one clear line and exit code 2."""
     try:
         yield
-    except (ValueError, FileNotFoundError, NotADirectoryError, PermissionError, RuntimeError) as error:
+    except (ValueError, RuntimeError) as error:
         raise fail(str(error)) from None
+    except OSError as error:
+        if error.strerror is None:  # the library's own, which says what to do
+            raise fail(str(error)) from None
+        where = f"{error.filename}: " if error.filename else ""
+        raise fail(f"{where}{error.strerror}; check the path, the space on its disk and its permissions") from None
+
+
+def _check_out(out: Path) -> None:
+    """A mistaken --out is answered before the work, not after it; the folder is made once there is something for it."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out}: --out is a file, expected a folder (made if need be); choose another name")
 
 
 def _use_threads(threads: int | None) -> None:
@@ -92,6 +103,7 @@ def fit(
     with clear_errors():
         # What needs nothing heavy is read first: a typing error is answered at once.
         given = _assignments(change or [])
+        _check_out(out)
         _use_threads(threads)
         result = _fit(data, out, kind, iterations, max_seconds, max_size, max_splats, points, hold_out, seed,
                       given, checkpoint_seconds, restart)  # fmt: skip
@@ -242,6 +254,7 @@ def render(
         import numpy as np
 
         behind = _color(background)
+        _check_out(out)
 
         from attnwarp.io import read_dataset, read_ply
         from attnwarp.io._file import write_atomically
