@@ -176,6 +176,12 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
     ("arguments", "message"),
     [
         (["fit", "nowhere", "--out", "{out}"], "nowhere: no such file or folder"),
+        (["fit", "bear", "--out", "{out}"], "for a scene: attnwarp-eval scenes export bear DIR"),
+        (
+            ["fit", "scenes/bear.yaml", "--out", "{out}"],
+            "for a scene: attnwarp-eval scenes export scenes/bear.yaml DIR",
+        ),
+        (["fit", "{data}/none", "--out", "{out}"], "none: no such file or folder\n"),  # no name of a scene: no hint
         (["fit", "{data}", "--out", "{out}", "--set", "lr_mean=1"], "did you mean 'lr_means'"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim"], "expected NAME=VALUE"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim=2"], "ssim: got 2"),
@@ -229,6 +235,25 @@ def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith(f"attnwarp: {tmp_path / 'out'}") and "File too large; check the path, the space" in last
     assert not list((tmp_path / "out").iterdir())  # nor is half a file left
+
+
+def test_render_needs_no_points(data, tmp_path):
+    write_ply(tmp_path / "m.ply", one_splat())
+    colmap = tmp_path / "colmap"
+    colmap.mkdir()
+    (colmap / "cameras.txt").write_text("1 PINHOLE 8 6 10 10 4 3\n")
+    (colmap / "images.txt").write_text("1 1 0 0 0 0 0 3 1 front.png\n\n")
+    for cloud in (b"", b"damaged"):
+        (colmap / "points3D.txt").write_bytes(cloud)
+        done = in_process("render", tmp_path / "m.ply", colmap, "--out", tmp_path / "out")
+        assert done.exit_code == 0, done.stderr
+        assert cv2.imread(str(tmp_path / "out" / "front.png")).shape == (6, 8, 3)
+    # A transforms.json whose points were not copied along.
+    alone = tmp_path / "transforms.json"
+    alone.write_bytes((data / "transforms.json").read_bytes())
+    assert "ply_file_path" in alone.read_text()
+    done = in_process("render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16")
+    assert done.exit_code == 0, done.stderr
 
 
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
