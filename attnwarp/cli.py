@@ -16,6 +16,7 @@ import typer
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
+    from attnwarp.io import Dataset
 
 USAGE = 2
 """Exit code of everything that a person can mend: arguments, files, folders."""
@@ -51,8 +52,19 @@ def clear_errors() -> Iterator[None]:
     """Turn errors about a person's input into one clear line and exit code 2."""
     try:
         yield
-    except (ValueError, FileNotFoundError, NotADirectoryError, PermissionError, RuntimeError) as error:
+    except (ValueError, RuntimeError) as error:
         raise fail(str(error)) from None
+    except OSError as error:
+        if error.strerror is None:  # the library's own, which says what to do
+            raise fail(str(error)) from None
+        where = f"{error.filename}: " if error.filename else ""
+        raise fail(f"{where}{error.strerror}; check the path, the space on its disk and its permissions") from None
+
+
+def _check_out(out: Path) -> None:
+    """A mistaken --out is answered before the work, not after it; the folder is made once there is something for it."""
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out}: --out is a file, expected a folder (made if need be); choose another name")
 
 
 def _use_threads(threads: int | None) -> None:
@@ -92,6 +104,7 @@ def fit(
     with clear_errors():
         # What needs nothing heavy is read first: a typing error is answered at once.
         given = _assignments(change or [])
+        _check_out(out)
         _use_threads(threads)
         result = _fit(data, out, kind, iterations, max_seconds, max_size, max_splats, points, hold_out, seed,
                       given, checkpoint_seconds, restart)  # fmt: skip
@@ -132,10 +145,9 @@ def _fit(
     from attnwarp import fit as fitting
     from attnwarp.fit.loop import CHECKPOINT
     from attnwarp.fit.progress import shown
-    from attnwarp.io import read_dataset
 
     settings = fitting.FitSettings.from_dict(given)
-    dataset = read_dataset(data)
+    dataset = _read_views(data)
     train, test = fitting.hold_out(dataset, every)
     views = fitting.load_views(train, max_size=max_size)
     held_out = fitting.load_views(test, max_size=max_size) if test is not None else None
@@ -155,6 +167,20 @@ def _fit(
         )  # fmt: skip
     _write_results(out, result, held_out)
     return result
+
+
+def _read_views(path: Path, **options: Any) -> Dataset:
+    """The data set at ``path``; whoever gives a scene in its place is told how a scene becomes one."""
+    from attnwarp.io import read_dataset
+
+    export = f"attnwarp-eval scenes export {path} DIR"
+    if path.suffix in (".yaml", ".yml") and not path.is_dir():
+        raise ValueError(
+            f"{path}: expected transforms.json, its folder or a COLMAP folder; for a scene: {export}, then give DIR"
+        )
+    if path.name == str(path) and not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder; for a scene: {export}, then give DIR")
+    return read_dataset(path, **options)
 
 
 def _assignments(changes: list[str]) -> dict[str, Any]:
@@ -242,14 +268,15 @@ def render(
         import numpy as np
 
         behind = _color(background)
+        _check_out(out)
 
-        from attnwarp.io import read_dataset, read_ply
+        from attnwarp.io import read_ply
         from attnwarp.io._file import write_atomically
         from attnwarp.render import render as draw
 
         _use_threads(threads)
         splats = read_ply(model)
-        views = read_dataset(cameras, missing_images="none").cameras
+        views = _read_views(cameras, missing_images="none", points=False).cameras
         out.mkdir(parents=True, exist_ok=True)
         for camera, name in zip(views, _file_names(views), strict=True):
             if size is not None:

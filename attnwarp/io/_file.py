@@ -62,6 +62,9 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[BinaryIO], o
             stream.flush()
             os.fsync(stream.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
+        # A full disk is found by write(), which does not know what it wrote to.
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+            error.filename = str(path)
         temporary.unlink(missing_ok=True)
         raise

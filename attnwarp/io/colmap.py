@@ -57,6 +57,7 @@ def read_colmap(
     images: str | os.PathLike[str] | None = None,
     missing_images: Missing = "error",
     resize_cameras: bool = False,
+    points: bool = True,
 ) -> Dataset:
     """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as COLMAP does.
 
@@ -69,6 +70,7 @@ def read_colmap(
         missing_images: "error", or "none" to get None for the path of an image that is not there.
         resize_cameras: when an image has another size than its camera (``images_4`` for instance), resize the camera
             instead of refusing.
+        points: False to leave the points out; their file is then not read, and may be missing or damaged.
 
     Raises:
         FileNotFoundError: no model there.
@@ -102,10 +104,13 @@ def read_colmap(
         missing_images=missing_images,
         resize_cameras=resize_cameras,
     )
-    points = colors = None
-    if (model / f"points3D{suffix}").is_file():
-        points, colors = (_binary_points if binary else _text_points)(existing_file(model / f"points3D{suffix}"))
-    return Dataset(cameras, paths, points, colors)
+    cloud = model / f"points3D{suffix}"
+    if not points or not cloud.is_file():
+        return Dataset(cameras, paths)
+    if binary:
+        return Dataset(cameras, paths, *_binary_points(existing_file(cloud)))
+    # Empty is what COLMAP's own guide asks for where poses are known and points are not: no points, not a damaged file.
+    return Dataset(cameras, paths, *_text_points(cloud))
 
 
 # ----------------------------------------------------------------------------------------------------------------

@@ -22,6 +22,7 @@ def read_dataset(
     images: str | os.PathLike[str] | None = None,
     missing_images: Missing = "error",
     resize_cameras: bool = False,
+    points: bool = True,
 ) -> Dataset:
     """Read a transforms.json or a COLMAP model.
 
@@ -36,6 +37,7 @@ def read_dataset(
         images: folder of the images of a COLMAP model; see :func:`read_colmap`.
         missing_images: "error", or "none" to get None for the path of an image that is not there.
         resize_cameras: when an image has another size than its camera, resize the camera instead of refusing.
+        points: False to leave the points out; their file is then not read, and may be missing or damaged.
 
     Raises:
         FileNotFoundError: nothing there that could be read.
@@ -61,7 +63,9 @@ def read_dataset(
             )
         format = "transforms" if transforms else "colmap"
     if format == "colmap":
-        return read_colmap(path, images=images, missing_images=missing_images, resize_cameras=resize_cameras)
+        return read_colmap(
+            path, images=images, missing_images=missing_images, resize_cameras=resize_cameras, points=points
+        )
     if images is not None:
         raise ValueError("images: only COLMAP models take a folder of images; a transforms.json names its own")
-    return read_transforms(path, missing_images=missing_images, resize_cameras=resize_cameras)
+    return read_transforms(path, missing_images=missing_images, resize_cameras=resize_cameras, points=points)

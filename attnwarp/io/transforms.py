@@ -34,7 +34,11 @@ OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
 
 
 def read_transforms(
-    path: str | os.PathLike[str], *, missing_images: Missing = "error", resize_cameras: bool = False
+    path: str | os.PathLike[str],
+    *,
+    missing_images: Missing = "error",
+    resize_cameras: bool = False,
+    points: bool = True,
 ) -> Dataset:
     """Read a transforms.json.
 
@@ -48,6 +52,7 @@ def read_transforms(
             are read together and told apart by ``Dataset.splits``.
         missing_images: "error", or "none" to get None for the path of an image that is not there.
         resize_cameras: when an image has another size than its camera, resize the camera instead of refusing.
+        points: False to leave the points out; their file is then not read, and may be missing or damaged.
 
     Raises:
         FileNotFoundError: no such file.
@@ -56,11 +61,13 @@ def read_transforms(
     """
     path = Path(path)
     if not path.is_dir():
-        return _read_file(path, _split_of(path), missing_images, resize_cameras)
+        return _read_file(path, _split_of(path), missing_images, resize_cameras, points)
     if (path / "transforms.json").exists():
-        return _read_file(path / "transforms.json", None, missing_images, resize_cameras)
+        return _read_file(path / "transforms.json", None, missing_images, resize_cameras, points)
     files = [path / f"transforms_{split}.json" for split in SPLITS]
-    parts = [_read_file(file, _split_of(file), missing_images, resize_cameras) for file in files if file.exists()]
+    parts = [
+        _read_file(file, _split_of(file), missing_images, resize_cameras, points) for file in files if file.exists()
+    ]
     if not parts:
         raise FileNotFoundError(f"{path}: neither transforms.json nor transforms_train.json is there")
     with_points = next((part for part in parts if part.points is not None), parts[0])
@@ -131,7 +138,9 @@ def _split_of(path: Path) -> str | None:
     return next((split for split in SPLITS if path.name == f"transforms_{split}.json"), None)
 
 
-def _read_file(path: Path, split: str | None, missing_images: Missing, resize_cameras: bool) -> Dataset:
+def _read_file(
+    path: Path, split: str | None, missing_images: Missing, resize_cameras: bool, with_points: bool
+) -> Dataset:
     path = existing_file(path)
     try:
         data = json.loads(path.read_bytes())
@@ -154,7 +163,7 @@ def _read_file(path: Path, split: str | None, missing_images: Missing, resize_ca
         splits.append(named.get(name, split))
     cameras, found = with_images(path, cameras, paths, missing_images=missing_images, resize_cameras=resize_cameras)
     points = colors = None
-    ply = data.get("ply_file_path")
+    ply = data.get("ply_file_path") if with_points else None
     if ply is not None:
         if not isinstance(ply, str):
             raise FileFormatError(path, f"got {ply!r}, expected a path", field="ply_file_path")

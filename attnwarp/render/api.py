@@ -25,7 +25,9 @@ DEPTHS = {"2d": ("intersection", "center"), "3d": ("center", "peak")}
 class Render:
     """A picture of splats. Every output means the same whatever the kind, the backend and the depth mode.
 
-    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there.
+    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there. Backend "cuda" leaves out
+    what gsplat cannot give: there ``median_depth`` and ``distortion_l1`` are NaN everywhere, ``weight`` carries no gradient, and
+    ``counters`` holds only "splats".
 
     Attributes:
         color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed in.
@@ -33,16 +35,19 @@ class Render:
         depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units; NaN where nothing
             was drawn. The background takes no part in it.
         median_depth: (H, W) depth of the last splat drawn while the transmittance before it is above 1/2; NaN where
-            nothing was drawn. Where alpha stays below 1/2 it is the last splat's.
+            nothing was drawn. Where alpha stays below 1/2 it is the last splat's. NaN everywhere from backend "cuda".
         normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length is at most alpha.
         distortion_l1: (H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper, gsplat), 2 sum_{j<i} w_i w_j
-            (z_i - z_j) in compositing order: the two agree where depth grows along that order. Scene units.
+            (z_i - z_j) in compositing order: the two agree where depth grows along that order. Scene units. NaN everywhere
+            from backend "cuda".
         distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 - near / z) and the
             planes ``ndc`` (the original 2DGS code). No unit.
-        weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is not seen.
+        weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is not seen. From backend
+            "cuda" it carries no gradient.
         counters: how much work it was: "splats" (in), "visible" (can show in the picture), "tile_pairs" (splats over
             8 x 8 tiles), "pairs" (splats over pixels whose intersection was computed), "composited" (those of them in a
-            4 x 4 square that the splat draws to), "contributing" (those drawn), "tiles".
+            4 x 4 square that the splat draws to), "contributing" (those drawn), "tiles". These are the "cpu" backend's;
+            "reference" has "splats", "pairs" and "contributing", "cuda" only "splats".
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
     """
@@ -97,7 +102,7 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
     length = torch.where(around, (across * across).sum(-1), 1.0)
     around = around & (length > 0)
     unit = across / torch.where(around, length, 1.0).sqrt()[..., None]
-    rotation = torch.as_tensor(camera.world_to_camera) if pose is None else pose
+    rotation = torch.tensor(camera.world_to_camera) if pose is None else pose
     world = unit @ rotation[:3, :3].to(depth.dtype)
     inner = torch.where(around[..., None], world, torch.nan)
     return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1), value=torch.nan)
@@ -120,13 +125,15 @@ def render(
     """Render Gaussian splats: colour, coverage, depth, normals, distortion; differentiable.
 
     Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or ``features``), ``pose`` and
-    ``background``, from every output (of ``Render.counters`` and the mask ``valid`` there are none).
+    ``background``, from every output (of ``Render.counters`` and the mask ``valid`` there are none). Backend "cuda" is the
+    exception: none from ``weight``, and ``median_depth`` and ``distortion_l1`` are NaN, so a loss must not use them.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
         camera: the view; H x W pixels.
         backend: "cpu" (numba, float32 with float64 set-up), "reference" (brute force in float64, for small scenes),
-            "cuda" (gsplat on a GPU; what it does differently is refused or left NaN, see :mod:`attnwarp.render.cuda`).
+            "cuda" (gsplat on a GPU: no "intersection" or "peak" depth, no skew, ``median_depth`` and ``distortion_l1`` NaN,
+            ``weight`` without a gradient, ``counters`` only "splats"; see :mod:`attnwarp.render.cuda`).
             "auto" is "cuda" where the splats lie on a GPU and "cpu" elsewhere.
         depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or "center". "3d":
             "center" (default) or "peak", where the Gaussian is largest along the ray.
@@ -143,7 +150,8 @@ def render(
         A :class:`Render`, float32 from "cpu" and "cuda", float64 from "reference".
 
     Raises:
-        ValueError: an argument out of range or of the wrong shape; the message says which and what was expected.
+        ValueError: an argument out of range or of the wrong shape, or something that backend "cuda" computes differently; the
+            message says which and what was expected.
         RuntimeError: backend "cuda" without a GPU or without gsplat.
 
     Example:

@@ -9,6 +9,7 @@ differently:
   up to 1.6e-2), its screen filter sits in the middle of that box, and only centres are tested against ``near``, so that
   a splat that crosses the camera plane is drawn wrong. These cannot be emulated from outside: kind "2d" is refused unless
   ``ATTNWARP_GSPLAT_2D=1`` is set in the environment, which says that they are accepted.
+- Of the camera's K only fx, fy, cx and cy are read: a camera with skew (K[0, 1] not 0) is refused.
 - alpha is clamped at 0.999 or 0.99 depending on the version, and the splat that brings the transmittance below 1e-4 is
   left out. Both differ by less than 1 % of a pixel, behind opaque splats.
 - There is no median depth and no distortion_l1 of a feature: both are NaN everywhere.
@@ -46,6 +47,12 @@ def refuse(inputs: Inputs) -> None:
         raise ValueError(
             f"depth: got {inputs.depth!r}, but gsplat knows the depth of a splat's centre only; "
             "pass depth='center', or use backend 'cpu'"
+        )
+    skew = float(inputs.K[0, 1])
+    if skew != 0:
+        raise ValueError(
+            f"camera: K[0, 1], its skew, is {skew:.6g}, but gsplat reads only fx, fy, cx and cy of K; use backend 'cpu', or "
+            "a camera with K[0, 1] = 0 if the skew is rounding"
         )
     if inputs.kind == "2d" and os.environ.get(ACCEPT_2D) != "1":
         raise ValueError(

@@ -66,6 +66,13 @@ def data(tmp_path_factory):
     return folder
 
 
+def one_splat():
+    return Gaussians(
+        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.2), torch.ones(1),
+        torch.zeros(1, 1, 3),
+    )  # fmt: skip
+
+
 def test_help_answers_at_once():
     spent = []
     for _ in range(3):
@@ -169,6 +176,12 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
     ("arguments", "message"),
     [
         (["fit", "nowhere", "--out", "{out}"], "nowhere: no such file or folder"),
+        (["fit", "bear", "--out", "{out}"], "for a scene: attnwarp-eval scenes export bear DIR"),
+        (
+            ["fit", "scenes/bear.yaml", "--out", "{out}"],
+            "for a scene: attnwarp-eval scenes export scenes/bear.yaml DIR",
+        ),
+        (["fit", "{data}/none", "--out", "{out}"], "none: no such file or folder\n"),  # no name of a scene: no hint
         (["fit", "{data}", "--out", "{out}", "--set", "lr_mean=1"], "did you mean 'lr_means'"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim"], "expected NAME=VALUE"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim=2"], "ssim: got 2"),
@@ -187,12 +200,64 @@ def test_what_cannot_be_used_ends_in_one_clear_line_and_code_2(data, tmp_path, a
     assert "Traceback" not in done.stderr
 
 
-def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
-    splats = Gaussians(
-        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.2), torch.ones(1),
-        torch.zeros(1, 1, 3),
+@pytest.mark.parametrize("command", ["fit", "render"])
+def test_an_out_that_cannot_be_a_folder_ends_in_one_clear_line(data, tmp_path, command):
+    taken = tmp_path / "taken"
+    taken.write_text("not to be lost")
+    write_ply(tmp_path / "m.ply", one_splat())
+    first = [data] if command == "fit" else [tmp_path / "m.ply", data]
+    long = tmp_path / ("n" * 300)
+    for out, message in [
+        (taken, f"{taken}: --out is a file, expected a folder"),
+        (taken / "below", f"{taken / 'below'}: Not a directory; check the path"),
+        (long, f"{long}: File name too long; check the path"),
+    ]:
+        done = in_process(command, *first, "--out", out)
+        assert done.exit_code == 2, (out, done.exception)
+        assert message in done.stderr
+    assert taken.read_text() == "not to be lost"
+
+
+@pytest.mark.parametrize("command", ["fit", "render"])
+def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
+    """No file may grow beyond 100 bytes, which to a writer is what a full disk is."""
+    write_ply(tmp_path / "m.ply", one_splat())
+    arguments = [data, "--iterations", 1] if command == "fit" else [tmp_path / "m.ply", data]
+    # Once without the limit, lest it be numba's cache of compiled kernels that finds the disk full.
+    assert in_process(command, *arguments, "--out", tmp_path / "warm").exit_code == 0
+    done = subprocess.run(
+        [*ATTNWARP, command, *map(str, arguments), "--threads", "1", "--out", str(tmp_path / "out")],
+        capture_output=True, text=True, timeout=120, check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
     )  # fmt: skip
-    write_ply(tmp_path / "m.ply", splats)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"attnwarp: {tmp_path / 'out'}") and "File too large; check the path, the space" in last
+    assert not list((tmp_path / "out").iterdir())  # nor is half a file left
+
+
+def test_render_needs_no_points(data, tmp_path):
+    write_ply(tmp_path / "m.ply", one_splat())
+    colmap = tmp_path / "colmap"
+    colmap.mkdir()
+    (colmap / "cameras.txt").write_text("1 PINHOLE 8 6 10 10 4 3\n")
+    (colmap / "images.txt").write_text("1 1 0 0 0 0 0 3 1 front.png\n\n")
+    for cloud in (b"", b"damaged"):
+        (colmap / "points3D.txt").write_bytes(cloud)
+        done = in_process("render", tmp_path / "m.ply", colmap, "--out", tmp_path / "out")
+        assert done.exit_code == 0, done.stderr
+        assert cv2.imread(str(tmp_path / "out" / "front.png")).shape == (6, 8, 3)
+    # A transforms.json whose points were not copied along.
+    alone = tmp_path / "transforms.json"
+    alone.write_bytes((data / "transforms.json").read_bytes())
+    assert "ply_file_path" in alone.read_text()
+    done = in_process("render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16")
+    assert done.exit_code == 0, done.stderr
+
+
+def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
+    write_ply(tmp_path / "m.ply", one_splat())
     cameras = [
         Camera.look_at([3, 0, z], [0, 0, 0], width=8, height=8, fov_y=40, name=f"{side}/a.png")
         for z, side in ((0, "left"), (1, "right"))

@@ -11,6 +11,7 @@ from attnwarp import Gaussians
 from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import FileFormatError, read_ply
+from attnwarp.render import render
 
 from .conftest import blobs, pictures, ring
 
@@ -51,6 +52,25 @@ def test_a_fit_brings_held_out_views_closer_to_their_pictures(scene, kind):
     assert (first.iteration, last.iteration) == (0, 200)
     # What 200 steps add is far above what a seed would change.
     assert last.psnr > first.psnr + 5
+
+
+def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
+    asked = []
+
+    def watched(*args, sh_degree, **options):
+        asked.append(sh_degree)
+        return render(*args, sh_degree=sh_degree, **options)
+
+    monkeypatch.setattr("attnwarp.fit.loop.render", watched)
+    k = 3
+    start, settings = begin(scene, iterations=4 * k, sh_every=k, evaluate_every=1000, **{**FAST, "sh_degree": 2})
+    result = fit(start, scene[0], settings)
+    # Iteration i is drawn with degree i // k, up to the settings' own: 0 at 0, 1 from k, 2 from 2k, and 2 it stays.
+    assert asked == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
+    # What was not drawn had no gradient and stays as it began; what was drawn moved.
+    only_first = fit(start, scene[0], dataclasses.replace(settings, iterations=k)).gaussians.sh
+    assert bool((only_first[:, 1:] == 0).all()) and not torch.equal(only_first[:, :1], start.sh[:, :1])
+    assert bool((result.gaussians.sh[:, 1:4] != 0).any()) and bool((result.gaussians.sh[:, 4:] != 0).any())
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])

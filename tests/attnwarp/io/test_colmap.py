@@ -189,6 +189,25 @@ def test_a_damaged_line_is_named(tmp_path, name, line, parts):
         assert part in str(caught.value), str(caught.value)
 
 
+def test_an_empty_text_file_of_points_holds_none_and_an_empty_binary_one_is_damaged(tmp_path):
+    (write_text(tmp_path / "text") / "points3D.txt").write_bytes(b"")
+    data = read_dataset(tmp_path / "text", missing_images="none")
+    assert data.points.shape == (0, 3) and data.colors.shape == (0, 3)
+    (write_binary(tmp_path / "binary") / "points3D.bin").write_bytes(b"")
+    with pytest.raises(FileFormatError, match=r"points3D\.bin: the file is empty"):
+        read_dataset(tmp_path / "binary", missing_images="none")
+
+
+@pytest.mark.parametrize("write", [write_binary, write_text])
+def test_points_that_are_not_wanted_are_not_read(tmp_path, write):
+    model = write(tmp_path)
+    (next(model.glob("points3D.*"))).write_bytes(b"no points")
+    with pytest.raises(FileFormatError, match="points3D"):
+        read_dataset(model, missing_images="none")
+    data = read_dataset(model, missing_images="none", points=False)
+    assert len(data) == 3 and data.points is None and data.colors is None
+
+
 def test_missing_images_are_listed(tmp_path):
     write_binary(tmp_path / "sparse/0")
     with pytest.raises(FileFormatError, match=r"3 of 3 images are missing: .*a\.png.*c\.png; put them there"):

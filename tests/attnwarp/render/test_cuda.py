@@ -7,12 +7,20 @@ import dataclasses
 import pytest
 import torch
 
+from attnwarp import Camera
 from attnwarp.render import api, constants, cuda, reference, render
 
 
 def prepared(splats, camera, depth: str = "center") -> reference.Inputs:
     ndc = (constants.NDC_NEAR, constants.NDC_FAR)
     return api._prepare(splats, camera, depth, None, None, None, constants.NEAR, None, None, ndc, on_cpu=False)
+
+
+def square_pixels(camera: Camera) -> Camera:
+    """The camera without its skew, which gsplat does not know."""
+    K = camera.K.copy()
+    K[0, 1] = 0
+    return Camera(K, camera.world_to_camera, camera.width, camera.height)
 
 
 def brute_force(inputs: reference.Inputs, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -35,7 +43,9 @@ def test_outputs_are_made_from_composited_features(kind, make_camera, make_splat
         assert torch.equal(a.isnan(), b.isnan()), name
         # Features pass through float32, as on the GPU.
         assert float((a - b).abs().nan_to_num().max()) < 1e-5, name
+    # What the docstrings of the door say is not there.
     assert bool(made.median_depth.isnan().all()) and bool(made.distortion_l1.isnan().all())
+    assert made.counters == {"splats": 27} and not made.weight.requires_grad
 
 
 def test_weights_need_no_gradients_from_the_caller(make_camera, make_splats) -> None:
@@ -55,7 +65,7 @@ def test_weights_need_no_gradients_from_the_caller(make_camera, make_splats) -> 
 
 
 def test_what_gsplat_computes_differently_is_refused(make_camera, make_splats, monkeypatch) -> None:
-    camera = make_camera(3, 8, 8)
+    camera = square_pixels(make_camera(3, 8, 8))
     flat, solid = make_splats(3, "2d", 5, camera), make_splats(3, "3d", 5, camera)
     monkeypatch.delenv(cuda.ACCEPT_2D, raising=False)
     with pytest.raises(ValueError, match="depth: got 'intersection', but gsplat knows the depth of a splat's centre"):
@@ -69,8 +79,23 @@ def test_what_gsplat_computes_differently_is_refused(make_camera, make_splats, m
     cuda.refuse(prepared(solid, camera))
 
 
+def test_a_camera_with_skew_is_refused(make_camera, make_splats) -> None:
+    skewed = make_camera(3, 8, 8)
+    solid = make_splats(3, "3d", 5, skewed)
+    assert skewed.K[0, 1] != 0
+    # Before it is asked whether there is a GPU: the answer would be the same on one.
+    with pytest.raises(
+        ValueError, match=r"camera: K\[0, 1\], its skew, is [-0-9.]+, but gsplat reads only.*backend 'cpu'"
+    ):
+        render(solid, skewed, backend="cuda", depth="center")
+    cuda.refuse(prepared(solid, square_pixels(skewed)))
+    # What the CPU draws depends on it: to leave it out would be a wrong picture, not a detail.
+    with_skew, without = (render(solid, camera, backend="cpu").color for camera in (skewed, square_pixels(skewed)))
+    assert float((with_skew - without).abs().max()) > 1e-2
+
+
 def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> None:
-    camera = make_camera(3, 8, 8)
+    camera = square_pixels(make_camera(3, 8, 8))
     solid = make_splats(3, "3d", 5, camera)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; use backend 'cpu'"):

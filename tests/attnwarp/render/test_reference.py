@@ -10,14 +10,28 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.render import constants, harmonics, render
+from attnwarp.render.api import normal_from_depth
 
 BACKENDS = ("reference", "cpu")
 OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize(("kind", "mode", "antialiased"), [("2d", "intersection", False), ("3d", "peak", True)])
-def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, make_camera, make_splats) -> None:
+@pytest.mark.parametrize(
+    ("kind", "mode", "antialiased", "channels"),
+    [
+        ("2d", "intersection", False, None),
+        ("2d", "center", False, None),
+        ("3d", "center", False, None),
+        ("3d", "center", True, None),
+        ("3d", "peak", False, None),
+        ("3d", "peak", True, None),
+        ("2d", "intersection", False, 4),
+        ("3d", "center", True, 4),
+    ],
+)
+def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, channels, make_camera, make_splats) -> None:
+    """``channels``: of features in place of the harmonics."""
     camera = make_camera(8, 9, 7)
     # Without ties (4, 5, 7), whose order jumps, and without the splat edge-on to 1e-9 (9), whose normal does.
     start = make_splats(8, kind, 16, camera, degree=2)
@@ -29,13 +43,17 @@ def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, make_c
     leaves[3] = leaves[3].clamp(0.01, 0.95)
     leaves += [torch.tensor(camera.world_to_camera), torch.tensor([0.2, 0.5, 0.8], dtype=torch.float64)]
     generator = torch.Generator().manual_seed(0)
+    if channels is not None:
+        for k, shape in ((4, (len(start), channels)), (6, (channels,))):
+            leaves[k] = torch.rand(shape, generator=generator, dtype=torch.float64)
     weights: dict[str, torch.Tensor] = {}
 
     def loss(values: list[torch.Tensor]) -> torch.Tensor:
         view = render(
-            Gaussians(kind, *values[:5]),
+            Gaussians(kind, *values[:4], values[4] if channels is None else start.sh),
             camera,
             backend="reference",
+            features=None if channels is None else values[4],
             depth=mode,
             antialiased=antialiased if kind == "3d" else None,
             pose=values[5],
@@ -57,19 +75,42 @@ def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, make_c
             direction = torch.randn(leaf.shape, generator=generator, dtype=torch.float64)
             if k == 5:
                 direction[3] = 0
-            slopes = []
+            expected = float((gradient * direction).sum())
+            # Central differences: h^2 of truncation and 1e-16 * loss / h of rounding, about 1e-6 of the gradient here.
+            tolerance = 2e-5 * scale * math.sqrt(leaf.numel()) + 1e-6
+            slopes: list[float] = []
             # A threshold crossed within the step would read as a slope of 1/h: the best of three steps counts.
             for h in (1e-6, 1e-7, 3e-8):
+                if slopes and abs(slopes[-1] - expected) <= tolerance:
+                    break
                 ends = []
                 for sign in (1, -1):
                     moved = [t.clone() for t in leaves]
                     moved[k] = leaf + sign * h * direction
                     ends.append(float(loss(moved)))
                 slopes.append((ends[0] - ends[1]) / (2 * h))
-            expected = float((gradient * direction).sum())
-            closest = min(abs(slope - expected) for slope in slopes)
-            # Central differences: h^2 of truncation and 1e-16 * loss / h of rounding, about 1e-6 of the gradient here.
-            assert closest <= 2e-5 * scale * math.sqrt(leaf.numel()) + 1e-6, (k, expected, slopes)
+            assert min(abs(slope - expected) for slope in slopes) <= tolerance, (k, expected, slopes)
+
+
+def test_the_gradient_of_normals_from_depth_is_the_finite_difference(make_camera) -> None:
+    camera = make_camera(8, 7, 6)
+    generator = torch.Generator().manual_seed(0)
+    depth = 3 + 0.2 * torch.rand(6, 7, generator=generator, dtype=torch.float64)
+    depth[2, 4] = torch.nan
+    pose = torch.tensor(camera.world_to_camera)
+    undefined = normal_from_depth(depth, camera).isnan()
+    # The hole takes its neighbours along; the rest of the inside is defined, or nothing was tested.
+    assert int((~undefined[..., 0]).sum()) == 4 * 5 - 5
+
+    def normals(depth: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        return normal_from_depth(depth, camera, pose)[~undefined]
+
+    depth.requires_grad_()
+    pose.requires_grad_()
+    # Steps of 1e-6 in depths of 3: h^2 of truncation, 1e-16 / h of rounding; the NaN stays one and must have gradient 0.
+    assert torch.autograd.gradcheck(normals, (depth, pose), eps=1e-6, atol=1e-6, rtol=1e-6)
+    (gradient,) = torch.autograd.grad(normals(depth, pose).square().sum() + normals(depth, pose).sum(), depth)
+    assert bool(gradient.isfinite().all()) and float(gradient[2, 4]) == 0 and float(gradient.abs().max()) > 0.1
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
