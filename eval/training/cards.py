@@ -93,13 +93,14 @@ def card(
     missed = [f["what"] for f in figures if f["asked"] is not None and f["value"] < f["asked"]]
     if missed:
         lines += ["", "Short of what was asked for: " + "; ".join(missed) + "."]
+    trained = "" if facts.get("minutes") is None else f", trained in {facts['minutes']:.0f} minutes"
     lines += ["", "## Files", "", "| file | bytes | SHA-256 |", "|---|---|---|"]
     for path in files:
         lines.append(f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |")
     lines += [
         "",
         f"32 pictures of 128 x 128 px take {facts['seconds']:.2f} s on {facts['threads']} thread(s) of the machine that made "
-        f"this card. Made with torch {facts['torch']}, {facts['epochs']} epochs, seed {facts['seed']}.",
+        f"this card. Made with torch {facts['torch']}, {facts['epochs']} epochs, seed {facts['seed']}{trained}.",
         "",
     ]
     return "\n".join(lines)
