@@ -498,7 +498,11 @@ def metrics(
         ),
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option(help="Folder: masks named as the renders; white counts for Edit PSNR.")
+        Path | None,
+        typer.Option(
+            help="Folder: masks named as the renders; white counts for Edit PSNR and the perceptual distance. The others "
+            "see whole pictures."
+        ),
     ] = None,
     background: Annotated[
         str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")

@@ -5,7 +5,8 @@
 For each scene and yaw: the exact disagreement of two views and the one along optical flow, on the edited object, of four
 pairs of pictures whose consistency is known beforehand: the unedited truth and an edit with one answer in both views
 (both as consistent as the scene itself), the same with the target moved by 2 px, and one with a different answer in each
-view (as inconsistent as can be). The table of docs/metrics.md comes from here.
+view (as inconsistent as can be). With ``--out`` a report is written there: report.md with its figures, flow.json, and the
+pictures of each pair. The table of docs/metrics.md comes from here; reports/flow is made with ``--no-pictures``.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ SLIP = 2
 PAIRS = ("truth", "one_answer", "slip", "two_answers")
 """What the two views show: the scene unedited; edited with one answer; the same, the target moved by :data:`SLIP`; the
 source with one answer, the target with another."""
+
+TITLES = {"truth": "truth", "one_answer": "one answer", "slip": f"{SLIP} px slip", "two_answers": "two answers"}
+"""What tables call them."""
 
 
 @dataclass(frozen=True)
@@ -148,10 +152,16 @@ def table(rows: Sequence[Row]) -> str:
     """Markdown: mean DeltaE of the edited object, exact, along the flow, and along it at the exact figure's pixels; and the
     flow's own errors in the whole picture.
     """
-    shown = ("truth", "one answer", f"{SLIP} px slip", "two answers")
-    head = ["scene", "yaw", "object px", *shown]
-    head += ["EPE median, p95 (px)", "check passes", "not in source"]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    columns, cells = _cells(rows)
+    lines = [columns, ["---"] * len(columns), *cells]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """The table's columns, and its rows as text."""
+    columns = ["scene", "yaw", "object px", *TITLES.values()]
+    columns += ["EPE median, p95 (px)", "check passes", "not in source"]
+    table = []
     for row in rows:
         cells = [row.scene, f"{row.yaw:g}", f"{row.figures['truth']['consistency.pixels']:g}"]
         for kind in PAIRS:
@@ -160,8 +170,140 @@ def table(rows: Sequence[Row]) -> str:
             cells.append(" / ".join(f"{found[f'consistency.{name}']:.1f}" for name in names))
         cells.append(f"{row.flow['consistency.flow_epe_median']:.2f}, {row.flow['consistency.flow_epe_p95']:.1f}")
         cells += [f"{row.flow['consistency.flow_recall']:.0%}", f"{row.flow['consistency.flow_false']:.0%}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        table.append(cells)
+    return columns, table
+
+
+def write_report(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
+    """Write report.md and its figures.
+
+    Args:
+        rows: of :func:`study`, of one flow method.
+        out: folder.
+        size, spp: of the pictures, as the report says them.
+    """
+    from attnwarp_eval.cost import environment
+    from attnwarp_eval.report.model import Picture, Report, Section, Table
+    from attnwarp_eval.report.write import markdown
+
+    about = environment()
+    lead = [
+        f"Made by `python -m attnwarp_eval.flow_study --out <this folder>`: {', '.join(dict.fromkeys(r.scene for r in rows))}; "
+        f"{size} x {size} px, {spp} samples a pixel; flow by OpenCV's {rows[0].method} "
+        f"({_version(about['versions'], 'opencv')}) between the UNEDITED pictures of two views, the second turned around the "
+        "scene by yaw degrees.",
+        "The figure is the mean CIEDE2000 of the edited object between the two views, about 1 being just seen. Its exact "
+        "form compares colours at correspondences known from the scene; published work takes optical flow for them, where "
+        "flow there and back agree. The four pairs' consistency is known beforehand: *truth*, the scene unedited, and *one "
+        "answer*, a recolouring that is the same in both views, are as consistent as can be; *slip* is the second with the "
+        f"target moved by {SLIP} px; *two answers* has another colour in each view. docs/metrics.md explains the rest.",
+    ]
+    columns, cells = _cells(rows)
+    far = Section(
+        "How far the flow's figure is from the exact one",
+        [
+            "Of two views that are perfectly consistent, the flow's figure over the exact one: 1 is right, above it the flow "
+            "sees disagreement that is not there. Beside it the same at the pixels of the exact figure, which leaves "
+            "outlines out; and the flow's figure of the slipped edit over that of the consistent one: at 1 it cannot tell the "
+            "two apart. Least and largest over the scenes."
+        ],
+        [Table(SUMMARY, _summary(rows))],
+        [Picture(_draw_consistency(rows, out).relative_to(out).as_posix(), "CIEDE2000 between two views against yaw")],
+    )
+    wrong = Section(
+        "How wrong the flow itself is",
+        [
+            "Endpoint error over pixels visible in both views away from edges; the share of those that the check lets pass; "
+            "and of all that it lets pass, the share that the source certainly does not show. Whole picture."
+        ],
+        figures=[Picture(_draw_flow(rows, out).relative_to(out).as_posix(), "Errors of the flow against yaw")],
+    )
+    caption = "Mean CIEDE2000: exact / along the flow / along the flow at the pixels of the exact figure"
+    every = Section("Every scene and yaw", tables=[Table(columns, cells, caption)])
+    report = Report("Consistency along optical flow, against exact correspondences", lead, [far, wrong, every])
+    path = out / "report.md"
+    path.write_text(markdown(report), encoding="utf-8")
+    return [path]
+
+
+SUMMARY = [
+    "yaw", "truth", "one answer", "one answer, same pixels", "slip over one answer, exact", "slip over one answer, flow",
+]  # fmt: skip
+
+
+def _summary(rows: Sequence[Row]) -> list[list[str]]:
+    """By yaw: the least and the largest ratio over the scenes."""
+
+    def value(row: Row, kind: str, name: str) -> float:
+        return row.figures[kind][f"consistency.{name}"]
+
+    ratios: list[Callable[[Row], float]] = [
+        lambda r: value(r, "truth", "flow_delta_e") / value(r, "truth", "delta_e"),
+        lambda r: value(r, "one_answer", "flow_delta_e") / value(r, "one_answer", "delta_e"),
+        lambda r: value(r, "one_answer", "flow_same_delta_e") / value(r, "one_answer", "delta_e"),
+        lambda r: value(r, "slip", "delta_e") / value(r, "one_answer", "delta_e"),
+        lambda r: value(r, "slip", "flow_delta_e") / value(r, "one_answer", "flow_delta_e"),
+    ]
+    table = []
+    for yaw in dict.fromkeys(row.yaw for row in rows):
+        cells = [f"{yaw:g}"]
+        for ratio in ratios:
+            found = [one for row in rows if row.yaw == yaw for one in [ratio(row)] if np.isfinite(one)]
+            cells.append(f"{min(found):.1f} to {max(found):.1f}" if found else "undefined")
+        table.append(cells)
+    return table
+
+
+def _draw_consistency(rows: Sequence[Row], out: Path) -> Path:
+    from attnwarp_eval.report import figures
+
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    path = out / "figures" / "consistency.svg"
+    with figures.drawing(path, columns=len(scenes), width=4.0 * len(scenes)) as axes:
+        for ax, scene in zip(axes, scenes, strict=True):
+            mine = [row for row in rows if row.scene == scene]
+            for k, kind in enumerate(PAIRS[1:]):
+                for name, style in (("delta_e", "-"), ("flow_delta_e", "--")):
+                    ax.plot(
+                        [row.yaw for row in mine], [row.figures[kind][f"consistency.{name}"] for row in mine], style,
+                        color=figures.PALETTE[k], marker=figures.MARKERS[k], markersize=4, linewidth=1.4,
+                        label=f"{TITLES[kind]}, {'exact' if name == 'delta_e' else 'flow'}",
+                    )  # fmt: skip
+            ax.set(xlabel="yaw, degrees", ylabel="mean CIEDE2000", yscale="log")
+            ax.set_title(scene, loc="left", fontsize=9.5)
+        axes[0].legend()
+    return path
+
+
+def _draw_flow(rows: Sequence[Row], out: Path) -> Path:
+    from attnwarp_eval.report import figures
+
+    scenes = list(dict.fromkeys(row.scene for row in rows))
+    path = out / "figures" / "flow.svg"
+    panels = {
+        "flow_epe_median": "median endpoint error, px", "flow_recall": "of the visible, the check passes",
+        "flow_false": "of what passes, not in the source",
+    }  # fmt: skip
+    with figures.drawing(path, columns=len(panels), width=4.0 * len(panels)) as axes:
+        for ax, (name, title) in zip(axes, panels.items(), strict=True):
+            for k, scene in enumerate(scenes):
+                mine = [row for row in rows if row.scene == scene]
+                ax.plot(
+                    [row.yaw for row in mine], [row.flow[f"consistency.{name}"] for row in mine],
+                    color=figures.PALETTE[k], marker=figures.MARKERS[k], markersize=4, linewidth=1.4, label=scene,
+                )  # fmt: skip
+            ax.set(xlabel="yaw, degrees")
+            if name == "flow_epe_median":
+                ax.set_yscale("log")
+            else:
+                ax.set_ylim(0, 1)
+            ax.set_title(title, loc="left", fontsize=9.5)
+        axes[0].legend()
+    return path
+
+
+def _version(versions: dict[str, str], start: str) -> str:
+    return next((f"{name} {version}" for name, version in versions.items() if name.startswith(start)), start)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -175,7 +317,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=256, help="of the pictures in px (default 256)")
     parser.add_argument("--spp", type=int, default=32, help="samples a pixel (default 32)")
     parser.add_argument("--method", choices=("dis", "farneback"), default="dis", help="of OpenCV's flow (default dis)")
-    parser.add_argument("--out", type=Path, help="folder for flow.json and a picture of each pair")
+    parser.add_argument("--out", type=Path, help="folder for report.md, its figures, flow.json and pictures")
+    parser.add_argument("--no-pictures", action="store_true", help="leave out the picture of each pair")
     options = parser.parse_args(arguments)
 
     def keep(name: str, image: Any) -> None:
@@ -191,12 +334,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.scenes:
         for row in study(
             name, SCENES[name], size=options.size, spp=options.spp, yaws=options.yaws, method=options.method,
-            keep=keep if options.out else None,
+            keep=keep if options.out and not options.no_pictures else None,
         ):  # fmt: skip
             rows.append(row)
     print(table(rows))
     if options.out:
         (options.out / "flow.json").write_text(json.dumps(_plain([asdict(row) for row in rows]), indent=1) + "\n")
+        for path in write_report(rows, options.out, size=options.size, spp=options.spp):
+            print(path)
 
 
 def _plain(value: Any) -> Any:

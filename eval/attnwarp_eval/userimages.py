@@ -44,7 +44,8 @@ class Inputs:
         source_edit: the one edited picture that the others follow.
         prompt: what the edited scene should show.
         source_prompt: what the scene showed before.
-        masks: folder of masks, named as the renders: white counts for Edit PSNR, black does not.
+        masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual distance, black
+            does not.
         background: sRGB in [0, 1] behind transparent pixels.
     """
 
@@ -132,6 +133,9 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
     _Figure("embedding.clip_image", "CLIP single-image similarity", ("renders", "source_edit"), "clip"),
     _Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
 )  # fmt: skip
+
+_MASKED = (_EDIT, _PERCEPTUAL)
+"""Figures that masks act on; the others are of whole pictures."""
 
 Progress = Callable[[int, int, str], None]
 """Called with views done, views in all, and the view at work."""
@@ -310,7 +314,7 @@ def _views(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[s
 def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
     """The folders that a figure is computed from."""
     used = [name for name in figure.needs if name in folders]
-    return [*used, "masks"] if figure is _EDIT and "masks" in folders else used
+    return [*used, "masks"] if figure in _MASKED and "masks" in folders else used
 
 
 def _compare_names(
@@ -318,7 +322,9 @@ def _compare_names(
 ) -> None:
     """Say what found no partner."""
     shown = list(folders["renders"])
-    used = {name for figure in views for name in figure.needs} | ({"masks"} if _EDIT in views else set())
+    used = {name for figure in views for name in figure.needs} | (
+        {"masks"} if any(figure in views for figure in _MASKED) else set()
+    )
     for other in (name for name in ("edited", "originals", "masks") if name in folders and name in used):
         there = folders[other]
         # A scene is usually fitted on some of its views: renders without an edited picture are no mistake.
@@ -382,6 +388,9 @@ def _gather(
         if kind in loaded and pictures:
             to.update(zip(pictures, loaded[kind].images(list(pictures.values())), strict=True))
 
+    def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
+        return float(loaded["perceptual"].distance([a], [b])[0])
+
     needed = [name for name in folders["renders"] if any(name in names for names in members.values())]
     for start in range(0, len(needed), BATCH):
         batch = needed[start : start + BATCH]
@@ -392,16 +401,16 @@ def _gather(
         changed = [name for name in batch if name in members[_DIRECTION]]
         encode("clip", partners("originals", changed, renders), kept.before)
         paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
-        masked = [name for name in paired if name in members[_EDIT] and "masks" in folders]
+        masked = paired if "masks" in folders else []
         masks = {name: inside(picture) for name, picture in partners("masks", masked, renders).items()}
         for name, picture in partners("edited", paired, renders).items():
             if name in members[_EDIT]:
-                mask = {name: masks[name]} if name in masks else None
+                mask = {name: masks[name]} if masks else None
                 one = metrics.edit_psnr({name: picture}, {name: renders[name]}, mask)
                 kept.errors[name] = (one.mse[0], one.psnr[0])
             if name in members[_PERCEPTUAL]:
                 try:
-                    kept.distances[name] = float(loaded["perceptual"].distance([picture], [renders[name]])[0])
+                    kept.distances[name] = metrics.perceptual(picture, renders[name], distance, masks.get(name))
                 except ValueError as error:
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
     progress(len(needed), len(needed), "")
@@ -419,7 +428,8 @@ def _rows(
             _edit_rows(kept.errors, done)
             continue
         if figure is _PERCEPTUAL:
-            value = float(np.mean(list(kept.distances.values())))
+            defined = [value for value in kept.distances.values() if not np.isnan(value)]
+            value = float(np.mean(defined)) if defined else float("nan")
             done.rows.append(Row(figure.key, figure.title, value, kept.distances, figure.encoder))
             continue
         if figure is _CLIP:
@@ -447,7 +457,7 @@ def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> Non
             "views; in the pooled figure they count as no error"
         )
     if found.undefined:
-        done.notes.append(f"{found.undefined} masks are black all over: nothing of those views counts for Edit PSNR")
+        done.notes.append(f"{found.undefined} masks are black all over: nothing of those views counts")
 
 
 def _texts_needed(views: Iterable[_Figure]) -> list[str]:

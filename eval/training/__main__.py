@@ -63,8 +63,8 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
 
 
 @app.command()
-def assess(name: str, data: Data = DATA, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
-    """Measure an encoder on what it has never seen, and write its card."""
+def assess(name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
+    """Measure an encoder on what it has never seen, and write its card; the checkpoint, if there is one, says how long training took."""
     import torch
 
     from attnwarp_eval.encoders.bundled import load
@@ -85,7 +85,7 @@ def assess(name: str, data: Data = DATA, weights: Weights = WEIGHTS, threads: Th
         return [f.to_dict() for f in found]
 
     trained = figures()
-    facts = _facts(name, encoder) | {"seconds": _seconds(encoder), "threads": threads}
+    facts = _facts(name, encoder, out) | {"seconds": _seconds(encoder), "threads": threads}
     torch.manual_seed(0)
     encoder.net = type(encoder.net)(encoder.tokenizer.get_vocab_size()) if name == "clip-small" else type(encoder.net)()
     encoder.net.eval().requires_grad_(False)
@@ -106,7 +106,7 @@ def everything(data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, th
     for name in NAMES:
         train(name, data, out, threads)
         export(name, out, weights)
-        assess(name, data, weights, threads)
+        assess(name, data, out, weights, threads)
 
 
 def _recipe(name: str) -> Any:
@@ -133,11 +133,12 @@ def _seconds(encoder: Any, rounds: int = 7) -> float:
     return statistics.median(taken[1:])
 
 
-def _facts(name: str, encoder: Any) -> dict[str, Any]:
+def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
     import importlib
 
     import torch
 
+    from training.common import minutes
     from training.data import SPLITS
     from training.perceptual import TRAIN_PHOTOS
     from training.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES
@@ -152,6 +153,8 @@ def _facts(name: str, encoder: Any) -> dict[str, Any]:
         "pictures": f"{cast} by ray casting", "objects": len(OBJECTS),
         "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
     }  # fmt: skip
+    checkpoints = [out / f"{name}.pt", *([out / f"{name}-naming.pt"] if name == "clip-small" else [])]
+    facts["minutes"] = minutes(*checkpoints)
     if name == "clip-small":
         facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}
         facts["pictures"] += f", {SPLITS['train-rendered'].worlds} by Mitsuba"

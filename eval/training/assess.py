@@ -65,8 +65,16 @@ class Figure:
 
 
 def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike, **more: float | None) -> Figure:
-    """A figure from one answer a question, grouped by world."""
+    """A figure from one answer a question, grouped by world.
+
+    Raises:
+        ValueError: no answers, or another number of worlds.
+    """
     values, groups = np.asarray(right, dtype=np.float64), np.asarray(worlds)
+    if not len(values) or values.shape != groups.shape:
+        raise ValueError(
+            f"{what}: got {len(values)} answers and {len(groups)} worlds, expected one world for each of at least one answer"
+        )
     sums = {g: (values[groups == g].sum(), int((groups == g).sum())) for g in np.unique(groups)}
     table = np.array(list(sums.values()))
     rng = np.random.default_rng(0)
@@ -175,7 +183,7 @@ def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, wha
     right = []
     for place, k in enumerate(first):
         others = rng.choice(np.delete(np.arange(len(first)), place), 63, replace=False)
-        choice = np.array([place, *others])
+        choice = np.array([*others, place])  # the right one last: the first of equals wins, so a tie is no find
         best = choice[(images[k] @ texts[choice].T).argmax()]
         right.append(bool(true_of(said[first[best]][None], said[k][None])[0, 0]))
     return figure(what, right, pictures.world[first], chance=1 / 64, asked=0.6)
@@ -209,10 +217,10 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
         # One seed for all sentences: they differ in what they say, not in how.
         texts = encoder.texts([sentence(said, np.random.default_rng(seed)) for said in (old, *targets)])
         away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
-        if not (images[after] != images[before]).any():
+        if np.array_equal(pictures.images[after], pictures.images[before]):
             continue  # what was changed is not in the picture: there is no direction
-        moved = _unit(images[after] - images[before])
-        right.append((away @ moved).argmax() == 0)
+        likeness = away @ _unit(images[after] - images[before])
+        right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
         worlds.append(world)
     return figure("the edit among 8, by directional similarity", right, worlds, chance=1 / 8, asked=0.8)
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from attnwarp_eval.encoders._weights import sha256_of
+
 ABOUT = {
     "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million
 parameters for pictures of 112 x 112 px, a transformer of {text:.1f} million for text, byte-pair tokens.
@@ -93,13 +95,16 @@ def card(
     missed = [f["what"] for f in figures if f["asked"] is not None and f["value"] < f["asked"]]
     if missed:
         lines += ["", "Short of what was asked for: " + "; ".join(missed) + "."]
+    trained = "" if facts.get("minutes") is None else f", trained in {facts['minutes']:.0f} minutes"
     lines += ["", "## Files", "", "| file | bytes | SHA-256 |", "|---|---|---|"]
     for path in files:
         lines.append(f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |")
+    if len(files) > 1:
+        lines += ["", f"SHA-256 of all, one after the other, by which results name the encoder: `{sha256_of(files)}`."]
     lines += [
         "",
         f"32 pictures of 128 x 128 px take {facts['seconds']:.2f} s on {facts['threads']} thread(s) of the machine that made "
-        f"this card. Made with torch {facts['torch']}, {facts['epochs']} epochs, seed {facts['seed']}.",
+        f"this card. Made with torch {facts['torch']}, {facts['epochs']} epochs, seed {facts['seed']}{trained}.",
         "",
     ]
     return "\n".join(lines)

@@ -16,7 +16,8 @@ import torch.nn.functional as F
 from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
 
 from attnwarp_eval.encoders.nets import ClipSmall
-from training.common import Run, channels_last, crops, groups, rate
+from training import naming
+from training.common import Run, channels_last, crops, groups, rate, settings
 from training.naming import Heads, pictures_of, scrambled, warm_start
 from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
 
@@ -264,5 +265,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return dict(zip(("contrast", "names", "heads"), sums / each, strict=True))
 
     checkpoint = out / "clip-small.pt"
-    Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs).train(epoch)
+    # The image tower's start is part of what this comes from.
+    recipe = settings(globals()) | {"naming": naming.recipe()}
+    Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs, recipe).train(epoch)
     return checkpoint

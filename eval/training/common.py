@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -14,6 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
+
+from attnwarp_eval.errors import InputError
 
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)
@@ -89,6 +92,20 @@ def groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
     return [{"params": matrices, "weight_decay": decay}, {"params": others, "weight_decay": 0.0}]
 
 
+def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
+    """What a recipe says: its constants, by their upper-case names, and which pictures it takes.
+
+    Args:
+        module: the recipe's ``globals()``; what it imports in upper case, such as the words for colours, is part of it.
+        splits: names of the pictures that it is trained on, in :data:`training.data.SPLITS`.
+    """
+    from training.data import DATA_PROTOCOL, SPLITS
+
+    plain = (bool, int, float, str, tuple, list, dict)
+    found = {name: value for name, value in module.items() if name.isupper() and isinstance(value, plain)}
+    return found | {"data": {"protocol": DATA_PROTOCOL, **{name: asdict(SPLITS[name]) for name in splits}}}
+
+
 @dataclass
 class Run:
     """A training run that can be killed and gone on with: its state is written after every epoch.
@@ -97,26 +114,67 @@ class Run:
         path: of the checkpoint.
         state: everything that has a ``state_dict``, by name.
         epochs: how many in all.
+        recipe: what else the result depends on, see :func:`settings`; written into the checkpoint, which goes on with no
+            other.
     """
 
     path: Path
     state: dict[str, Any]
     epochs: int
+    recipe: Mapping[str, Any]
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
-        """Run the epochs that are left; each draws from generators seeded by its number, so a resumed run is the same."""
-        first = 0
+        """Run the epochs that are left; each draws from generators seeded by its number, so a resumed run is the same.
+
+        Raises:
+            InputError: the checkpoint is of another recipe, or from before recipes were written into them.
+        """
+        first, seconds = 0, 0.0
+        recipe = {"epochs": self.epochs, **self.recipe}
         if self.path.exists():
             stored = torch.load(self.path, weights_only=True)
+            self._same_recipe(stored.get("recipe"), recipe)
             for name, thing in self.state.items():
                 thing.load_state_dict(stored[name])
-            first = int(stored["epoch"])
+            first, seconds = int(stored["epoch"]), float(stored["seconds"])
         for number in range(first, self.epochs):
             start = time.perf_counter()
             said = epoch(number)
+            taken = time.perf_counter() - start
+            seconds += taken
             words = ", ".join(f"{k} {v:.4g}" for k, v in said.items())
-            print(f"epoch {number + 1}/{self.epochs}: {words}, {time.perf_counter() - start:.0f} s", flush=True)
+            print(f"epoch {number + 1}/{self.epochs}: {words}, {taken:.0f} s", flush=True)
             temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
             kept = {name: thing.state_dict() for name, thing in self.state.items()}
-            torch.save({**kept, "epoch": number + 1}, temporary)
+            torch.save({**kept, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)}, temporary)
             temporary.replace(self.path)
+
+    def _same_recipe(self, stored: str | None, recipe: Mapping[str, Any]) -> None:
+        remedy = "remove it to train from the start"
+        if stored is None:
+            raise InputError(
+                f"{self.path}: does not say which recipe it was made by, so it cannot be gone on with; {remedy}"
+            )
+        was, now = json.loads(stored), json.loads(json.dumps(recipe))  # tuples are lists there
+        for name in (*now, *was):
+            if (name in was) != (name in now) or was.get(name) != now.get(name):
+                made, asked = (_short(one[name]) if name in one else "nothing" for one in (was, now))
+                raise InputError(
+                    f"{self.path}: was made with {name} = {made}, got {asked}; {remedy}, or restore the setting"
+                )
+
+
+def minutes(*paths: Path) -> float | None:
+    """How long the trainings behind some checkpoints took together; None where one is not at hand or does not say."""
+    total = 0.0
+    for path in paths:
+        seconds = torch.load(path, weights_only=True).get("seconds") if path.exists() else None
+        if seconds is None:
+            return None
+        total += seconds
+    return total / 60
+
+
+def _short(value: Any, most: int = 120) -> str:
+    said = json.dumps(value)
+    return said if len(said) <= most else f"{said[:most]}..."

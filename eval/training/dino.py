@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from attnwarp_eval.encoders.nets import DinoSmall
-from training.common import Run, channels_last, groups, placed_crops, rate
+from training.common import Run, channels_last, groups, placed_crops, rate, settings
 from training.data import Pictures, load
 
 SEED = 2
@@ -204,5 +204,6 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return dict(zip(("class", "patches", "contrast", "same prototype"), sums / each, strict=True))
 
     checkpoint = out / "dino-small.pt"
-    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer}, epochs).train(epoch)
+    recipe = settings(globals(), "train-moved", "train-shapes", "train")
+    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer}, epochs, recipe).train(epoch)
     return checkpoint

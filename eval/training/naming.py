@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from attnwarp_eval.encoders.nets import ClipSmall
-from training.common import Run, channels_last, crops, groups, rate
+from training.common import Run, channels_last, crops, groups, rate, settings
 from training.data import Pictures, load
 from training.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES
 
@@ -140,8 +141,13 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
 
     checkpoint = out / "clip-small-naming.pt"
     state = {"vision": vision, "norm": pool.norm, "heads": heads, "optimizer": optimizer}
-    Run(checkpoint, state, epochs).train(epoch)
+    Run(checkpoint, state, epochs, recipe()).train(epoch)
     return checkpoint
+
+
+def recipe() -> dict[str, Any]:
+    """What the checkpoint depends on."""
+    return settings(globals(), "train", "train-rendered", "train-moved", "train-shapes")
 
 
 @torch.no_grad()

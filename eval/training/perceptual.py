@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 
 from attnwarp_eval.encoders.nets import PerceptualSmall
-from training.common import Run, channels_last, rate
+from training.common import Run, channels_last, rate, settings
 from training.data import load
 from training.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair
 
@@ -132,5 +132,5 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return {"loss": total / STEPS, "ordered": right / (STEPS * BATCH)}
 
     checkpoint = out / "perceptual-small.pt"
-    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs).train(epoch)
+    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, settings(globals(), "train")).train(epoch)
     return checkpoint

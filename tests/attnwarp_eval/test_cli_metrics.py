@@ -311,6 +311,29 @@ def test_a_mask_leaves_out_what_is_black_and_divides_by_the_rest(data):
     assert list(views) == ["view1", "view2"]
 
 
+def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
+    folder, arrays = data
+    inside = np.zeros((40, 48), np.uint8)
+    inside[:, 16:] = 255
+    for view, mask in zip(VIEWS, (inside, np.full_like(inside, 255), np.zeros_like(inside)), strict=True):
+        write(folder / "masks" / f"{view}.png", mask)
+    done = everything(folder, models, f"--mask={folder / 'masks'}")
+    assert done.exit_code == 0, done.output
+    row = saved(folder)["metrics"]["perceptual.distance"]
+    encoder = load_encoder(models["perceptual"], "perceptual")
+    edited, renders = ([arrays[g][v].astype(np.float32) / 255 for v in VIEWS] for g in ("edited", "renders"))
+    put = np.concatenate([renders[0][:, :16], edited[0][:, 16:]], axis=1)
+    part, whole = 1.5 * encoder.distance([put], renders[:1])[0], encoder.distance(edited[1:2], renders[1:2])[0]
+    assert row["views"] == {"view1": pytest.approx(part), "view2": pytest.approx(whole), "view10": None}
+    assert row["value"] == pytest.approx((part + whole) / 2)
+    assert (row["n"], row["undefined"]) == (2, ["view10"])
+    assert "1 masks are black all over" in done.stderr
+    for view in VIEWS:
+        write(folder / "masks" / f"{view}.png", np.zeros_like(inside))
+    done = everything(folder, models, f"--mask={folder / 'masks'}")
+    assert saved(folder)["metrics"]["perceptual.distance"]["value"] is None
+
+
 @pytest.mark.parametrize(
     "spoil, complaint",
     [

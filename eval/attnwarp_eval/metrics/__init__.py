@@ -18,7 +18,7 @@ from attnwarp_eval.metrics.consistency import (
 )
 from attnwarp_eval.metrics.embedding import Similarity, clip_similarity, directional_similarity, image_similarity
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
-from attnwarp_eval.metrics.image import EditPsnr, edit_psnr, image_error, ms_ssim, mse, psnr, ssim, ssim_map
+from attnwarp_eval.metrics.image import EditPsnr, edit_psnr, image_error, ms_ssim, mse, perceptual, psnr, ssim, ssim_map
 
 __all__ = [
     "Disagreement",
@@ -39,6 +39,7 @@ __all__ = [
     "mse",
     "nearest_answer",
     "optical_flow",
+    "perceptual",
     "psnr",
     "ssim",
     "ssim_map",

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.arrays import Array, Mask, share
+from attnwarp_eval.arrays import Mask
 from attnwarp_eval.metrics._pictures import picture, region
-from attnwarp_eval.metrics.image import edit_psnr, ms_ssim, mse, psnr_of_mse, ssim
-
-Distance = Callable[[Array, Array], float]
-"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""
+from attnwarp_eval.metrics.image import Distance, edit_psnr, ms_ssim, mse, perceptual, psnr_of_mse, ssim
 
 
 def fidelity(
@@ -34,10 +31,8 @@ def fidelity(
         mask: (H, W) bool, the edited object (:func:`attnwarp_eval.edited.edit_mask`). All True for an edit of the light,
             which leaves nothing outside: those figures are NaN.
         original_srgb: the view before the edit; without it nothing is said about preservation.
-        distance: a perceptual distance; without it there is none. Inside, the rest of the picture is made equal to the
-            truth first, and the distance divided by the share of the picture that is inside; outside, the other way round.
-            For a distance that is a mean over places it then is the mean over those of the region, apart from what
-            spills over the region's border.
+        distance: a perceptual distance; without it there is none. Inside and outside it is masked as
+            :func:`attnwarp_eval.metrics.perceptual` says.
 
     Returns:
         ``mse``, ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and ``.outside``, ``ms_ssim`` whole, the
@@ -59,7 +54,7 @@ def fidelity(
         figures[f"fidelity.ssim{suffix}"] = ssim(image, truth, part)
         figures[f"fidelity.pixels{suffix}"] = int(part.sum())
         if distance is not None:
-            figures[f"fidelity.distance{suffix}"] = _distance(distance, image, truth, part)
+            figures[f"fidelity.distance{suffix}"] = perceptual(image, truth, distance, part)
     figures["fidelity.ms_ssim"] = ms_ssim(image, truth)
     if original_srgb is not None:
         outside = parts[".outside"]
@@ -69,7 +64,7 @@ def fidelity(
         figures["fidelity.preserved_psnr"] = psnr_of_mse(error)
         figures["fidelity.preserved_ssim"] = ssim(image, original, outside)
         if distance is not None:
-            figures["fidelity.preserved_distance"] = _distance(distance, image, original, outside)
+            figures["fidelity.preserved_distance"] = perceptual(image, original, distance, outside)
     return figures
 
 
@@ -109,10 +104,3 @@ def _shrunk(part: Mask) -> Mask:
 
     kept: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)
     return kept
-
-
-def _distance(distance: Distance, image: Array, truth: Array, part: Mask) -> float:
-    covered = share(int(part.sum()), part.size)
-    if not covered > 0:
-        return math.nan
-    return float(distance(np.where(part[..., None], image, truth), truth)) / covered

@@ -8,16 +8,19 @@ float64. With nothing to measure (an empty mask, a picture smaller than the wind
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.arrays import Array, Mask, mean
+from attnwarp_eval.arrays import Array, Mask, mean, share
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.metrics._pictures import pair
+
+Distance = Callable[[Array, Array], float]
+"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""
 
 WINDOW = 11
 """Side of SSIM's window in pixels; that of :data:`attnwarp.losses.SSIM_WINDOW`, not imported since it brings torch."""
@@ -111,6 +114,32 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
         term = luminance * structure if coarsest else structure
         product *= max(mean(term[windows]), 0.0) ** weight
     return product
+
+
+def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any = None) -> float:
+    """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN for an empty mask.
+
+    Outside the mask the picture is made equal to the target first, so that nothing there differs, and the distance is
+    divided by the share of the picture that the mask covers. For a distance that is a mean over places it then is the mean
+    over those of the mask, apart from what spills over the mask's border: networks see a neighbourhood of each place.
+    Pictures that are equal inside the mask are at distance 0, whatever stands outside.
+
+    Args:
+        image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the mask may be anything; of
+            the target it is what the network sees around the mask, black where it is NaN or outside [0, 1].
+        distance: takes both pictures in float64. Of an encoder: ``lambda a, b: float(encoder.distance([a], [b])[0])``.
+        mask: (H, W) bool, the pixels that count; all if left out.
+
+    Raises:
+        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0, 1].
+    """
+    image, target, inside = pair(image_srgb, target_srgb, mask, ("image_srgb", "target_srgb"))
+    covered = share(int(inside.sum()), inside.size)
+    if not covered > 0:
+        return math.nan
+    around = np.asarray(target_srgb, dtype=np.float64)
+    target = np.where(inside[..., None] | ~((around >= 0) & (around <= 1)), target, around)
+    return float(distance(np.where(inside[..., None], image, target), target)) / covered
 
 
 def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str, float]:

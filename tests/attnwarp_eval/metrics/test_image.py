@@ -348,3 +348,79 @@ def test_importing_metrics_imports_nothing_heavy():
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     heavy = {"torch", "cv2", "scipy", "skimage", "mitsuba", "open3d", "pyvista", "numba"}
     assert not heavy & set(json.loads(ran.stdout))
+
+
+def local(image, target):
+    """A distance that is a mean over places and sees nothing around them."""
+    return float(np.abs(image - target).mean())
+
+
+def blurring(image, target):
+    """One that sees 7 x 7 px around each place, as a network does."""
+    from scipy.ndimage import uniform_filter
+
+    return float(np.abs(uniform_filter(image, (7, 7, 1)) - uniform_filter(target, (7, 7, 1))).mean())
+
+
+@pytest.mark.parametrize("distance", [local, blurring])
+def test_a_mask_of_everything_is_no_mask_for_a_perceptual_distance(distance):
+    image, target = pictures()
+    whole = distance(image, target)
+    assert metrics.perceptual(image, target, distance) == whole > 0
+    assert metrics.perceptual(image, target, distance, np.ones(image.shape[:2], bool)) == whole
+
+
+@pytest.mark.parametrize("garbage", [0.0, 1.0, 7.5, np.nan, -np.inf])
+@pytest.mark.parametrize("distance", [local, blurring])
+def test_what_is_equal_inside_the_mask_is_at_distance_0_whatever_is_outside(distance, garbage):
+    _, target = pictures()
+    mask = np.zeros(target.shape[:2], bool)
+    mask[8:30, 11:41] = True
+    spoilt = np.where(mask[..., None], target, garbage)
+    assert metrics.perceptual(spoilt, target, distance, mask) == 0
+    assert metrics.perceptual(target, spoilt, distance, mask) == 0
+    image, _ = pictures()
+    known = metrics.perceptual(image, target, distance, mask)
+    assert known > 0
+    assert metrics.perceptual(np.where(mask[..., None], image, garbage), target, distance, mask) == known
+
+
+def test_a_masked_distance_is_the_mean_over_the_mask_apart_from_the_border():
+    image, target = pictures()
+    mask = np.zeros(target.shape[:2], bool)
+    mask[8:30, 11:41] = True
+    expected = np.abs(image - target)[8:30, 11:41].mean()
+    assert metrics.perceptual(image, target, local, mask) == pytest.approx(expected, rel=1e-12)
+    # All of a mask in one colour: what spills over is what the border misses, to the last digit.
+    shifted = np.clip(target, 0.1, 0.8)
+    found = metrics.perceptual(shifted + 0.1, shifted, blurring, mask)
+    assert found == pytest.approx(0.1, rel=1e-9)
+
+
+def test_an_empty_mask_has_no_distance_and_asks_for_none():
+    image, target = pictures()
+    assert math.isnan(metrics.perceptual(image, target, lambda a, b: 1 / 0, np.zeros(image.shape[:2], bool)))
+
+
+def test_a_perceptual_distance_refuses_what_the_others_do():
+    image, target = pictures()
+    bad = image.copy()
+    bad[3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match="image_srgb: nan at row 3, column 4, channel 1"):
+        metrics.perceptual(bad, target, local)
+    with pytest.raises(ValueError, match="target_srgb: got 39 x 52 pixels"):
+        metrics.perceptual(image, target[1:], local)
+    with pytest.raises(ValueError, match="mask: got uint8, expected bool"):
+        metrics.perceptual(image, target, local, np.ones(image.shape[:2], np.uint8))
+
+
+def test_the_bundled_distance_of_a_masked_picture_is_that_of_the_picture_put_into_its_target():
+    from attnwarp_eval.encoders import load_encoder
+
+    encoder = load_encoder("perceptual-small", "perceptual")
+    image, target = pictures(64, 64)
+    mask = np.zeros((64, 64), bool)
+    mask[:, :32] = True
+    distance = lambda a, b: float(encoder.distance([a], [b])[0])  # noqa: E731
+    put = np.concatenate([image[:, :32], target[:, 32:]], axis=1)
+    assert metrics.perceptual(image, target, distance, mask) == 2 * distance(put, target) > 0
