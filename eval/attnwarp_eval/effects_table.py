@@ -23,7 +23,7 @@ from attnwarp_eval.transport import called_for
 if TYPE_CHECKING:
     from attnwarp_eval.report.model import Table
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Raised whenever an entry would come out otherwise."""
 
 USUAL = ("geometry", "direct", "shadows", "textures")
@@ -218,7 +218,7 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
                 ", ".join(name for name in entry["needed"] if name not in USUAL) or "–",
                 ", ".join(entry["not_simulated"]) or "–",
                 plan_words(entry["plan"]),
-                "not asked" if proof is None else proof["verdict"],
+                "not asked" if proof is None else proof_words(proof),
                 _bound(proof),
                 _smallest(proof),
                 *_times(cost),
@@ -230,6 +230,13 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
 def plan_words(planned: Mapping[str, Any]) -> str:
     """A plan in a few words: integrator, and the camera where it is not a pinhole."""
     return str(planned["integrator"]) + (", thin lens" if planned["sensor"]["type"] == "thinlens" else "")
+
+
+def proof_words(proof: Mapping[str, Any]) -> str:
+    """A verdict in a few words, with what the comparison alone came to where something is not simulated."""
+    if proof["verdict"] == proof["of_simulated"]:
+        return str(proof["verdict"])
+    return f"{proof['verdict']} ({proof['of_simulated']} but for what is not simulated)"
 
 
 def _bound(proof: Mapping[str, Any] | None) -> str:
@@ -264,10 +271,13 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
     from attnwarp_eval.report.write import markdown
 
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
+    partly = sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries) - certified
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
     costs = [entry["cost"] for entry in entries if "cost" in entry]
     lead = [
-        f"{len(entries)} scenes, {certified} of their plans certified. Mitsuba {about['versions']['mitsuba']} as "
+        f"{len(entries)} scenes, {certified} of their plans certified"
+        + (f", {partly} more but for what is not simulated" if partly else "")
+        + f". Mitsuba {about['versions']['mitsuba']} as "
         f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
         f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of docs/effects.md at 32 x 32 "
         "from the source; **bound** is |d| + 2.33 SE of the picture's mean, which must stay below 1 %; the **smallest "

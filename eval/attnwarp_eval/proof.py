@@ -7,7 +7,8 @@
    picture, with Sidak's correction over all of them, AND equivalence of the whole (two one-sided tests within 1 %).
 
 No difference found is not yet equality: only the equivalence test certifies, and it refuses when the noise is too great
-for it. The statistics are pure functions of stacks of pictures.
+for it. What neither side simulates no comparison can find: a scene that calls for it is never certified. The statistics
+are pure functions of stacks of pictures.
 """
 
 from __future__ import annotations
@@ -22,8 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.effects import detect
-from attnwarp_eval.optics import NOT_SIMULATED
-from attnwarp_eval.plan import Plan, everything_on, plan
+from attnwarp_eval.plan import Plan, everything_on, plan, small_lights
 from attnwarp_eval.scene import Scene
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
@@ -239,8 +239,10 @@ class Proof:
     """What the ladder says of a plan.
 
     Attributes:
-        verdict: "certified" only when bits are equal or the equivalence test holds and nothing else refused;
-            "refused" when a difference was found; "can't tell" when there was too much noise for either.
+        verdict: "certified" only when bits are equal or the equivalence test holds, nothing else refused, and all that
+            the scene calls for is simulated; "refused" when a difference was found; "can't tell" otherwise.
+        of_simulated: what the comparison alone says, of what is simulated; above ``verdict`` only where something is not.
+        not_simulated: what the scene calls for and neither the plan nor everything on shows.
         rungs: the tests, in order.
         detectable: the smallest difference that could have been seen, a share of the mean, by level.
         seconds: spent.
@@ -250,6 +252,15 @@ class Proof:
     rungs: tuple[Rung, ...]
     detectable: dict[str, float]
     seconds: float
+    of_simulated: Verdict
+    not_simulated: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The verdict, with the reason where it is not that of the comparison."""
+        if self.verdict == self.of_simulated:
+            return self.verdict
+        return f"{self.verdict}: not simulated: {', '.join(self.not_simulated)}; {self.of_simulated} but for that"
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -257,7 +268,7 @@ class Proof:
 
     def lines(self) -> Iterator[str]:
         """For a person."""
-        yield f"proof: {self.verdict} ({self.seconds:.1f} s)"
+        yield f"proof: {self.words} ({self.seconds:.1f} s)"
         for rung in self.rungs:
             word = {None: "-", True: "ok", False: "REFUSED"}[rung.passed]
             yield f"  {rung.name:20} {word:8} {rung.words}"
@@ -298,6 +309,7 @@ def prove(
     ours = plan(scene) if ours is None else ours
     against = everything_on(scene) if against is None else against
     rungs = [_structural(scene, ours)] if structure else []
+    blind = tuple(rungs[0].numbers["not_simulated"]) if rungs else ()
     made_by = comparable(scene)
 
     def pictures(made: Plan, spp: int, first: int, count: int) -> Array:
@@ -307,7 +319,9 @@ def prove(
         ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
-        return Proof(verdict, tuple(rungs), detectable or {}, time.perf_counter() - start)
+        # Both sides lack what is not simulated, so that equal pictures say nothing of it; unequal ones still refuse.
+        capped: Verdict = "can't tell" if blind and verdict == "certified" else verdict
+        return Proof(capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind)
 
     if rungs and rungs[0].passed is False:
         return finish("refused")
@@ -385,8 +399,9 @@ def _samples(ours: Plan, against: Plan, pictures: Any, seed: int, seeds: int, se
 def _structural(scene: Scene, ours: Plan) -> Rung:
     """Whether what the plan leaves out is absent from all that was looked at."""
     found = detect(scene)
-    missing = [name for name in found if found[name].needed and not found[name].simulated and name not in NOT_SIMULATED]
-    named = [name for name in NOT_SIMULATED if found[name].needed]
+    blind: list[str] = [name for name in found if found[name].needed and not found[name].simulated]
+    if found["caustics"].simulated and small_lights(scene) is not None:
+        blind.append("caustics seen in mirrors and through glass")
     integrators = ours.integrator
     lacks = []
     if (found["medium"].needed or found["subsurface"].needed) and (not ours.media or "volpath" not in integrators):
@@ -401,6 +416,6 @@ def _structural(scene: Scene, ours: Plan) -> Rung:
     words = "what is left out is in neither the file nor Mitsuba's graphs"
     if found["interreflection"].source == "said":
         words += f"; bounces beyond {bounces} are left out by the scene's own word and not part of this proof"
-    if missing or named:
-        words += f"; not simulated and so not proved: {', '.join([*missing, *named])}"
-    return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks})
+    if blind:
+        words += f"; not simulated and so not proved: {', '.join(blind)}"
+    return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks, "not_simulated": blind})

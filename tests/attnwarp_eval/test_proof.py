@@ -129,7 +129,9 @@ def test_the_paired_test_agrees_with_scipy():
 def test_the_plan_of_a_scene_is_certified(name):
     # A budget for a busy machine; a quiet one needs a few seconds of it.
     found = proof.prove(SCENES[name](), seconds=180)
-    assert found.verdict == "certified", list(found.lines())
+    assert found.of_simulated == "certified", list(found.lines())
+    # Glass polarises light, which no picture here shows.
+    assert found.verdict == ("can't tell" if name == "refraction" else "certified")
     assert found.rungs[0].name == "structure" and found.detectable
 
 
@@ -186,9 +188,9 @@ def test_over_200_true_nulls_of_real_pictures_it_refuses_at_its_stated_rate(name
 
 
 @pytest.mark.slow
-def test_the_caustic_of_a_point_light_is_certified_when_there_is_time():
+def test_the_caustic_of_a_point_light_is_certified_but_for_what_is_not_simulated_when_there_is_time():
     found = proof.prove(SCENES["caustics"](), seconds=240)
-    assert found.verdict == "certified", list(found.lines())
+    assert (found.verdict, found.of_simulated) == ("can't tell", "certified"), list(found.lines())
 
 
 def test_everything_on_is_never_volpathmis():
