@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -23,8 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.effects import detect
-from attnwarp_eval.plan import Plan, everything_on, plan, small_lights
+from attnwarp_eval.plan import Lens, Pass, Plan, convex, everything_on, plan, small_lamps, small_lights
 from attnwarp_eval.scene import Scene
+from attnwarp_eval.transport import called_for
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
 Array = npt.NDArray[np.float64]
@@ -402,20 +403,76 @@ def _structural(scene: Scene, ours: Plan) -> Rung:
     blind: list[str] = [name for name in found if found[name].needed and not found[name].simulated]
     if found["caustics"].simulated and small_lights(scene) is not None:
         blind.append("caustics seen in mirrors and through glass")
-    integrators = ours.integrator
-    lacks = []
-    if (found["medium"].needed or found["subsurface"].needed) and (not ours.media or "volpath" not in integrators):
-        lacks.append("a medium needs volpath")
-    if found["depth_of_field"].needed and ours.lens is None:
-        lacks.append("depth of field needs a lens")
-    deepest = max((step.max_depth for step in ours.passes if step.max_depth > 0), default=0)
-    endless = any(step.max_depth < 0 for step in ours.passes)
+    lacks = list(_lacks(scene, ours, caustic=found["caustics"].needed and found["caustics"].simulated))
     bounces = scene.spec.appearance.bounces
-    if not endless and found["refraction"].needed and deepest < 3:
-        lacks.append("refraction needs paths of 3 edges and more")
     words = "what is left out is in neither the file nor Mitsuba's graphs"
     if found["interreflection"].source == "said":
         words += f"; bounces beyond {bounces} are left out by the scene's own word and not part of this proof"
     if blind:
         words += f"; not simulated and so not proved: {', '.join(blind)}"
     return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks, "not_simulated": blind})
+
+
+def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
+    """What the scene's words and Mitsuba's graphs call for and the plan's passes do not make, one sentence each.
+
+    Args:
+        caustic: whether the scene has a caustic that can be simulated.
+    """
+    spec = scene.spec
+    called = called_for(spec)
+    cameras = [step for step in ours.passes if step.integrator != "ptracer"]
+    if ("medium" in called or "subsurface" in called) and (
+        not ours.media or any(step.integrator not in ("volpath", "ptracer") for step in ours.passes)
+    ):
+        yield "a medium needs volpath, in every pass"
+    said = spec.cameras.lens
+    if said is not None and ours.lens is None:
+        yield "depth of field needs a lens"
+    elif said is not None and ours.lens != Lens(said.aperture, said.focus):
+        yield f"the lens is another: aperture {said.aperture:g} and focus {said.focus} are said"
+    elif said is None and ours.lens is not None:
+        yield "the scene says no lens, but the plan has one"
+
+    # What a light shows where something rough is seen first, and where something smooth is (or a lamp, or nothing).
+    both = {"smooth", "rough"}
+    for name, shines in _shining(scene):
+        seen: set[str] = set()
+        for step in ours.passes:
+            if step.sign > 0 and not step.beam and shines(step):
+                seen |= {"rough"} if step.integrator == "ptracer" else both if step.first == "any" else {step.first}
+        missing = sorted(both - seen)
+        if missing:
+            where = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
+            yield f"{name} shines in no pass{where}"
+        taken = sum(step.beam and step.sign < 0 and shines(step) for step in cameras)
+        given = sum(step.beam and step.sign > 0 and shines(step) for step in ours.passes)
+        if taken > given:
+            yield f"the beam of {name} is taken away and no paths from the light put it back"
+
+    # A surface that nothing else faces is lit once; everywhere else any bounce below the scene's own cap may show.
+    bounces = 1 if convex(scene) and not ours.media else spec.appearance.bounces
+    depth = -1 if bounces == "unlimited" else bounces + 1
+    longer = [name for name in ("refraction", "specular", "subsurface", "medium", "interreflection") if name in called]
+    for step in ours.passes:
+        reach = 2 if step.integrator == "direct" else step.max_depth
+        if reach >= 0 and (depth < 0 or reach < depth):
+            wanted = "no end" if depth < 0 else f"{depth} edges"
+            yield f"paths of the pass {step.integrator} have {reach} edges, but {', '.join(longer) or 'the scene'} needs {wanted}"
+
+    if caustic:
+        small = set(small_lamps(scene))
+        for k, light in enumerate(spec.lights):
+            if light.type != "sky" and not any(s.integrator == "ptracer" and k in s.lights for s in ours.passes):
+                yield f"the caustic of lights[{k}], a {light.type}, needs paths from the light (ptracer)"
+        if small and not any(step.integrator == "ptracer" and step.lamps for step in ours.passes):
+            yield f"the caustic of object {spec.objects[min(small)].name!r} needs paths from the light (ptracer)"
+
+
+def _shining(scene: Scene) -> Iterator[tuple[str, Callable[[Pass], bool]]]:
+    """Every light of a scene and its lamps together: what they are called, and whether they shine in a pass."""
+    for k, light in enumerate(scene.spec.lights):
+        yield f"lights[{k}], a {light.type},", lambda step, k=k: k in step.lights
+    lamps = [item.name for item in scene.spec.objects if item.emission]
+    if lamps:
+        yield f"object {lamps[0]!r}, a lamp,", lambda step: step.lamps
