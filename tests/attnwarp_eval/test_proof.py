@@ -118,6 +118,37 @@ def test_the_stated_smallest_difference_is_found_four_times_in_five():
     assert 140 <= sum(found) <= 178
 
 
+def synthetic(trial, kind="normal", brighter=1.0):
+    """What a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls with the samples."""
+
+    def pictures(side, spp, first, count):
+        out = []
+        for k in range(count):
+            rng = np.random.default_rng((trial, side, first + k, spp))
+            grain = rng.standard_normal(SHAPE[1:]) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE[1:]) - 1
+            out.append((brighter if side else 1.0) * (1 + 0.3 / math.sqrt(spp) * grain))
+        return np.stack(out)
+
+    return pictures
+
+
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+@pytest.mark.parametrize(("alpha", "range_"), [(0.01, (0, 8)), (0.05, (1, 21)), (0.2, (14, 59))])
+def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, alpha, range_):
+    found = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
+    # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same pixels refuse together, so
+    # that the whole keeps a little below its rate. At 20 %, two rungs at the full rate each would refuse about 70.
+    assert range_[0] <= found.count("refused") <= range_[1]
+    assert found.count("certified") == 200 - found.count("refused")
+
+
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
+    found = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
+    assert {one.verdict for one in found} == {"refused"}
+    assert all(any(rung.passed is False for rung in one.rungs) for one in found)
+
+
 def test_the_paired_test_agrees_with_scipy():
     rng = np.random.default_rng(9)
     a, b = rng.random((24, 4, 4, 3)), rng.random((24, 4, 4, 3)) + 0.02
