@@ -13,6 +13,7 @@ are pure functions of stacks of pictures.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -504,7 +505,11 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
 def _shining(scene: Scene) -> Iterator[tuple[str, Callable[[Pass], bool]]]:
     """Every light of a scene and its lamps together: what they are called, and whether they shine in a pass."""
     for k, light in enumerate(scene.spec.lights):
-        yield f"lights[{k}], a {light.type},", lambda step, k=k: k in step.lights
+        yield f"lights[{k}], a {light.type},", functools.partial(_shines, k)
     lamps = [item.name for item in scene.spec.objects if item.emission]
     if lamps:
         yield f"object {lamps[0]!r}, a lamp,", lambda step: step.lamps
+
+
+def _shines(light: int, step: Pass) -> bool:
+    return light in step.lights
