@@ -29,6 +29,12 @@ PROTOCOL = 2
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
 
+TIMED = (
+    "time, everything on / plan", "at equal noise", "light changed by the cap", "time, everything on within the cap / plan",
+    "at equal error",
+)  # fmt: skip
+"""Columns that come from timing."""
+
 AMPLIFIED = 8.0
 """How much stronger the difference of two pictures is shown."""
 
@@ -101,8 +107,6 @@ def collect(
 
 
 def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from attnwarp_eval.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
@@ -124,8 +128,7 @@ def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str]
     if settings.rounds:
         progress(f"{scene.name}: time against everything on")
         cost = measure(scene, rounds=settings.rounds)
-        equal = cost.at_equal_error
-        entry["cost"] = asdict(cost) | {"faster": cost.faster, "at_equal_error": equal if np.isfinite(equal) else None}
+        entry["cost"] = cost.to_dict()
     if settings.prove:
         progress(f"{scene.name}: proof")
         proof = prove(scene, seconds=settings.budget)
@@ -208,7 +211,7 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
     from attnwarp_eval.report.model import Table
 
     columns = ["scene", "beyond the usual", "not simulated", "plan", "proof", "bound", "smallest difference seen",
-               "time, everything on / plan", "at equal error"]  # fmt: skip
+               *TIMED]  # fmt: skip
     rows = []
     for entry in entries:
         proof, cost = entry.get("proof"), entry.get("cost")
@@ -224,7 +227,7 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
                 *_times(cost),
             ]
         )
-    return Table(columns, rows, timed=("time, everything on / plan", "at equal error"))
+    return Table(columns, rows, timed=TIMED)
 
 
 def plan_words(planned: Mapping[str, Any]) -> str:
@@ -259,11 +262,20 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     from attnwarp_eval.report.words import number
 
     if cost is None:
-        return ["–", "–"]
-    equal = cost["at_equal_error"]
-    interval = cost["interval"]
-    between = f" [{number(interval[0])}, {number(interval[1])}]" if interval else ""
-    return [number(cost["faster"]), "the plan has no noise" if equal is None else number(equal) + between]
+        return ["–"] * len(TIMED)
+
+    def ratio(equal: float | None, interval: Sequence[float] | None) -> str:
+        between = f" [{number(interval[0])}, {number(interval[1])}]" if interval else ""
+        return "the plan has no noise" if equal is None else number(equal) + between
+
+    noise, cap = ratio(cost["at_equal_noise"], cost["interval"]), cost["cap"]
+    if cap is None:
+        # Both pictures have the same mean, so that equal noise is equal error.
+        return [number(cost["faster"]), noise, "no cap", number(cost["faster"]), noise]
+    bias = "–"
+    if cap["bias"] is not None:
+        bias = f"{cap['bias']:+.1%} [{cap['bias_interval'][0]:+.1%}, {cap['bias_interval'][1]:+.1%}]"
+    return [number(cost["faster"]), noise, bias, number(cap["faster"]), ratio(cap["at_equal_error"], cap["interval"])]
 
 
 def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
@@ -286,10 +298,14 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
     ]
     if costs:
         lead.append(
-            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, plan and everything on (light "
-            f"followed until roulette ends it) in turn, {costs[0]['rounds']} rounds. At equal error: the same times the "
-            "ratio of variances, with a 95 % bootstrap interval over rounds; above 1 the plan saves. An interval that "
-            "holds 1 says that nothing was seen to be saved."
+            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in turn, {costs[0]['rounds']} "
+            "rounds. Everything on follows light until roulette ends it. **At equal noise**: the same times the ratio of "
+            "variances. Where a scene caps its bounces the plan leaves light out by the scene's own word, so that the two "
+            "pictures have other means and equal noise is not equal error: the **light changed by the cap** is the mean of "
+            "the plan's pictures against that of everything on without a cap. **At equal error** is therefore against "
+            "everything on within the cap, whose pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds "
+            "(of the light by Welch's test); above 1 the plan saves. An interval that holds 1 says that nothing was seen to "
+            "be saved."
         )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
     drawn = [entry for entry in entries if "largest_difference" in entry]
