@@ -344,7 +344,7 @@ def effects(
         lines += ["", *proof.lines()]
     typer.echo("\n".join(lines))
     if proof is not None and proof.verdict != "certified":
-        raise fail(f"{loaded.name}: the plan is not certified: {proof.verdict}", TOO_LITTLE)
+        raise fail(f"{loaded.name}: the plan is not certified: {proof.words}", TOO_LITTLE)
 
 
 def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
@@ -352,7 +352,7 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     with clear_errors():
-        from attnwarp_eval.effects_table import Settings, collect
+        from attnwarp_eval.effects_table import Settings, collect, proof_words
         from attnwarp_eval.scene_file import list_scenes
 
         names = list_scenes()
@@ -377,7 +377,7 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
                 raise fail("interrupted; finished scenes are kept, the same command goes on from here", 130) from None
             bar.update(task, description="done", completed=len(names))
     typer.echo(out / "effects.md")
-    doubtful = [f"{e['scene']}: {e['proof']['verdict']}" for e in entries if "proof" in e
+    doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
                 and e["proof"]["verdict"] != "certified"]  # fmt: skip
     if doubtful:
         raise fail(f"not every plan is certified: {'; '.join(doubtful)}", TOO_LITTLE)

@@ -172,15 +172,44 @@ def _varies(texture: Any) -> bool:
 
 
 @dataclass(frozen=True)
+class Cap:
+    """What a scene's own cap on bounces cuts off, and what everything on costs within it.
+
+    Attributes:
+        bounces: the cap.
+        bias: mean light of the plan's pictures over that of everything on without a cap, less 1.
+        bias_interval: its 95 %, by Welch's test on the logarithms of the rounds' means; both None for a black picture.
+        seconds, variance: of everything on within the cap, as :class:`Cost` has them.
+        faster: how many times longer it takes for the same samples.
+        at_equal_error: how many times longer for the same noise, which is the same error, since its pictures have the
+            plan's mean; infinite where the plan has no noise.
+        interval: 95 % of that; None where the plan has no noise.
+    """
+
+    bounces: int
+    bias: float | None
+    bias_interval: tuple[float, float] | None
+    seconds: float
+    variance: float
+    faster: float
+    at_equal_error: float
+    interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
 class Cost:
     """What everything on would cost, against the plan, measured on one small picture of the source.
+
+    Everything on follows light until roulette ends it. Where the scene caps its bounces that is light that the plan leaves
+    out, so that the two pictures have other means: equal noise is not equal error there, and ``cap`` says what is.
 
     Attributes:
         size, spp: of the measurement.
         seconds: (plan, everything on) medians.
         variance: (plan, everything on), mean over pixels and channels, relative to the squared mean.
         rounds: pictures of each, taken in turn.
-        interval: 95 % of :attr:`at_equal_error`, by resampling the rounds; None where the plan has no noise.
+        interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None where the plan has no noise.
+        cap: None where the scene has no cap.
     """
 
     size: int
@@ -189,6 +218,7 @@ class Cost:
     seconds: tuple[float, float]
     variance: tuple[float, float]
     interval: tuple[float, float] | None
+    cap: Cap | None = None
 
     @property
     def faster(self) -> float:
@@ -196,9 +226,16 @@ class Cost:
         return self.seconds[1] / self.seconds[0]
 
     @property
-    def at_equal_error(self) -> float:
+    def at_equal_noise(self) -> float:
         """How many times longer everything on takes for the same noise; infinite where the plan has none."""
         return self.faster * self.variance[1] / self.variance[0] if self.variance[0] > 0 else float("inf")
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON, where infinity is null."""
+        out = asdict(self) | {"faster": self.faster, "at_equal_noise": _finite(self.at_equal_noise)}
+        if self.cap is not None:
+            out["cap"]["at_equal_error"] = _finite(self.cap.at_equal_error)
+        return out
 
 
 def measure(
@@ -206,16 +243,22 @@ def measure(
 ) -> Cost:
     """Render plan and everything on in turn and time both, after one unmeasured picture each.
 
+    Where the scene caps its bounces, everything on within the cap is a third.
+
     Args:
         size, spp: of the picture; if left out as large as needed for tracing, not starting, to take most of the time.
     """
     size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
     small = scene.with_size(size, size)
-    contestants = (plan(small, spp), everything_on(small, spp, capped=False))
-    pictures: tuple[list[Any], list[Any]] = ([], [])
-    seconds: tuple[list[float], list[float]] = ([], [])
+    contestants = [plan(small, spp), everything_on(small, spp, capped=False)]
+    bounces = scene.spec.appearance.bounces
+    if bounces != "unlimited":
+        contestants.append(everything_on(small, spp))
+    pictures: list[list[Any]] = [[] for _ in contestants]
+    seconds: list[list[float]] = [[] for _ in contestants]
     for turn in range(rounds + 1):
-        for k in (0, 1) if turn % 2 else (1, 0):
+        for step in range(len(contestants)):
+            k = (step + turn) % len(contestants)
             start = time.perf_counter()
             picture = render_plan(small, small.source, contestants[k], seed + turn)
             if turn:
@@ -225,19 +268,54 @@ def measure(
     taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
     variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
     medians = [float(np.median(s)) for s in seconds]
-    interval = None
-    if variance[0] > 0:
-        # Two rounds are paired in time, since what else the machine does slows both.
-        ratio = np.array(seconds[1]) / np.array(seconds[0])
-        # Squared distances between rounds: the variance of a resample is the mean over its pairs of different rounds.
-        apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in taken]
-        draws = np.random.default_rng(0).integers(0, rounds, (1000, rounds))
-        spread = [np.array([_between(a, d) for d in draws]) for a in apart]
-        known = (spread[0] > 0) & (spread[1] > 0)
-        values = np.median(ratio[draws], axis=1)[known] * spread[1][known] / spread[0][known]
-        low, high = np.percentile(values, [2.5, 97.5])
-        interval = (float(low), float(high))
-    return Cost(size, spp, rounds, (medians[0], medians[1]), (variance[0], variance[1]), interval)
+    interval = _ratio_interval(taken[0], taken[1], seconds[0], seconds[1])
+    cap = None
+    if bounces != "unlimited":
+        faster = medians[2] / medians[0]
+        bias, between = _cut(taken[0].mean(1), taken[1].mean(1))
+        cap = Cap(
+            bounces, bias, between, medians[2], variance[2], faster,
+            faster * variance[2] / variance[0] if variance[0] > 0 else float("inf"),
+            _ratio_interval(taken[0], taken[2], seconds[0], seconds[2]),
+        )  # fmt: skip
+    return Cost(size, spp, rounds, (medians[0], medians[1]), (variance[0], variance[1]), interval, cap)
+
+
+def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | None]:
+    """Relative difference of two means with its 95 % interval, from the means of independent pictures."""
+    from scipy import stats
+
+    if min(ours.min(), full.min()) <= 0 or len(ours) < 2:
+        return None, None
+    # Logarithms, so that the noise of the reference counts as well.
+    a, b = np.log(ours), np.log(full)
+    middle, parts = float(a.mean() - b.mean()), [float(x.var(ddof=1)) / len(x) for x in (a, b)]
+    # Rounding aside: pictures without noise differ by exactly what they differ by.
+    if sum(parts) < 1e-20:
+        return float(np.expm1(middle)), (float(np.expm1(middle)), float(np.expm1(middle)))
+    freedom = sum(parts) ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(parts, (a, b), strict=True))
+    reach = float(stats.t.ppf(0.975, freedom)) * float(np.sqrt(sum(parts)))
+    return float(np.expm1(middle)), (float(np.expm1(middle - reach)), float(np.expm1(middle + reach)))
+
+
+def _ratio_interval(
+    ours: Array, other: Array, ours_seconds: list[float], other_seconds: list[float]
+) -> tuple[float, float] | None:
+    """95 % of the ratio of variance times time, by resampling rounds; None where ``ours`` has no noise."""
+    rounds = len(ours)
+    if not ours.var(0).any():
+        return None
+    # Two rounds are paired in time, since what else the machine does slows both.
+    ratio = np.array(other_seconds) / np.array(ours_seconds)
+    # Squared distances between rounds: the variance of a resample is the mean over its pairs of different rounds.
+    apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in (ours, other)]
+    draws = np.random.default_rng(0).integers(0, rounds, (1000, rounds))
+    spread = [np.array([_between(a, d) for d in draws]) for a in apart]
+    known = (spread[0] > 0) & (spread[1] > 0)
+    if not known.any():
+        return None
+    low, high = np.percentile(np.median(ratio[draws], axis=1)[known] * spread[1][known] / spread[0][known], [2.5, 97.5])
+    return float(low), float(high)
 
 
 def _between(apart: Array, drawn: npt.NDArray[np.int64]) -> float:
@@ -257,7 +335,7 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
         "everything_on": everything_on(scene, capped=False).to_dict(),
     }
     if cost is not None:
-        out["cost"] = asdict(cost) | {"faster": cost.faster, "at_equal_error": _finite(cost.at_equal_error)}
+        out["cost"] = cost.to_dict()
     return out
 
 
@@ -287,7 +365,7 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
     yield f"geometry: {about['geometry']['reasons'][0]}"
     if "cost" in about:
         cost = about["cost"]
-        equal = cost["at_equal_error"]
+        equal = cost["at_equal_noise"]
         yield (
             f"cost of a {cost['size']} x {cost['size']} picture, {cost['spp']} samples: "
             f"plan {cost['seconds'][0]:.3f} s, everything on {cost['seconds'][1]:.3f} s ({cost['faster']:.1f} times); "
@@ -295,9 +373,25 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
             + (
                 "the plan needs one sample, since it has none"
                 if equal is None
-                else f"{equal:.1f} times ({cost['interval'][0]:.1f} to {cost['interval'][1]:.1f})"
+                else f"{equal:.1f} times{_span(cost['interval'])}"
             )
         )
+        if cap := cost["cap"]:
+            if cap["bias"] is not None:
+                low, high = cap["bias_interval"]
+                yield (
+                    f"  not for the same error: the scene's cap of {cap['bounces']} bounces changes the picture's light by "
+                    f"{cap['bias']:+.1%} ({low:+.1%} to {high:+.1%}) against light without a cap"
+                )
+            equal = cap["at_equal_error"]
+            yield (
+                f"  everything on within the cap {cap['seconds']:.3f} s ({cap['faster']:.1f} times)"
+                + ("" if equal is None else f"; for the same error {equal:.1f} times{_span(cap['interval'])}")
+            )
+
+
+def _span(interval: tuple[float, float] | None) -> str:
+    return f" ({interval[0]:.1f} to {interval[1]:.1f})" if interval else ""
 
 
 def _words(scene: Scene, step: dict[str, Any]) -> str:

@@ -23,11 +23,17 @@ from attnwarp_eval.transport import called_for
 if TYPE_CHECKING:
     from attnwarp_eval.report.model import Table
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Raised whenever an entry would come out otherwise."""
 
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
+
+TIMED = (
+    "time, everything on / plan", "at equal noise", "light changed by the cap", "time, everything on within the cap / plan",
+    "at equal error",
+)  # fmt: skip
+"""Columns that come from timing."""
 
 AMPLIFIED = 8.0
 """How much stronger the difference of two pictures is shown."""
@@ -101,8 +107,6 @@ def collect(
 
 
 def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]) -> dict[str, Any]:
-    from dataclasses import asdict
-
     from attnwarp_eval.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
@@ -124,8 +128,7 @@ def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str]
     if settings.rounds:
         progress(f"{scene.name}: time against everything on")
         cost = measure(scene, rounds=settings.rounds)
-        equal = cost.at_equal_error
-        entry["cost"] = asdict(cost) | {"faster": cost.faster, "at_equal_error": equal if np.isfinite(equal) else None}
+        entry["cost"] = cost.to_dict()
     if settings.prove:
         progress(f"{scene.name}: proof")
         proof = prove(scene, seconds=settings.budget)
@@ -208,7 +211,7 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
     from attnwarp_eval.report.model import Table
 
     columns = ["scene", "beyond the usual", "not simulated", "plan", "proof", "bound", "smallest difference seen",
-               "time, everything on / plan", "at equal error"]  # fmt: skip
+               *TIMED]  # fmt: skip
     rows = []
     for entry in entries:
         proof, cost = entry.get("proof"), entry.get("cost")
@@ -218,18 +221,25 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
                 ", ".join(name for name in entry["needed"] if name not in USUAL) or "–",
                 ", ".join(entry["not_simulated"]) or "–",
                 plan_words(entry["plan"]),
-                "not asked" if proof is None else proof["verdict"],
+                "not asked" if proof is None else proof_words(proof),
                 _bound(proof),
                 _smallest(proof),
                 *_times(cost),
             ]
         )
-    return Table(columns, rows, timed=("time, everything on / plan", "at equal error"))
+    return Table(columns, rows, timed=TIMED)
 
 
 def plan_words(planned: Mapping[str, Any]) -> str:
     """A plan in a few words: integrator, and the camera where it is not a pinhole."""
     return str(planned["integrator"]) + (", thin lens" if planned["sensor"]["type"] == "thinlens" else "")
+
+
+def proof_words(proof: Mapping[str, Any]) -> str:
+    """A verdict in a few words, with what the comparison alone came to where something is not simulated."""
+    if proof["verdict"] == proof["of_simulated"]:
+        return str(proof["verdict"])
+    return f"{proof['verdict']} ({proof['of_simulated']} but for what is not simulated)"
 
 
 def _bound(proof: Mapping[str, Any] | None) -> str:
@@ -252,11 +262,20 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     from attnwarp_eval.report.words import number
 
     if cost is None:
-        return ["–", "–"]
-    equal = cost["at_equal_error"]
-    interval = cost["interval"]
-    between = f" [{number(interval[0])}, {number(interval[1])}]" if interval else ""
-    return [number(cost["faster"]), "the plan has no noise" if equal is None else number(equal) + between]
+        return ["–"] * len(TIMED)
+
+    def ratio(equal: float | None, interval: Sequence[float] | None) -> str:
+        between = f" [{number(interval[0])}, {number(interval[1])}]" if interval else ""
+        return "the plan has no noise" if equal is None else number(equal) + between
+
+    noise, cap = ratio(cost["at_equal_noise"], cost["interval"]), cost["cap"]
+    if cap is None:
+        # Both pictures have the same mean, so that equal noise is equal error.
+        return [number(cost["faster"]), noise, "no cap", number(cost["faster"]), noise]
+    bias = "–"
+    if cap["bias"] is not None:
+        bias = f"{cap['bias']:+.1%} [{cap['bias_interval'][0]:+.1%}, {cap['bias_interval'][1]:+.1%}]"
+    return [number(cost["faster"]), noise, bias, number(cap["faster"]), ratio(cap["at_equal_error"], cap["interval"])]
 
 
 def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
@@ -264,10 +283,13 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
     from attnwarp_eval.report.write import markdown
 
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
+    partly = sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries) - certified
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
     costs = [entry["cost"] for entry in entries if "cost" in entry]
     lead = [
-        f"{len(entries)} scenes, {certified} of their plans certified. Mitsuba {about['versions']['mitsuba']} as "
+        f"{len(entries)} scenes, {certified} of their plans certified"
+        + (f", {partly} more but for what is not simulated" if partly else "")
+        + f". Mitsuba {about['versions']['mitsuba']} as "
         f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
         f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of docs/effects.md at 32 x 32 "
         "from the source; **bound** is |d| + 2.33 SE of the picture's mean, which must stay below 1 %; the **smallest "
@@ -276,10 +298,14 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
     ]
     if costs:
         lead.append(
-            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, plan and everything on (light "
-            f"followed until roulette ends it) in turn, {costs[0]['rounds']} rounds. At equal error: the same times the "
-            "ratio of variances, with a 95 % bootstrap interval over rounds; above 1 the plan saves. An interval that "
-            "holds 1 says that nothing was seen to be saved."
+            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in turn, {costs[0]['rounds']} "
+            "rounds. Everything on follows light until roulette ends it. **At equal noise**: the same times the ratio of "
+            "variances. Where a scene caps its bounces the plan leaves light out by the scene's own word, so that the two "
+            "pictures have other means and equal noise is not equal error: the **light changed by the cap** is the mean of "
+            "the plan's pictures against that of everything on without a cap. **At equal error** is therefore against "
+            "everything on within the cap, whose pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds "
+            "(of the light by Welch's test); above 1 the plan saves. An interval that holds 1 says that nothing was seen to "
+            "be saved."
         )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
     drawn = [entry for entry in entries if "largest_difference" in entry]

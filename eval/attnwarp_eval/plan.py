@@ -293,14 +293,22 @@ def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
 
 
 def convex(scene: Scene) -> bool:
-    """Whether a scene is a single convex surface, which never lights itself."""
-    shapes = scene.shapes() if len(scene.spec.objects) == 1 else []
+    """Whether a scene is a single convex surface, which never lights itself. Glass does: light passes through it."""
+    alone = len(scene.spec.objects) == 1 and not isinstance(scene.spec.objects[0].material, optics.GlassMaterial)
+    shapes = scene.shapes() if alone else []
     return len(shapes) == 1 and isinstance(shapes[0], Box | Rectangle | Sphere)
 
 
 def small_lights(scene: Scene) -> str | None:
     """Names the lights too small to be met by chance through smooth glass or a mirror; None where there are none."""
     names: list[str] = [light.type for light in scene.spec.lights if light.type != "sky"]
+    names += [f"object {scene.spec.objects[k].name!r}" for k in small_lamps(scene)]
+    return ", ".join(names) or None
+
+
+def small_lamps(scene: Scene) -> list[int]:
+    """Indices of the objects that shine and are too small to be met by chance through smooth glass or a mirror."""
+    found_small: list[int] = []
     lamps = [k for k, item in enumerate(scene.spec.objects) if item.emission]
     if lamps:
         bent = smooth_objects(scene)
@@ -313,8 +321,8 @@ def small_lights(scene: Scene) -> str | None:
             low, high = np.min([b[0] for b in boxes[k]], axis=0), np.max([b[1] for b in boxes[k]], axis=0)
             away = min(float(np.linalg.norm(middle[k] - middle[j])) for j in bent) if bent else 0.0
             if float(np.linalg.norm(high - low)) / 2 < SMALL * away:
-                names.append(f"object {scene.spec.objects[k].name!r}")
-    return ", ".join(names) or None
+                found_small.append(k)
+    return found_small
 
 
 BEAM_MARGIN = 1.05

@@ -7,14 +7,16 @@
    picture, with Sidak's correction over all of them, AND equivalence of the whole (two one-sided tests within 1 %).
 
 No difference found is not yet equality: only the equivalence test certifies, and it refuses when the noise is too great
-for it. The statistics are pure functions of stacks of pictures.
+for it. What neither side simulates no comparison can find: a scene that calls for it is never certified. The statistics
+are pure functions of stacks of pictures.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -22,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.effects import detect
-from attnwarp_eval.optics import NOT_SIMULATED
-from attnwarp_eval.plan import Plan, everything_on, plan
+from attnwarp_eval.plan import Lens, Pass, Plan, convex, everything_on, plan, small_lamps, small_lights
 from attnwarp_eval.scene import Scene
+from attnwarp_eval.transport import called_for
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
 Array = npt.NDArray[np.float64]
@@ -37,10 +39,7 @@ ONE_SIDED = 2.33
 """Normal quantile of 1 %: |d| + 2.33 SE < margin is two one-sided tests at 1 % each."""
 
 ALPHA = 0.01
-"""Chance that a rung refuses a plan that drops nothing."""
-
-POWER = 0.84
-"""Normal quantile of 80 %: the power at which the smallest difference that could have been seen is stated."""
+"""Chance that the whole ladder refuses a plan that drops nothing; the rungs share it."""
 
 BLOCK = 8
 
@@ -239,8 +238,10 @@ class Proof:
     """What the ladder says of a plan.
 
     Attributes:
-        verdict: "certified" only when bits are equal or the equivalence test holds and nothing else refused;
-            "refused" when a difference was found; "can't tell" when there was too much noise for either.
+        verdict: "certified" only when bits are equal or the equivalence test holds, nothing else refused, and all that
+            the scene calls for is simulated; "refused" when a difference was found; "can't tell" otherwise.
+        of_simulated: what the comparison alone says, of what is simulated; above ``verdict`` only where something is not.
+        not_simulated: what the scene calls for and neither the plan nor everything on shows.
         rungs: the tests, in order.
         detectable: the smallest difference that could have been seen, a share of the mean, by level.
         seconds: spent.
@@ -250,6 +251,15 @@ class Proof:
     rungs: tuple[Rung, ...]
     detectable: dict[str, float]
     seconds: float
+    of_simulated: Verdict
+    not_simulated: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The verdict, with the reason where it is not that of the comparison."""
+        if self.verdict == self.of_simulated:
+            return self.verdict
+        return f"{self.verdict}: not simulated: {', '.join(self.not_simulated)}; {self.of_simulated} but for that"
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -257,7 +267,7 @@ class Proof:
 
     def lines(self) -> Iterator[str]:
         """For a person."""
-        yield f"proof: {self.verdict} ({self.seconds:.1f} s)"
+        yield f"proof: {self.words} ({self.seconds:.1f} s)"
         for rung in self.rungs:
             word = {None: "-", True: "ok", False: "REFUSED"}[rung.passed]
             yield f"  {rung.name:20} {word:8} {rung.words}"
@@ -298,6 +308,7 @@ def prove(
     ours = plan(scene) if ours is None else ours
     against = everything_on(scene) if against is None else against
     rungs = [_structural(scene, ours)] if structure else []
+    blind = tuple(rungs[0].numbers["not_simulated"]) if rungs else ()
     made_by = comparable(scene)
 
     def pictures(made: Plan, spp: int, first: int, count: int) -> Array:
@@ -307,33 +318,70 @@ def prove(
         ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
-        return Proof(verdict, tuple(rungs), detectable or {}, time.perf_counter() - start)
+        # Both sides lack what is not simulated, so that equal pictures say nothing of it; unequal ones still refuse.
+        capped: Verdict = "can't tell" if blind and verdict == "certified" else verdict
+        return Proof(capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind)
 
     if rungs and rungs[0].passed is False:
         return finish("refused")
+    found = climb(
+        lambda side, spp, first, count: pictures((ours, against)[side], spp, first, count),
+        seeds=seeds, seconds=seconds - (time.perf_counter() - start), seed=seed,
+    )  # fmt: skip
+    rungs.extend(found.rungs)
+    return finish(found.verdict, found.detectable)
+
+
+Pictures = Callable[[int, int, int, int], Array]
+"""Pictures (count, H, W, C) of a side (0 the plan, 1 everything on), samples a pixel, first seed and count."""
+
+
+@dataclass(frozen=True)
+class Climb:
+    """What the rungs after the first say, by pictures alone."""
+
+    verdict: Verdict
+    rungs: tuple[Rung, ...]
+    detectable: dict[str, float]
+
+
+def climb(
+    pictures: Pictures, *, seeds: int = 12, seconds: float = 60.0, seed: int = 1000, alpha: float = ALPHA
+) -> Climb:
+    """The rungs that look at pictures only; together they refuse two sides that are the same with chance ``alpha``.
+
+    Two of them can refuse, paired bias and Welch's test, and they look at pictures of different seeds: each has Sidak's
+    share of ``alpha``.
+    """
+    from scipy import stats
+
+    start = time.perf_counter()
+    rungs: list[Rung] = []
+    share = sidak(alpha, 2)
     pairs = 24
-    a, b = pictures(ours, 1, seed, pairs), pictures(against, 1, seed, pairs)
+    a, b = pictures(0, 1, seed, pairs), pictures(1, 1, seed, pairs)
     if np.array_equal(a, b):
         rungs.append(Rung("same seed", True, f"{pairs} pictures equal bit for bit: the paths are the same"))
-        return finish("certified", {"any": 0.0})
+        return Climb("certified", tuple(rungs), {"any": 0.0})
     rungs.append(Rung("same seed", None, "the pictures differ, as those of different paths do"))
     common = paired(a, b)
-    bad = common.p < ALPHA
+    bad = common.p < share
     rungs.append(
         Rung(
             "paired bias, 1 spp", not bad,
             f"everything on is {common.difference:+.2%} +- {common.error:.2%} brighter over {pairs} common seeds "
-            f"(p = {common.p:.2g})",
+            f"(p = {common.p:.2g}, refused below {share:.2g})",
             asdict(common),
         )
     )  # fmt: skip
     if bad:
-        return finish("refused", {"picture": (2.58 + POWER) * common.error})
+        reach = float(stats.t.isf(share / 2, pairs - 1) + stats.t.ppf(0.8, pairs - 1))
+        return Climb("refused", tuple(rungs), {"picture": reach * common.error})
 
-    spp = _samples(ours, against, pictures, seed + pairs, seeds, seconds - (time.perf_counter() - start))
-    a = pictures(ours, spp, seed + 1000, seeds)
-    b = pictures(against, spp, seed + 2000, seeds)
-    found = levels(a, b)
+    spp = _samples(pictures, seed + pairs, seeds, seconds - (time.perf_counter() - start))
+    a = pictures(0, spp, seed + 1000, seeds)
+    b = pictures(1, spp, seed + 2000, seeds)
+    found = levels(a, b, alpha=share)
     detectable = {level.name: level.detectable for level in found}
     for level in found:
         rungs.append(
@@ -354,8 +402,8 @@ def prove(
         )
     )  # fmt: skip
     if any(level.differs for level in found):
-        return finish("refused", detectable)
-    return finish("certified" if same.equal else "can't tell", detectable)
+        return Climb("refused", tuple(rungs), detectable)
+    return Climb("certified" if same.equal else "can't tell", tuple(rungs), detectable)
 
 
 def _with_spp(made: Plan, spp: int) -> Plan:
@@ -365,11 +413,11 @@ def _with_spp(made: Plan, spp: int) -> Plan:
     return replace(made, passes=tuple(replace(step, spp=spp * step.spp // least) for step in made.passes))
 
 
-def _samples(ours: Plan, against: Plan, pictures: Any, seed: int, seeds: int, seconds: float) -> int:
+def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
     """Samples a pixel at which 2.33 standard errors come to half the margin, or as many as the time allows."""
     trial, count = 4, 6
     start = time.perf_counter()
-    means = [pictures(made, trial, seed + 100 * k, count).mean((1, 2, 3)) for k, made in enumerate((ours, against))]
+    means = [pictures(side, trial, seed + 100 * side, count).mean((1, 2, 3)) for side in (0, 1)]
     each = (time.perf_counter() - start) / count / trial
     scale = max(abs(float(means[1].mean())), 1e-300)
     variance = sum(float(m.var(ddof=1)) for m in means) / scale**2 * trial  # of one sample, both sides together
@@ -385,22 +433,83 @@ def _samples(ours: Plan, against: Plan, pictures: Any, seed: int, seeds: int, se
 def _structural(scene: Scene, ours: Plan) -> Rung:
     """Whether what the plan leaves out is absent from all that was looked at."""
     found = detect(scene)
-    missing = [name for name in found if found[name].needed and not found[name].simulated and name not in NOT_SIMULATED]
-    named = [name for name in NOT_SIMULATED if found[name].needed]
-    integrators = ours.integrator
-    lacks = []
-    if (found["medium"].needed or found["subsurface"].needed) and (not ours.media or "volpath" not in integrators):
-        lacks.append("a medium needs volpath")
-    if found["depth_of_field"].needed and ours.lens is None:
-        lacks.append("depth of field needs a lens")
-    deepest = max((step.max_depth for step in ours.passes if step.max_depth > 0), default=0)
-    endless = any(step.max_depth < 0 for step in ours.passes)
+    blind: list[str] = [name for name in found if found[name].needed and not found[name].simulated]
+    if found["caustics"].simulated and small_lights(scene) is not None:
+        blind.append("caustics seen in mirrors and through glass")
+    lacks = list(_lacks(scene, ours, caustic=found["caustics"].needed and found["caustics"].simulated))
     bounces = scene.spec.appearance.bounces
-    if not endless and found["refraction"].needed and deepest < 3:
-        lacks.append("refraction needs paths of 3 edges and more")
     words = "what is left out is in neither the file nor Mitsuba's graphs"
     if found["interreflection"].source == "said":
         words += f"; bounces beyond {bounces} are left out by the scene's own word and not part of this proof"
-    if missing or named:
-        words += f"; not simulated and so not proved: {', '.join([*missing, *named])}"
-    return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks})
+    if blind:
+        words += f"; not simulated and so not proved: {', '.join(blind)}"
+    return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks, "not_simulated": blind})
+
+
+def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
+    """What the scene's words and Mitsuba's graphs call for and the plan's passes do not make, one sentence each.
+
+    Args:
+        caustic: whether the scene has a caustic that can be simulated.
+    """
+    spec = scene.spec
+    called = called_for(spec)
+    cameras = [step for step in ours.passes if step.integrator != "ptracer"]
+    if ("medium" in called or "subsurface" in called) and (
+        not ours.media or any(step.integrator not in ("volpath", "ptracer") for step in ours.passes)
+    ):
+        yield "a medium needs volpath, in every pass"
+    said = spec.cameras.lens
+    if said is not None and ours.lens is None:
+        yield "depth of field needs a lens"
+    elif said is not None and ours.lens != Lens(said.aperture, said.focus):
+        yield f"the lens is another: aperture {said.aperture:g} and focus {said.focus} are said"
+    elif said is None and ours.lens is not None:
+        yield "the scene says no lens, but the plan has one"
+
+    # What a light shows where something rough is seen first, and where something smooth is (or a lamp, or nothing).
+    both = {"smooth", "rough"}
+    for name, shines in _shining(scene):
+        seen: set[str] = set()
+        for step in ours.passes:
+            if step.sign > 0 and not step.beam and shines(step):
+                seen |= {"rough"} if step.integrator == "ptracer" else both if step.first == "any" else {step.first}
+        missing = sorted(both - seen)
+        if missing:
+            where = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
+            yield f"{name} shines in no pass{where}"
+        taken = sum(step.beam and step.sign < 0 and shines(step) for step in cameras)
+        given = sum(step.beam and step.sign > 0 and shines(step) for step in ours.passes)
+        if taken > given:
+            yield f"the beam of {name} is taken away and no paths from the light put it back"
+
+    # A surface that nothing else faces is lit once; everywhere else any bounce below the scene's own cap may show.
+    bounces = 1 if convex(scene) and not ours.media else spec.appearance.bounces
+    depth = -1 if bounces == "unlimited" else bounces + 1
+    longer = [name for name in ("refraction", "specular", "subsurface", "medium", "interreflection") if name in called]
+    for step in ours.passes:
+        reach = 2 if step.integrator == "direct" else step.max_depth
+        if reach >= 0 and (depth < 0 or reach < depth):
+            wanted = "no end" if depth < 0 else f"{depth} edges"
+            yield f"paths of the pass {step.integrator} have {reach} edges, but {', '.join(longer) or 'the scene'} needs {wanted}"
+
+    if caustic:
+        small = set(small_lamps(scene))
+        for k, light in enumerate(spec.lights):
+            if light.type != "sky" and not any(s.integrator == "ptracer" and k in s.lights for s in ours.passes):
+                yield f"the caustic of lights[{k}], a {light.type}, needs paths from the light (ptracer)"
+        if small and not any(step.integrator == "ptracer" and step.lamps for step in ours.passes):
+            yield f"the caustic of object {spec.objects[min(small)].name!r} needs paths from the light (ptracer)"
+
+
+def _shining(scene: Scene) -> Iterator[tuple[str, Callable[[Pass], bool]]]:
+    """Every light of a scene and its lamps together: what they are called, and whether they shine in a pass."""
+    for k, light in enumerate(scene.spec.lights):
+        yield f"lights[{k}], a {light.type},", functools.partial(_shines, k)
+    lamps = [item.name for item in scene.spec.objects if item.emission]
+    if lamps:
+        yield f"object {lamps[0]!r}, a lamp,", lambda step: step.lamps
+
+
+def _shines(light: int, step: Pass) -> bool:
+    return light in step.lights

@@ -39,6 +39,7 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
     small = [f"lights[{k}] is a {light.type}" for k, light in enumerate(spec.lights) if light.type != "sky"]
     small += [f"object {item.name!r} shines" for item in spec.objects if item.emission]
     bent: list[str] = []
+    polarising = False
     for item in spec.objects:
         if item.velocity is not None and any(item.velocity):
             note("motion", f"object {item.name!r} has a velocity")
@@ -53,6 +54,8 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
         note("glossy" if rough else "specular", f"{name}, roughness {rough:g}")
         if not rough:
             bent.append(name)
+            # A mirror here is ideal: it reflects both polarisations alike, so that only metal and glass tell them apart.
+            polarising |= not isinstance(material, MirrorMaterial)
         if isinstance(material, GlassMaterial):
             note("refraction", name)
             if material.interior:
@@ -61,7 +64,7 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
                 note("dispersion", f"{name} of Abbe number {material.abbe:g}")
     if bent and small:
         note("caustics", f"{bent[0]}, and {small[0]}")
-    if "refraction" in found or len(bent) > 1:
+    if "refraction" in found or (len(bent) > 1 and polarising):
         note(
             "polarisation", f"light meets specular surfaces more than once: {bent[0] if bent else found['refraction']}"
         )

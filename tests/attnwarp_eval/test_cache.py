@@ -2,11 +2,14 @@
 
 import multiprocessing
 import os
+import re
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from attnwarp_eval import cache
+from attnwarp_eval.cli import app
 from attnwarp_eval.errors import InputError
 
 
@@ -85,3 +88,26 @@ def test_many_small_writes_do_not_each_look_at_every_file_and_stay_within_a_hund
     assert all((tmp_path / "kind" / f"{k:04}.npz").exists() for k in range(590, 600))
     assert max(sizes) > 0.9e6 and max(sizes) <= 1.01e6 + 4000
     assert looks < 250
+
+
+def test_the_command_line_tells_what_lies_in_the_cache_and_removes_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    monkeypatch.delenv("ATTNWARP_CACHE_GB", raising=False)
+    runner = CliRunner()
+    empty = runner.invoke(app, ["cache", "info"])
+    assert empty.exit_code == 0 and re.search(r"all +0 files +0\.0 MB", empty.stdout)
+    for kind, number in (("meshes", 1), ("pictures", 2)):
+        for k in range(number):
+            path = tmp_path / kind / f"{k}.npz"
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(bytes(1_500_000))
+    told = runner.invoke(app, ["cache", "info"])
+    assert told.exit_code == 0 and str(tmp_path) in told.stdout.replace("\n", "")
+    assert re.search(r"meshes +1 files +1\.5 MB", told.stdout) and re.search(r"pictures +2 files +3\.0 MB", told.stdout)
+    assert re.search(r"all +3 files +4\.5 MB", told.stdout)
+    cleared = runner.invoke(app, ["cache", "clear"])
+    assert cleared.exit_code == 0 and "4.5 MB removed" in cleared.stdout
+    assert not list(tmp_path.rglob("*.npz")) and tmp_path.is_dir()
+    monkeypatch.setenv("ATTNWARP_CACHE_GB", "much")
+    wrong = runner.invoke(app, ["cache", "info"])
+    assert wrong.exit_code == 2 and "ATTNWARP_CACHE_GB" in wrong.output

@@ -1,7 +1,9 @@
 """Which effects a scene needs, what is planned for them, and materials, lamps, fog and lens against closed forms."""
 
+import functools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,6 +94,46 @@ def test_a_caustic_behind_a_lens_is_named_as_not_simulated():
     assert found["caustics"].needed and not found["caustics"].simulated
     structure = proof.prove(scene, seconds=0.1).rungs[0]
     assert "caustics" in structure.words and "not proved" in structure.words
+
+
+def test_a_scene_that_calls_for_what_is_not_simulated_is_never_certified():
+    # Both sides are the same plan, so that every picture is equal: the comparison alone certifies each time.
+    lens = make([FLOOR, ball(GLASS)], [POINT], 8, cameras={"lens": {"aperture": 0.1}})
+    moving = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SKY])
+    mirrors = make([FLOOR, ball(MIRROR)], [POINT], 4)
+    for scene, missing in (
+        (lens, "caustics"),
+        (moving, "motion"),
+        (SCENES["refraction"](), "polarisation"),
+        (mirrors, "caustics seen in mirrors and through glass"),
+    ):
+        found = proof.prove(scene, against=plan(scene), size=8)
+        assert found.of_simulated in ("certified", "can't tell"), list(found.lines())
+        assert found.verdict == "can't tell" and missing in found.not_simulated
+    still = make([FLOOR, ball()], [SKY])
+    found = proof.prove(still, against=plan(still), size=8)
+    assert (found.verdict, found.of_simulated, found.not_simulated) == ("certified", "certified", ())
+    # A difference is a difference whatever else is missing.
+    lit = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SUN, SKY])
+    refused = proof.prove(lit, replace(plan(lit), passes=plan(lit).passes[:1]), size=8)
+    assert refused.verdict == "refused"
+
+
+def test_ideal_mirrors_alone_polarise_nothing_and_metal_and_glass_do():
+    mirrors = [ball(MIRROR, name="a"), ball(MIRROR, (1.5, 0, 0.7), name="b")]
+    metal = ball({"type": "metal", "metal": "Al"}, (0, 1.5, 0.7), name="c")
+    calls = lambda objects: "polarisation" in transport.called_for(make([FLOOR, *objects], [SKY], 8).spec)  # noqa: E731
+    assert not calls(mirrors) and not calls([metal])
+    assert calls([*mirrors, metal]) and calls([ball(GLASS)])
+
+
+def test_the_command_line_ends_with_3_and_names_what_is_not_simulated(monkeypatch):
+    scene = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SKY], size=8)
+    monkeypatch.setattr("attnwarp_eval.scene_file.load_scene", lambda name: scene)
+    monkeypatch.setattr(effects, "measure", functools.partial(effects.measure, size=8, spp=4, rounds=2))
+    result = CliRunner().invoke(app, ["scenes", "effects", "moving", "--prove"])
+    assert result.exit_code == 3, result.output
+    assert "not simulated: motion" in " ".join(result.output.split())
 
 
 def test_only_geometry_needs_no_light():

@@ -6,7 +6,8 @@ import json
 import cv2
 import numpy as np
 import pytest
-from effect_scenes import FLOOR, SKY, SUN, make
+from effect_scenes import FLOOR, SKY, SUN, ball, make
+from scipy import stats
 from typer.testing import CliRunner
 
 from attnwarp_eval import effects, effects_table
@@ -49,11 +50,60 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
 
 
 def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
-    (entry,) = collect(["spheres"], tmp_path, Settings(rounds=0, pictures=False))
-    assert entry["proof"]["verdict"] == "certified"
-    ((_, _, _, _, verdict, bound, smallest, faster, equal),) = effects_table.table([entry]).rows
+    # A budget for a busy machine; a quiet one needs a few seconds of it.
+    (entry,) = collect(["spheres"], tmp_path, Settings(rounds=0, pictures=False, budget=240))
+    assert entry["proof"]["verdict"] == "certified", entry["proof"]
+    ((_, _, _, _, verdict, bound, smallest, *times),) = effects_table.table([entry]).rows
     assert verdict == "certified" and float(bound.rstrip("%")) < 1 and "picture" in smallest and "pixel" in smallest
-    assert (faster, equal) == ("–", "–")
+    assert times == ["–"] * 5
+
+
+def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeypatch):
+    # Synthetic renderings: the capped ones have mean 0.8, those without a cap 1; noise and time are planted.
+    scene = make([FLOOR, ball()], [SKY], 1, size=8)
+    free = effects.everything_on(scene.with_size(8, 8), 4, capped=False)
+    full = effects.everything_on(scene.with_size(8, 8), 4)
+    clock = [0.0]
+    monkeypatch.setattr(effects.time, "perf_counter", lambda: clock[0])
+
+    def render(scene, camera, made, seed):
+        mean, noise, seconds = (
+            (1.0, 0.04, 3.0) if made == free else (0.8, 0.03, 2.0) if made == full else (0.8, 0.02, 1.0)
+        )
+        clock[0] += seconds
+        return mean + noise * np.random.default_rng((seed, int(seconds))).standard_normal((8, 8, 3))
+
+    monkeypatch.setattr(effects, "render_plan", render)
+    cost = effects.measure(scene, size=8, spp=4, rounds=40)
+    low, high = cost.cap.bias_interval
+    # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192) = 0.054 %.
+    assert cost.cap.bias == pytest.approx(-0.2, abs=0.0025) and low < -0.2 < high and high - low < 0.003
+    assert cost.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
+    assert (
+        cost.cap.at_equal_error == pytest.approx(2 * 2.25, rel=0.1)
+        and cost.cap.interval[0] < 4.5 < cost.cap.interval[1]
+    )
+    about = effects.report(scene, cost=cost) | {"cost": cost.to_dict()}
+    text = "\n".join(effects.describe(scene, about))
+    assert "not for the same error: the scene's cap of 1 bounces changes the picture's light by -20" in text
+    row = effects_table._times(json.loads(json.dumps(cost.to_dict())))
+    assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
+    endless = effects.measure(make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3)
+    assert endless.cap is None and effects_table._times(endless.to_dict())[2] == "no cap"
+
+
+def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak_of():
+    bias, (low, high) = effects._cut(np.full(5, 0.5), np.full(5, 1.0))
+    assert bias == low == high == pytest.approx(-0.5, rel=1e-12)
+    assert effects._cut(np.zeros(5), np.ones(5)) == (None, None)
+    assert effects._cut(np.ones(1), np.ones(1)) == (None, None)
+
+
+def test_the_interval_of_the_light_cut_off_is_scipys():
+    a, b = np.random.default_rng(0).uniform(0.7, 0.9, 7), np.random.default_rng(1).uniform(0.95, 1.05, 9)
+    theirs = stats.ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.95)
+    bias, ours = effects._cut(a, b)
+    assert np.allclose(np.expm1(theirs), ours, rtol=1e-9) and ours[0] < bias < ours[1]
 
 
 def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, tmp_path):
