@@ -117,7 +117,7 @@ def test_the_highlight_is_brighter_than_any_paint_and_lies_where_optics_puts_it(
     assert checked
 
 
-# Elsewhere source and target do not both show the place of a large highlight.
+# In garden and person no large highlight of these targets lies where the source sees it too.
 @pytest.mark.parametrize("name", ["bear", "stump"])
 def test_the_mask_of_what_depends_on_the_viewer_finds_the_highlight_and_not_the_paint(name):
     scene, geometry = world(name)
