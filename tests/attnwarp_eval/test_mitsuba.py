@@ -121,6 +121,8 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
     owner = geometry.trace(camera).object_id
     for k, name_ in enumerate(scene.object_names):
         mine = owner == k
+        if scene.spec.objects[k].material.type != "diffuse":  # its highlights are not in the ray caster's light
+            continue
         if mine.sum() < 300:  # on thin objects three samples across a pixel are too few for the expectation
             continue
         got, want = image[mine], expected[mine]
