@@ -11,7 +11,8 @@ from attnwarp_eval.encoders._weights import sha256_of
 
 ABOUT = {
     "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million
-parameters for pictures of 112 x 112 px, a transformer of {text:.1f} million for text, byte-pair tokens.
+parameters for pictures of 112 x 112 px, of which each is embedded as the mean with its mirror image, a transformer of {text:.1f} million for
+text, byte-pair tokens.
 
 **Good for**: scores of renders and edits of scenes like those in `scenes/`: one thing on a ground, its colour, its material or pattern,
 the ground, the time of day; whether an edit went in the direction of the words; comparisons between methods on the same views.
@@ -31,10 +32,10 @@ Rare words and invented ones are scattered into captions so that unknown words d
     "dino-small": """A class token and 8 x 8 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to a sixteenth of the
 size, then three transformer blocks; {size:.1f} million parameters.
 
-**Good for**: whether two pictures show the same thing, from whichever side; which patch of one view is which of another, roughly.
+**Good for**: whether two pictures show the same thing, from whichever side.
 
-**Not good for**: telling photographs of the world apart, fine differences within a kind, exact correspondences: warps are checked against rays
-(`checks/`), not against these tokens. Its figures do not compare with those of DINOv2 (`--dino dinov2:FOLDER`).
+**Not good for**: telling photographs of the world apart, fine differences within a kind, and correspondences: its patch tokens find parts hardly better
+than those of a network with random weights (below), and warps are checked against rays (`checks/`), not against these tokens. Its figures do not compare with those of DINOv2 (`--dino dinov2:FOLDER`).
 
 **Recipe**: `training/dino.py`. Self-distillation with multi-crop and a momentum teacher, whose targets are centred and sharpened by Sinkhorn's normalisation; no labels. The two large crops are two
 views of one thing, which at times stands on another ground or in another light. Patches of small crops are taught by the teacher's patches

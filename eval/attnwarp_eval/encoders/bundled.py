@@ -88,12 +88,20 @@ class BundledClip(_OfSquares):
         _read(self.net, weights)
         self.preprocess = Preprocessing(resize=ClipSmall.size, crop=(ClipSmall.size, ClipSmall.size))
         dim = self.net.pool.project.out_features
-        self.about = _info(name, "clip", [weights, words], str(self.preprocess), ClipSmall.size, dim)
+        how = f"{self.preprocess}; mean of the picture's embedding and its mirror image's"
+        self.about = _info(name, "clip", [weights, words], how, ClipSmall.size, dim)
 
     def images(self, images: Sequence[Image]) -> Array:
-        """(N, D) float64 embeddings, not normalised."""
+        """(N, D) float64 embeddings, not normalised.
+
+        Each is the mean with the mirror image's: no caption that was trained on knows left from right, so what a mirror changes
+        is error.
+        """
         with full_float32():
-            found = [self.net.images(batch).double().numpy() for batch in self._batches(images)]
+            found = [
+                (0.5 * (self.net.images(batch) + self.net.images(batch.flip(-1)))).double().numpy()
+                for batch in self._batches(images)
+            ]
         return np.concatenate(found) if found else np.zeros((0, self.about.dim or 0))
 
     def cut(self, text: str) -> int:

@@ -108,6 +108,12 @@ def test_an_embedding_does_not_depend_on_what_else_is_in_the_list(clip, dino):
             assert np.allclose(encode([picture])[0], together[k], atol=1e-4 * np.abs(together).max())
 
 
+def test_a_picture_and_its_mirror_image_say_the_same(clip):
+    picture = np.random.default_rng(1).uniform(size=(112, 112, 3)).astype(np.float32)
+    a, b = clip.images([picture, np.ascontiguousarray(picture[:, ::-1])])
+    assert np.allclose(a, b, atol=1e-5 * np.abs(a).max())
+
+
 def test_things_colours_and_times_are_named(clip, worlds):
     figures = {
         f.what: f for f in assess.clip_figures(clip, dict.fromkeys(("test", "test-new-pairs", "test-rendered"), worlds))
