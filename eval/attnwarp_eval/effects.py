@@ -206,6 +206,8 @@ class Cost:
     Attributes:
         size, spp: of the measurement.
         seconds: (plan, everything on) medians.
+        faster: how many times longer everything on takes for the same samples: the median over rounds, in each of which both were
+            rendered one after the other.
         variance: (plan, everything on), mean over pixels and channels, relative to the squared mean.
         rounds: pictures of each, taken in turn.
         interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None where the plan has no noise.
@@ -216,14 +218,10 @@ class Cost:
     spp: int
     rounds: int
     seconds: tuple[float, float]
+    faster: float
     variance: tuple[float, float]
     interval: tuple[float, float] | None
     cap: Cap | None = None
-
-    @property
-    def faster(self) -> float:
-        """How many times longer everything on takes for the same samples."""
-        return self.seconds[1] / self.seconds[0]
 
     @property
     def at_equal_noise(self) -> float:
@@ -232,7 +230,7 @@ class Cost:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON, where infinity is null."""
-        out = asdict(self) | {"faster": self.faster, "at_equal_noise": _finite(self.at_equal_noise)}
+        out = asdict(self) | {"at_equal_noise": _finite(self.at_equal_noise)}
         if self.cap is not None:
             out["cap"]["at_equal_error"] = _finite(self.cap.at_equal_error)
         return out
@@ -271,14 +269,20 @@ def measure(
     interval = _ratio_interval(taken[0], taken[1], seconds[0], seconds[1])
     cap = None
     if bounces != "unlimited":
-        faster = medians[2] / medians[0]
+        faster = _slower(seconds[0], seconds[2])
         bias, between = _cut(taken[0].mean(1), taken[1].mean(1))
         cap = Cap(
             bounces, bias, between, medians[2], variance[2], faster,
             faster * variance[2] / variance[0] if variance[0] > 0 else float("inf"),
             _ratio_interval(taken[0], taken[2], seconds[0], seconds[2]),
         )  # fmt: skip
-    return Cost(size, spp, rounds, (medians[0], medians[1]), (variance[0], variance[1]), interval, cap)
+    faster = _slower(seconds[0], seconds[1])
+    return Cost(size, spp, rounds, (medians[0], medians[1]), faster, (variance[0], variance[1]), interval, cap)
+
+
+def _slower(ours: list[float], other: list[float]) -> float:
+    """Median of the ratios of rounds, as the interval of :func:`_ratio_interval` has it: two rounds are paired in time."""
+    return float(np.median(np.array(other) / np.array(ours)))
 
 
 def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | None]:
@@ -305,7 +309,7 @@ def _ratio_interval(
     rounds = len(ours)
     if not ours.var(0).any():
         return None
-    # Two rounds are paired in time, since what else the machine does slows both.
+    # What else the machine does slows both of a round.
     ratio = np.array(other_seconds) / np.array(ours_seconds)
     # Squared distances between rounds: the variance of a resample is the mean over its pairs of different rounds.
     apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in (ours, other)]
