@@ -3,6 +3,7 @@
 Oracles: the file system (which cells were there before), byte equality of reports, exit codes.
 """
 
+import functools
 import json
 import os
 import pathlib
@@ -110,7 +111,11 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     for attempt in range(5):
         run = folder / f"interrupted{attempt}"
         arguments = command("run", "study.yaml", "--out", run)
-        process = subprocess.Popen(arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.PIPE, text=True)
+        # A background job of a shell ignores the signal, and so would what it starts.
+        listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        process = subprocess.Popen(
+            arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.PIPE, text=True, preexec_fn=listening
+        )
         deadline = time.monotonic() + 300
         while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
             time.sleep(0.02)
