@@ -1,5 +1,6 @@
 """The command line as a person meets it: in a process of its own, with files on disk."""
 
+import functools
 import json
 import resource
 import signal
@@ -143,7 +144,11 @@ def test_the_number_of_threads_changes_no_bit(data, tmp_path):
 
 
 def start_and_wait_for_a_checkpoint(arguments, out):
-    process = subprocess.Popen([*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    # A background job of a shell ignores the signal, and so would what it starts.
+    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        [*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=listening
+    )
     end = time.monotonic() + 100
     while not (out / "checkpoint.pt").exists():
         assert process.poll() is None and time.monotonic() < end, process.communicate()
