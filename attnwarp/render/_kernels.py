@@ -36,6 +36,9 @@ f64 = np.float64
 u64 = np.uint64
 TILE = K.TILE
 PIXELS = TILE * TILE
+SIDE = TILE // 4  # squares of 4 x 4 pixels along a tile
+SQUARES = SIDE * SIDE
+EVERY = (1 << SQUARES) - 1  # a bit for each
 CHUNK = 2048  # splats set up at once: their rows stay in the second-level cache
 
 # A projected splat is a row of 192 bytes, three cache lines: WIDE columns of float64, then float32. The table is passed
@@ -48,39 +51,48 @@ CA, CB, CC, LX, LY, RXX, RXY, RYY = 2, 3, 4, 5, 6, 7, 8, 9  # 3D: conic; z = Z0 
 WIDE = 11
 Z0, ZLO, ZHI, OPACITY = 11, 12, 13, 14
 GRADIENTS = 15  # columns up to here carry gradients
-FILTER, SHUT, WMAX, CUT = 15, 16, 17, 18  # screen rho = FILTER |x - centre|^2 + SHUT; nothing shows if CUT < 0
-IZ0, IZLO, IZHI = 19, 20, 21  # 1 over Z0, ZLO, ZHI
+FILTER, WMAX, CUT = 15, 17, 18  # whether there is a screen filter; nothing shows where W > WMAX, or if CUT < 0
+IZ0, WTOP, WLOW = 19, 20, 21  # 2D: 1 / z = IZ0 W, with W no more than WTOP and no less than WLOW
+IZLO = 20  # 3D: 1 / ZLO
 NORMAL, VALUES = 22, 25  # world normal, and the first three channels
-BOUNDED = 28
 COLUMNS = 24
+F11, F12, F22 = 20, 21, 22  # 3D: rho = (F11 dx + F12 dy)^2 + (F22 dy)^2, float64 behind the others; no cancellation
 
 # A block of splats as the forward pass works on them: for each a row of float32, with the table's columns and its
-# place among the tile's; then its weights at the 16 pixels of all squares, and of the square at hand.
+# place among the tile's; then its weights at the 16 pixels of all squares, and of the square at hand; then what depends on
+# where pixels are counted from, at the middle of the quarter of the tile at hand. This is kept in float64 too, for the middle
+# of the tile, followed by its slopes in x and y: 8 numbers each.
 BLOCK = 32
 AHEAD = 32
 ROW = 32
 STEP = 28
 WEIGHTS = BLOCK * ROW
 SHARES = WEIGHTS + BLOCK * 16
-WORK = SHARES + BLOCK * 16
+PLACED = SHARES + BLOCK * 16
+WORK = PLACED + BLOCK * 8
+EXACT = 24
+AT_U, AT_V, AT_W, SCREEN_X, SCREEN_Y, AT_X, AT_Y = range(7)  # SCREEN: X and Y times the root of 2
+QUARTER = 0x33  # its squares, as bits, from its first one on
+CORNER = 10  # the bits that the number of a square has in common with its quarter's first one
 
-# An entry of a tile's list is a splat's place in the order of depth, and above it one bit for each of the tile's four
+# An entry of a tile's list is a splat's place in the order of depth, and above it one bit for each of the tile's
 # squares of 4 x 4 pixels that the splat may show in.
-PLACE_BITS = 28
+PLACE_BITS = 32
 PLACE = (1 << PLACE_BITS) - 1
 WEIGHT_UNIT = 2.0**-36
-# A run of tiles: the first one, how many, and which columns of squares in the upper and in the lower half, from the
-# run's first one on, as first | last << 16.
-RUN = 4
+# A run of tiles: the first one, how many, and its first column of squares; from CODES on, for each row of squares, its
+# columns as first | last << 16.
+RUN, CODES = 8, 4
 NOTES = 64
-NONE = 32767 | (-1 << 16)
 
-# Slots of a tile's buffer, each 64 floats.
+# Slots of a tile's buffer, each PIXELS floats.
 (XS, YS, AL, ZZ, IZ, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, ZREF, IREF, WW, NX, NY, NZ, C_0, C_1,
  C_2) = range(23)  # fmt: skip
 SLOTS = 23  # and one more for each channel from the fourth on
 
 HUGE = 1e30
+FAR = 1e15  # its square is HUGE
+ROOT2 = math.sqrt(2)
 LOG2E_HALF = f32(0.5 * math.log2(math.e))
 # exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error, 9.1e-8.
 E1, E2, E3, E4, E5 = (
@@ -129,7 +141,28 @@ def _gauss(rho):
     # Adding 1.5 2^23 rounds to an integer and leaves it in the lowest bits.
     shifted = L.fma(rho, -LOG2E_HALF, ROUND)
     f = L.fma(rho, -LOG2E_HALF, ROUND - shifted)
-    return L.times_power(f * (f * (f * (f * (f * E5 + E4) + E3) + E2) + E1) + f32(1.0), shifted)
+    # In pairs rather than in a row: the products wait less for one another.
+    g = f * f
+    return L.times_power(((f * E5 + E4) * g + (f * E3 + E2)) * g + (f * E1 + f32(1.0)), shifted)
+
+
+@inlined
+def _root(x):
+    """The square root of eight float64 >= 0, to the last bits; NaN where they are negative or infinite."""
+    return x * L.inverse_root(L.most(x, 1e-300))
+
+
+@inlined
+def _log(x):
+    """The natural logarithm of eight float64, to 1e-12, for x > 0 that are not denormal: with x = f 2^k and f about 1,
+    2 artanh((f - 1) / (f + 1)) + k log 2."""
+    f, k = L.fraction(x), L.exponent(x)
+    large = f > 1.4142135623730951
+    f, k = L.where(large, f * 0.5, f), L.where(large, k + 1.0, k)
+    z = (f - 1.0) / (f + 1.0)
+    s = z * z
+    series = s * (s * (s * (s * (s * (s * (s * (1 / 15) + 1 / 13) + 1 / 11) + 1 / 9) + 1 / 7) + 1 / 5) + 1 / 3) + 1.0
+    return k * 0.6931471805599453 + z * series * 2.0
 
 
 @inlined
@@ -240,172 +273,310 @@ def _reaches(view, c0, c1, c2, size, wanted):
     return wanted[r2, t2] - wanted[r1, t2] - wanted[r2, t1] + wanted[r1, t1] > 0
 
 
-@jit
-def project(first, last, order, view, m, q, s, o, values, channels, wanted, table, thin, features):
+# A splat's outline, as :func:`project` leaves it for :func:`outline`: a row of 16 float32, in pixels from (X0, Y0). Where its
+# first row of squares begins, less Y0 and what is above that row; the ellipse's middle in y, top, 1 / top; half of the chord
+# through its middle, how far the chords' middles move to the right a row, half width, height of its right tip, middle in x;
+# the squared radius of the filter's disc, and the radius; what is added to a left and to a right end, for its place in the
+# picture; a row's height. Then the first and the last row of squares: none if the last is above the first, and no ellipse
+# if the first is negative.
+(SHAPE_Y, SHAPE_EY, SHAPE_TOP, SHAPE_SHRINK, SHAPE_HALF, SHAPE_LEAN, SHAPE_WIDE, SHAPE_TIP, SHAPE_EX, SHAPE_SQUARE,
+ SHAPE_RADIUS, SHAPE_LEFT, SHAPE_RIGHT, SHAPE_HIGH, SHAPE_FIRST, SHAPE_LAST) = range(16)  # fmt: skip
+
+# What eight splats are worked off in, rows of eight: in float64 their parameters, their centres in camera axes, and the
+# first columns of their rows of the table; in float32 the table's other columns, then the outline's.
+IN_Q, IN_S, IN_O, IN_C, OUT = 3, 7, 10, 11, 14
+FACTOR = 8 * (OUT + WIDE)
+SETUP = FACTOR + 24
+SHAPES = VALUES - WIDE
+SETUP_NARROW = 8 * (SHAPES + 16)
+
+
+@bare
+def project(
+    first, last, order, view, m, q, s, o, values, channels, wanted, table, thin, features, shapes, work, slim, Y
+):
     """The splats order[first:last] to the rows first..last of the table, and of ``features`` (M, channels) if there
-    are more than three.
+    are more than three; and their outlines to the rows 0..last - first of ``shapes`` (., 16).
 
     ``wanted`` (tiles_y + 1, tiles_x + 1) holds how many tiles are wanted above and left of each tile's corner: a splat
-    that cannot show in a wanted one gets a negative CUT, and the rest of its row is left as it was.
+    that cannot show in a wanted one gets a negative CUT and no outline, and the rest of its row is left as it was.
+    ``work`` (SETUP), ``slim`` (SETUP_NARROW) and ``Y`` (16) are for work. Eight splats are done at once, in float64.
     """
-    R = view[:9].copy().reshape(3, 3)
+    R00, R01, R02, R10, R11, R12 = view[0], view[1], view[2], view[3], view[4], view[5]
+    R20, R21, R22 = view[6], view[7], view[8]
     fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
-    flat, center = view[FLAT] > 0, view[CENTER] > 0
+    width, height = view[WIDTH], view[HEIGHT]
+    flat, center, harmonic = view[FLAT] > 0, view[CENTER] > 0, view[HARMONIC] > 0
     degree = round(math.sqrt(values.shape[1] / 3)) - 1
-    Q = np.empty((3, 3))
-    a = np.empty((3, 3))
-    S = np.empty((3, 3))
-    PC = np.empty(3)
-    Y = np.empty(16)
-    sizes = np.empty(3)
     kx, ky, kxy = 1 / fx, 1 / fy, -skew / (fx * fy)
-    for j in range(first, last):
-        later = order[min(j + 12, last - 1)]
-        _prefetch(m, later * 3)
-        _prefetch(q, later * 4)
-        _prefetch(s, later * s.shape[1])
-        _prefetch(o, later)
-        _prefetch(values, later * values.shape[1])
-        i = order[j]
-        m0, m1, m2 = f64(m[i, 0]), f64(m[i, 1]), f64(m[i, 2])
-        s0, s1, s2 = f64(s[i, 0]), f64(s[i, 1]), 0.0 if flat else f64(s[i, s.shape[1] - 1])
-        sizes[0], sizes[1], sizes[2] = s0, s1, s2
-        c0 = R[0, 0] * m0 + R[0, 1] * m1 + R[0, 2] * m2 + view[TX]
-        c1 = R[1, 0] * m0 + R[1, 1] * m1 + R[1, 2] * m2 + view[TX + 1]
-        c2 = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + view[TX + 2]
-        if not _reaches(view, c0, c1, c2, max(s0, s1, s2), wanted):
-            thin[j, WIDE + CUT] = f32(-1.0)
-            continue
-        _axes(q, i, Q)
-        for r in range(3):
+    every = wanted[-1, -1] == (wanted.shape[0] - 1) * (wanted.shape[1] - 1)
+    for j in range(first, last, 8):
+        here = min(8, last - j)
+        for lane in range(8):
+            later = order[min(j + lane + 16, last - 1)]
+            _prefetch(m, later * 3)
+            _prefetch(q, later * 4)
+            _prefetch(s, later * s.shape[1])
+            _prefetch(o, later)
+            _prefetch(values, later * values.shape[1])
+            i, at = u64(order[min(j + lane, last - 1)]), u64(lane)
             for k in range(3):
-                a[r, k] = R[r, 0] * Q[0, k] + R[r, 1] * Q[1, k] + R[r, 2] * Q[2, k]
-        ahead = c2 > near
-        opacity = f64(o[i])
-        spread = math.sqrt((s0 * a[2, 0]) ** 2 + (s1 * a[2, 1]) ** 2 + (s2 * a[2, 2]) ** 2)
-        axis = 2
-        if not flat:
-            axis = 0
-            if s1 < s0:
-                axis = 1
-            if s2 < sizes[axis]:
-                axis = 2
-        ic = 1 / c2
-        if ahead:
-            table[j, X0], table[j, Y0] = (fx * c0 + skew * c1) * ic + cx, fy * c1 * ic + cy
-        else:
-            table[j, X0], table[j, Y0] = cx, cy
+                work[at + u64(8 * k)] = m[i, u64(k)]
+            for k in range(4):
+                work[at + u64(8 * (IN_Q + k))] = q[i, u64(k)]
+            work[at + u64(8 * IN_S)], work[at + u64(8 * IN_S + 8)] = s[i, u64(0)], s[i, u64(1)]
+            work[at + u64(8 * IN_S + 16)] = 0.0 if flat else s[i, u64(s.shape[1] - 1)]
+            work[at + u64(8 * IN_O)] = o[i]
+        m0, m1, m2 = L.load8(work, 0), L.load8(work, 8), L.load8(work, 16)
+        s0, s1, s2 = L.load8(work, 8 * IN_S), L.load8(work, 8 * IN_S + 8), L.load8(work, 8 * IN_S + 16)
+        c0 = m0 * R00 + m1 * R01 + m2 * R02 + view[TX]
+        c1 = m0 * R10 + m1 * R11 + m2 * R12 + view[TX + 1]
+        c2 = m0 * R20 + m1 * R21 + m2 * R22 + view[TX + 2]
+        ic = L.inverse(c2)
+        ahead = near < c2
+        at_x, at_y = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
+        kept = 255 >> (8 - here)
+        inside = L.as_bits(ahead & (at_x > 0.0) & (at_x < width) & (at_y > 0.0) & (at_y < height)) if every else 0
+        if kept & ~inside:
+            L.store8(work, 8 * IN_C, c0)
+            L.store8(work, 8 * IN_C + 8, c1)
+            L.store8(work, 8 * IN_C + 16, c2)
+            for lane in range(here):
+                if inside >> lane & 1:
+                    continue
+                at = u64(lane)
+                size = max(work[at + u64(8 * IN_S)], work[at + u64(8 * IN_S + 8)], work[at + u64(8 * IN_S + 16)])
+                b = at + u64(8 * IN_C)
+                if not _reaches(view, work[b], work[b + u64(8)], work[b + u64(16)], size, wanted):
+                    kept &= ~(1 << lane)
+                    thin[u64(j + lane), u64(WIDE + CUT)] = f32(-1.0)
+                    shapes[u64(j + lane - first), u64(SHAPE_FIRST)] = f32(1.0)
+                    shapes[u64(j + lane - first), u64(SHAPE_LAST)] = f32(0.0)
+            if kept == 0:
+                continue
+        w, x, y, z = (
+            L.load8(work, 8 * IN_Q), L.load8(work, 8 * IN_Q + 8), L.load8(work, 8 * IN_Q + 16),
+            L.load8(work, 8 * IN_Q + 24),
+        )  # fmt: skip
+        inverse = L.inverse_root(w * w + x * x + y * y + z * z)
+        w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+        q00, q01, q02 = 1.0 - (y * y + z * z) * 2.0, (x * y - w * z) * 2.0, (x * z + w * y) * 2.0
+        q10, q11, q12 = (x * y + w * z) * 2.0, 1.0 - (x * x + z * z) * 2.0, (y * z - w * x) * 2.0
+        q20, q21, q22 = (x * z - w * y) * 2.0, (y * z + w * x) * 2.0, 1.0 - (x * x + y * y) * 2.0
+        a00 = q00 * R00 + q10 * R01 + q20 * R02
+        a10 = q00 * R10 + q10 * R11 + q20 * R12
+        a20 = q00 * R20 + q10 * R21 + q20 * R22
+        a01 = q01 * R00 + q11 * R01 + q21 * R02
+        a11 = q01 * R10 + q11 * R11 + q21 * R12
+        a21 = q01 * R20 + q11 * R21 + q21 * R22
+        a02 = q02 * R00 + q12 * R01 + q22 * R02
+        a12 = q02 * R10 + q12 * R11 + q22 * R12
+        a22 = q02 * R20 + q12 * R21 + q22 * R22
+        opacity = L.load8(work, 8 * IN_O)
+        spread = _root(s0 * a20 * (s0 * a20) + s1 * a21 * (s1 * a21) + s2 * a22 * (s2 * a22))
+        x0, y0 = L.where(ahead, at_x, cx), L.where(ahead, at_y, cy)
+        L.store8(work, 8 * (OUT + X0), x0)
+        L.store8(work, 8 * (OUT + Y0), y0)
+        length = _root(c0 * c0 + c1 * c1 + c2 * c2)
         depth = c2
-        filtered, unfiltered, most = 0.0, 0.0, 0.0
         if flat:
-            n0, n1, n2 = a[0, 2], a[1, 2], a[2, 2]
-            length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
+            n0, n1, n2, p0, p1, p2 = a02, a12, a22, q02, q12, q22
             nc = n0 * c0 + n1 * c1 + n2 * c2
-            if abs(nc) < K.EDGE_ON * length:
-                nc = -K.EDGE_ON * length if nc < 0 else K.EDGE_ON * length
-            depth = c2 if ahead else length
-            inverse = 1 / nc
-            for k in range(2):
-                tc = (a[0, k] * c0 + a[1, k] * c1 + a[2, k] * c2) * inverse
-                scale = depth / sizes[k]
-                gx, gy = scale * (a[0, k] - tc * n0), scale * (a[1, k] - tc * n1)
-                table[j, UX + 3 * k] = gx * kx
-                table[j, UY + 3 * k] = gy * ky + gx * kxy
-                table[j, U0 + 3 * k] = 0.0 if ahead else scale * (a[2, k] - tc * n2)
+            facing = nc
+            floor = length * K.EDGE_ON
+            nc = L.where(L.magnitude(nc) < floor, L.where(nc < 0.0, -floor, floor), nc)
+            depth = L.where(ahead, c2, length)
+            inverse = L.inverse(nc)
+            tc = (a00 * c0 + a10 * c1 + a20 * c2) * inverse
+            scale = depth * L.inverse(s0)
+            gx = scale * (a00 - tc * n0)
+            ux, uy = gx * kx, scale * (a10 - tc * n1) * ky + gx * kxy
+            L.store8(work, 8 * (OUT + U0), L.where(ahead, 0.0, scale * (a20 - tc * n2)))
+            tc = (a01 * c0 + a11 * c1 + a21 * c2) * inverse
+            scale = depth * L.inverse(s1)
+            gx = scale * (a01 - tc * n0)
+            vx, vy = gx * kx, scale * (a11 - tc * n1) * ky + gx * kxy
+            L.store8(work, 8 * (OUT + V0), L.where(ahead, 0.0, scale * (a21 - tc * n2)))
             scale = depth * inverse
-            table[j, WX] = scale * n0 * kx
-            table[j, WY] = scale * (n1 * ky + n0 * kxy)
-            table[j, W0] = 1.0 if ahead else scale * n2
-            filtered, unfiltered = (2.0, 0.0) if ahead else (0.0, HUGE)
-            most = depth / near
+            wx, wy = scale * n0 * kx, scale * (n1 * ky + n0 * kxy)
+            L.store8(work, 8 * (OUT + W0), L.where(ahead, 1.0, scale * n2))
+            L.store8(work, 8 * (OUT + UX), ux)
+            L.store8(work, 8 * (OUT + UY), uy)
+            L.store8(work, 8 * (OUT + VX), vx)
+            L.store8(work, 8 * (OUT + VY), vy)
+            L.store8(work, 8 * (OUT + WX), wx)
+            L.store8(work, 8 * (OUT + WY), wy)
+            L.store8(slim, 8 * (FILTER - WIDE), L.where(ahead, 1.0, 0.0))
+            L.store8(slim, 8 * (FILTER + 1 - WIDE), 0.0)
+            L.store8(slim, 8 * (WMAX - WIDE), depth * (1.0 / near))
         else:
-            limit = K.JACOBIAN_MARGIN * view[WIDTH] / 2 / fx
-            px = min(max(c0 / c2, -cx / fx - limit), (view[WIDTH] - cx) / fx + limit)
-            limit = K.JACOBIAN_MARGIN * view[HEIGHT] / 2 / fy
-            py = min(max(c1 / c2, -cy / fy - limit), (view[HEIGHT] - cy) / fy + limit)
-            sxx, sxy, syy = 0.0, 0.0, 0.0
-            for k in range(3):
-                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * sizes[k] * ic
-                gy = fy * (a[1, k] - py * a[2, k]) * sizes[k] * ic
-                sxx += gx * gx
-                sxy += gx * gy
-                syy += gy * gy
+            limit = K.JACOBIAN_MARGIN * width / 2 / fx
+            px = L.least(L.most(c0 * ic, -cx / fx - limit), (width - cx) / fx + limit)
+            limit = K.JACOBIAN_MARGIN * height / 2 / fy
+            py = L.least(L.most(c1 * ic, -cy / fy - limit), (height - cy) / fy + limit)
+            scale = s0 * ic
+            gx, gy = ((a00 - px * a20) * fx + (a10 - py * a20) * skew) * scale, (a10 - py * a20) * fy * scale
+            sxx, sxy, syy = gx * gx, gx * gy, gy * gy
+            scale = s1 * ic
+            gx, gy = ((a01 - px * a21) * fx + (a11 - py * a21) * skew) * scale, (a11 - py * a21) * fy * scale
+            sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
+            scale = s2 * ic
+            gx, gy = ((a02 - px * a22) * fx + (a12 - py * a22) * skew) * scale, (a12 - py * a22) * fy * scale
+            sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
             sharp = sxx * syy - sxy * sxy
-            sxx += K.BLUR_3D
-            syy += K.BLUR_3D
-            det = sxx * syy - sxy * sxy
-            inverse = 1 / det
-            table[j, CA], table[j, CB], table[j, CC] = syy * inverse, -sxy * inverse, sxx * inverse
-            for k in range(LX, WIDE):
-                table[j, k] = 0.0
+            sxx, syy = sxx + K.BLUR_3D, syy + K.BLUR_3D
+            inverse = L.inverse(sxx * syy - sxy * sxy)
+            A, B, C = syy * inverse, -sxy * inverse, sxx * inverse
+            L.store8(work, 8 * (OUT + CA), A)
+            L.store8(work, 8 * (OUT + CB), B)
+            L.store8(work, 8 * (OUT + CC), C)
+            edge = L.inverse_root(A)
+            L.store8(work, FACTOR, A * edge)
+            L.store8(work, FACTOR + 8, B * edge)
+            L.store8(work, FACTOR + 16, L.inverse_root(syy))
             if view[ANTIALIASED] > 0:
-                opacity *= math.sqrt(max(sharp / det, K.COMPENSATION_MIN))
+                opacity = opacity * _root(L.most(sharp * inverse, K.COMPENSATION_MIN))
+            L.store8(slim, 8 * (WLOW - WIDE), 0.0)
+            for k in range(FILTER, CUT):
+                L.store8(slim, 8 * (k - WIDE), 0.0)
+            for k in range(LX, WIDE):
+                L.store8(work, 8 * (OUT + k), 0.0)
             if not center:
-                q0 = 0.0
-                for r in range(3):
-                    for k in range(3):
-                        S[r, k] = (
-                            a[r, 0] * a[k, 0] / (s0 * s0)
-                            + a[r, 1] * a[k, 1] / (s1 * s1)
-                            + a[r, 2] * a[k, 2] / (s2 * s2)
-                        )
-                for r in range(3):
-                    PC[r] = S[r, 0] * c0 + S[r, 1] * c1 + S[r, 2] * c2
-                q0 = PC[0] * c0 + PC[1] * c1 + PC[2] * c2
-                lx, ly = c2 * PC[0] / q0, c2 * PC[1] / q0
+                i0, i1, i2 = L.inverse(s0 * s0), L.inverse(s1 * s1), L.inverse(s2 * s2)
+                S00 = a00 * a00 * i0 + a01 * a01 * i1 + a02 * a02 * i2
+                S01 = a00 * a10 * i0 + a01 * a11 * i1 + a02 * a12 * i2
+                S02 = a00 * a20 * i0 + a01 * a21 * i1 + a02 * a22 * i2
+                S11 = a10 * a10 * i0 + a11 * a11 * i1 + a12 * a12 * i2
+                S12 = a10 * a20 * i0 + a11 * a21 * i1 + a12 * a22 * i2
+                S22 = a20 * a20 * i0 + a21 * a21 * i1 + a22 * a22 * i2
+                f0 = S00 * c0 + S01 * c1 + S02 * c2
+                f1 = S01 * c0 + S11 * c1 + S12 * c2
+                f2 = S02 * c0 + S12 * c1 + S22 * c2
+                scale = c2 * L.inverse(f0 * c0 + f1 * c1 + f2 * c2)
+                gx, gy = scale * f0, scale * f1
                 # Denominator minus l^2: positive semidefinite, so the difference of large numbers is taken here in
                 # float64.
-                rxx, rxy, ryy = (
-                    c2 * c2 * S[0, 0] / q0 - lx * lx,
-                    c2 * c2 * S[0, 1] / q0 - lx * ly,
-                    c2 * c2 * S[1, 1] / q0 - ly * ly,
-                )
-                table[j, LX], table[j, LY] = lx * kx, ly * ky + lx * kxy
-                table[j, RXX] = rxx * kx * kx
-                table[j, RXY] = kx * (rxx * kxy + rxy * ky)
-                table[j, RYY] = rxx * kxy * kxy + 2 * rxy * kxy * ky + ryy * ky * ky
-        low = high = max(c2, near)
-        if not center:
-            low = max(c2 - K.EXTENT_SIGMAS * spread, near)
-            high = max(c2 + K.EXTENT_SIGMAS * spread, near)
-        cut = 2 * math.log(opacity / K.ALPHA_MIN) if opacity >= K.ALPHA_MIN else -1.0
-        thin[j, WIDE + Z0], thin[j, WIDE + ZLO], thin[j, WIDE + ZHI], thin[j, WIDE + OPACITY] = (
-            depth,
-            low,
-            high,
-            opacity,
-        )
-        thin[j, WIDE + FILTER], thin[j, WIDE + SHUT], thin[j, WIDE + WMAX], thin[j, WIDE + CUT] = (
-            filtered,
-            unfiltered,
-            most,
-            cut,
-        )
-        thin[j, WIDE + IZ0], thin[j, WIDE + IZLO], thin[j, WIDE + IZHI] = 1 / depth, 1 / low, 1 / high
-        # The outline is an ellipse only if the whole disc lies in front of the camera plane.
-        bounded = not flat or (ahead and c2 - math.sqrt(max(cut, 0.0)) * spread > 1e-3 * c2)
-        thin[j, WIDE + BOUNDED] = 1.0 if bounded else 0.0
-        facing = a[0, axis] * c0 + a[1, axis] * c1 + a[2, axis] * c2
-        flip = -1.0 if facing > 0 else 1.0
-        for k in range(3):
-            thin[j, WIDE + NORMAL + k] = flip * Q[k, axis]
-        if view[HARMONIC] > 0:
-            length = math.sqrt(c0 * c0 + c1 * c1 + c2 * c2)
-            x = (R[0, 0] * c0 + R[1, 0] * c1 + R[2, 0] * c2) / length
-            y = (R[0, 1] * c0 + R[1, 1] * c1 + R[2, 1] * c2) / length
-            z = (R[0, 2] * c0 + R[1, 2] * c1 + R[2, 2] * c2) / length
-            _harmonics(degree, x, y, z, Y)
-            for k in range(3):
-                total = 0.5
-                for b in range((degree + 1) ** 2):
-                    total += Y[b] * values[i, 3 * b + k]
-                thin[j, WIDE + VALUES + k] = max(total, 0.0)
+                xx, xy, yy = scale * c2 * S00 - gx * gx, scale * c2 * S01 - gx * gy, scale * c2 * S11 - gy * gy
+                L.store8(work, 8 * (OUT + LX), gx * kx)
+                L.store8(work, 8 * (OUT + LY), gy * ky + gx * kxy)
+                L.store8(work, 8 * (OUT + RXX), xx * (kx * kx))
+                L.store8(work, 8 * (OUT + RXY), (xx * kxy + xy * ky) * kx)
+                L.store8(work, 8 * (OUT + RYY), xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky))
+            # The normal is the shortest axis.
+            second = s1 < s0
+            third = s2 < L.where(second, s1, s0)
+            p0 = L.where(third, q02, L.where(second, q01, q00))
+            p1 = L.where(third, q12, L.where(second, q11, q10))
+            p2 = L.where(third, q22, L.where(second, q21, q20))
+            n0 = L.where(third, a02, L.where(second, a01, a00))
+            n1 = L.where(third, a12, L.where(second, a11, a10))
+            n2 = L.where(third, a22, L.where(second, a21, a20))
+            facing = n0 * c0 + n1 * c1 + n2 * c2
+        reach = spread * K.EXTENT_SIGMAS
+        low, high = L.most(c2 - reach, near), L.most(c2 + reach, near)
+        if flat:
+            # Where it shows by its intersection, z lies between these; 1e-30: if its centre is not in front, W must
+            # be positive, else it may be anything, see _shade.
+            L.store8(slim, 8 * (WTOP - WIDE), depth * L.inverse(low))
+            L.store8(slim, 8 * (WLOW - WIDE), L.where(ahead, depth * L.inverse(high), 1e-30))
+        if center:
+            low = high = L.most(c2, near)
+        if not flat:
+            L.store8(slim, 8 * (IZLO - WIDE), L.inverse(low))
+        L.store8(slim, 8 * (IZ0 - WIDE), L.inverse(low if center else depth))
+        drawn = opacity >= K.ALPHA_MIN
+        cut = L.where(drawn, _log(L.most(opacity, K.ALPHA_MIN) * (1 / K.ALPHA_MIN)) * 2.0, -1.0)
+        flip = L.where(facing > 0.0, -1.0, 1.0)
+        L.store8(slim, 8 * (Z0 - WIDE), depth)
+        L.store8(slim, 8 * (ZLO - WIDE), low)
+        L.store8(slim, 8 * (ZHI - WIDE), high)
+        L.store8(slim, 8 * (OPACITY - WIDE), opacity)
+        L.store8(slim, 8 * (CUT - WIDE), cut)
+        L.store8(slim, 8 * (NORMAL - WIDE), flip * p0)
+        L.store8(slim, 8 * (NORMAL + 1 - WIDE), flip * p1)
+        L.store8(slim, 8 * (NORMAL + 2 - WIDE), flip * p2)
+        # The outline.
+        cut = cut * (1 + 1e-6)
+        if flat:
+            # An ellipse only if the whole disc lies in front of the camera plane.
+            ellipse = ahead & (c2 * 1e-3 < c2 - _root(L.most(cut, 0.0)) * spread)
+            A = ux * ux + vx * vx - cut * wx * wx
+            B = ux * uy + vx * vy - cut * wx * wy
+            C = uy * uy + vy * vy - cut * wy * wy
+            det = A * C - B * B
+            ellipse = ellipse & (A > 0.0) & (C > 0.0) & (det > A * C * 1e-12)
+            inverse = L.inverse(det)
+            ex, ey = (C * wx - B * wy) * inverse * cut, (A * wy - B * wx) * inverse * cut
+            h = cut * (wx * ex + wy * ey + 1.0)
+            square = cut * 0.5
+            inverse = h * inverse
         else:
-            for k in range(3):
-                thin[j, WIDE + VALUES + k] = values[i, k] if k < channels else f32(0.0)
-            if channels > 3:
-                for k in range(channels):
-                    features[j, k] = values[i, k]
+            ex = ey = square = cut * 0.0
+            h, ellipse = cut, drawn
+            inverse = h * L.inverse(A * C - B * B)
+        radius, top, wide = _root(square), _root(A * inverse), _root(C * inverse)
+        over = L.inverse(A)
+        begin = y0 - (0.5 + 1e-4) + L.least(ey - top, -radius)
+        end = y0 - (0.5 - 1e-4) + L.most(ey + top, radius)
+        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all sides.
+        slack = (wide + L.magnitude(ex) + L.magnitude(x0)) * 1e-6 + 1e-4
+        slack_y = (top + L.magnitude(ey) + L.magnitude(y0)) * 5e-7 + 1e-4
+        shows = drawn & (end >= 0.0) & (begin <= height - 1.0)
+        row1 = L.down(L.up(L.most(begin, 0.0)) * (1 / TILE)) * SIDE
+        row2 = L.down(L.least(end, height - 1.0) * 0.25)
+        # What is drawn but is no ellipse begins in row -1.
+        row1, row2 = L.where(ellipse | L.flipped(drawn), row1, -1.0), L.where(shows, row2, -2.0)
+        b = 8 * SHAPES
+        L.store8(slim, b + 8 * SHAPE_Y, 0.5 - slack_y)
+        L.store8(slim, b + 8 * SHAPE_EY, ey)
+        L.store8(slim, b + 8 * SHAPE_TOP, top)
+        L.store8(slim, b + 8 * SHAPE_SHRINK, L.inverse(top))
+        L.store8(slim, b + 8 * SHAPE_HALF, _root(A * h) * over)
+        L.store8(slim, b + 8 * SHAPE_LEAN, -B * over)
+        L.store8(slim, b + 8 * SHAPE_WIDE, wide)
+        L.store8(slim, b + 8 * SHAPE_TIP, -B * wide * L.inverse(C))
+        L.store8(slim, b + 8 * SHAPE_EX, ex)
+        L.store8(slim, b + 8 * SHAPE_SQUARE, square)
+        L.store8(slim, b + 8 * SHAPE_RADIUS, radius)
+        L.store8(slim, b + 8 * SHAPE_LEFT, x0 - 0.5 - slack)
+        L.store8(slim, b + 8 * SHAPE_RIGHT, x0 - 0.5 + slack)
+        L.store8(slim, b + 8 * SHAPE_HIGH, slack_y * 2.0 + 3.0)
+        L.store8(slim, b + 8 * SHAPE_FIRST, row1)
+        L.store8(slim, b + 8 * SHAPE_LAST, row2)
+        if harmonic and degree > 0:
+            over = L.inverse(length)
+            L.store8(work, 0, (c0 * R00 + c1 * R10 + c2 * R20) * over)
+            L.store8(work, 8, (c0 * R01 + c1 * R11 + c2 * R21) * over)
+            L.store8(work, 16, (c0 * R02 + c1 * R12 + c2 * R22) * over)
+        for lane in range(here):
+            if not kept >> lane & 1:
+                continue
+            to, at = u64(j + lane), u64(lane)
+            i = u64(order[to])
+            for k in range(WIDE):
+                table[to, u64(k)] = work[at + u64(8 * (OUT + k))]
+            if not flat:
+                for k in range(3):
+                    table[to, u64(F11 + k)] = work[at + u64(FACTOR + 8 * k)]
+            for k in range(WIDE, VALUES):
+                thin[to, u64(WIDE + k)] = slim[at + u64(8 * (k - WIDE))]
+            for k in range(16):
+                shapes[to - u64(first), u64(k)] = slim[at + u64(8 * (SHAPES + k))]
+            if harmonic:
+                if degree > 0:
+                    # Where the splat's parameters were, which are not needed any more.
+                    _harmonics(degree, work[at], work[at + u64(8)], work[at + u64(16)], Y)
+                for k in range(3):
+                    total = 0.5 + C0 * values[i, u64(k)]
+                    for b in range(1, (degree + 1) ** 2):
+                        total += Y[u64(b)] * values[i, u64(3 * b + k)]
+                    thin[to, u64(WIDE + VALUES + k)] = max(total, 0.0)
+            else:
+                for k in range(3):
+                    thin[to, u64(WIDE + VALUES + k)] = values[i, u64(k)] if k < channels else f32(0.0)
+                if channels > 3:
+                    for k in range(channels):
+                        features[to, u64(k)] = values[i, u64(k)]
 
 
 @jit
@@ -482,7 +653,9 @@ def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, 
                 if used < spans.shape[0]:
                     tile = ty * tiles_x + tx - run
                     spans[used, 0], spans[used, 1] = tile, run
-                    spans[used, 2] = spans[used, 3] = (2 * run - 1) << 16
+                    spans[used, 2] = begin = SIDE * (tx - run)
+                    for r in range(SIDE):
+                        spans[used, CODES + r] = begin | (begin + SIDE * run - 1) << 16
                     change[tile] += 1
                     change[tile + run] -= 1
                 counts[k] += 1
@@ -492,22 +665,22 @@ def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, 
 
 
 @bare
-def _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change):
+def _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change):
     """The runs of the pieces of ellipses that are noted; see :func:`outline`.
 
     In steps, each for all notes: what finds the columns waits for no branch, and the branches (how many rows has a
     splat) wait for no root or division.
     """
-    steps = L.load(columns, 0)
     zero, far = f32(0.0), f32(1e9)
     for j in range(noted):
         at = j * 16
         # From the ellipse's middle; rows that the image ends within are taken whole.
-        y1 = steps + L.spread(shapes, at)
-        y2 = y1 + L.spread(shapes, at + 13)
-        top, shrink, half = L.spread(shapes, at + 2), L.spread(shapes, at + 3), L.spread(shapes, at + 4)
-        lean, stretch, tip = L.spread(shapes, at + 5), L.spread(shapes, at + 6), L.spread(shapes, at + 7)
-        e1, e2 = L.most(y1 - L.spread(shapes, at + 1), -top), L.least(y2 - L.spread(shapes, at + 1), top)
+        y1 = steps + L.spread(pieces, at)
+        y2 = y1 + L.spread(pieces, at + SHAPE_HIGH)
+        top, shrink = L.spread(pieces, at + SHAPE_TOP), L.spread(pieces, at + SHAPE_SHRINK)
+        half, lean = L.spread(pieces, at + SHAPE_HALF), L.spread(pieces, at + SHAPE_LEAN)
+        stretch, tip = L.spread(pieces, at + SHAPE_WIDE), L.spread(pieces, at + SHAPE_TIP)
+        e1, e2 = L.most(y1 - L.spread(pieces, at + SHAPE_EY), -top), L.least(y2 - L.spread(pieces, at + SHAPE_EY), top)
         t1, t2 = e1 * shrink, e2 * shrink
         # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
         chord1 = L.rough_root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
@@ -515,119 +688,96 @@ def _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, us
         right = L.where((e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2))
         left = L.where((e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2))
         meets = e1 <= e2
-        middle = L.spread(shapes, at + 8)
+        middle = L.spread(pieces, at + SHAPE_EX)
         left, right = L.where(meets, left + middle, far), L.where(meets, right + middle, -far)
         if flat:
             # The disc of the screen filter is joined to the ellipse.
             near = L.most(L.most(y1, -y2), zero)
-            chord = L.rough_root(L.most(L.spread(shapes, at + 9) - near * near, f32(1e-12)))
-            meets = near < L.spread(shapes, at + 10)
+            chord = L.rough_root(L.most(L.spread(pieces, at + SHAPE_SQUARE) - near * near, f32(1e-12)))
+            meets = near < L.spread(pieces, at + SHAPE_RADIUS)
             left = L.where(meets, L.least(left, -chord), left)
             right = L.where(meets, L.most(right, chord), right)
-        left = L.up(L.most(left + L.spread(shapes, at + 11), zero))
-        right = L.down(L.least(right + L.spread(shapes, at + 12), f32(width - 1)))
+        left = L.up(L.most(left + L.spread(pieces, at + SHAPE_LEFT), zero))
+        right = L.down(L.least(right + L.spread(pieces, at + SHAPE_RIGHT), f32(width - 1)))
         shows = left <= right
-        L.store(columns, 16 + j * 32, L.where(shows, L.down(left * f32(0.25)), f32(32767.0)))
-        L.store(columns, 32 + j * 32, L.where(shows, L.down(right * f32(0.25)), f32(-1.0)))
+        left, right = L.where(shows, left * f32(0.25), f32(32767.0)), L.where(shows, right * f32(0.25), f32(-1.0))
+        L.store_ends(codes, j * 48, left, right)
+        # Of the four rows of each row of tiles.
+        left, right = L.least(left, L.swapped1(left)), L.most(right, L.swapped1(right))
+        left, right = L.least(left, L.swapped2(left)), L.most(right, L.swapped2(right))
+        L.store_whole(codes, j * 48 + 16, left)
+        L.store_whole(codes, j * 48 + 32, right)
     room = spans.shape[0]
     for j in range(noted):
         k, ty = notes[j, 0], notes[j, 1]
-        begin, at = used, u64(16 + j * 32)
-        for pair in range(notes[j, 2]):
-            u1, l1 = int(columns[at + u64(2 * pair)]), int(columns[at + u64(2 * pair + 1)])
-            u2, l2 = int(columns[at + u64(2 * pair + 16)]), int(columns[at + u64(2 * pair + 17)])
-            end = max(u2, l2)
-            if end >= 0:
-                tx = min(u1, l1) >> 1
-                run = (end >> 1) - tx + 1
-                tile = (ty + pair) * tiles_x + tx
-                if before[u64(tile)] == before[u64(tile + run)]:
-                    continue
-                if used < room:
-                    spans[used, 0], spans[used, 1] = tile, run
-                    spans[used, 2] = NONE if u2 < 0 else (u1 - 2 * tx) | (u2 - 2 * tx) << 16
-                    spans[used, 3] = NONE if l2 < 0 else (l1 - 2 * tx) | (l2 - 2 * tx) << 16
-                    change[tile] += 1
-                    change[tile + run] -= 1
-                used += 1
+        begin, at = used, j * 48
+        for _ in range(notes[j, 2]):
+            left, right = int(codes[u64(at + 16)]), int(codes[u64(at + 32)])
+            if right >= 0:
+                tx = left // SIDE
+                run = right // SIDE - tx + 1
+                tile = ty * tiles_x + tx
+                if before[u64(tile)] != before[u64(tile + run)]:
+                    if used < room:
+                        to = u64(used)
+                        spans[to, 0], spans[to, 1], spans[to, 2] = tile, run, tx * SIDE
+                        L.copy_whole4(spans, used * RUN + CODES, codes, at)
+                        change[u64(tile)] += 1
+                        change[u64(tile + run)] -= 1
+                    used += 1
+            ty += 1
+            at += SIDE
         counts[k] += used - begin
     return used
 
 
 @bare
-def outline(first, last, table, thin, view, tiles_x, tiles_y, before, spans, counts, change, columns, shapes, notes):
+def outline(first, last, table, thin, view, tiles_x, tiles_y, before, shapes, spans, counts, change, codes, pieces,
+            notes):  # fmt: skip
     """Write the runs of tiles that the splats first..last (places in the order of depth) may show in to ``spans``.
 
     Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if the outline rho <=
     cut meets the rectangle of its pixel centres (but for roundings, which only add). Sixteen rows of squares are done
     at once. Splat k has ``counts[k]`` runs, which follow those of k - 1; a run is (first tile, number of tiles, columns
-    of squares in the upper half, in the lower half), see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and
-    taken away behind its end. Returns the rows needed; where they are more than fit, nothing of this counts.
-    Runs without a tile that is wanted, by ``before`` (tiles + 1), the number of them before each, are left out.
-    ``columns`` (16 + 32 NOTES), ``shapes`` (16 NOTES), both float32, and ``notes`` (NOTES, 3) are for work: ellipses are
-    noted in pieces of 16 rows of squares, NOTES of them, and then worked off together.
+    of squares in each row of them), see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and taken away
+    behind its end. Returns the rows needed; where they are more than fit, nothing of this counts. Runs without a tile
+    that is wanted, by ``before`` (tiles + 1), the number of them before each, are left out.
+    ``shapes`` are the outlines, from :func:`project`. ``codes`` (48 NOTES, int32), ``pieces`` (16 NOTES, float32) and
+    ``notes`` (NOTES, 3) are for work: ellipses are noted in pieces of 16 rows of squares, NOTES of them, and then
+    worked off together.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
     for k in range(16):
-        columns[k] = f32(4 * k)
+        pieces[k] = f32(4 * k)
+    steps = L.load(pieces, 0)
     used, noted = 0, 0
     for k in range(first, last):
-        row, slim = table[k], thin[k]
-        x0, y0, cut = row[X0], row[Y0], f64(slim[WIDE + CUT]) * (1 + 1e-6)
+        shape = u64(k - first)
         counts[k] = 0
-        if cut < 0:
-            continue
-        ellipse = slim[WIDE + BOUNDED] > 0
-        A, B, C, h, ex, ey = row[CA], row[CB], row[CC], cut, 0.0, 0.0
-        if flat and ellipse:
-            ux, uy, vx, vy, wx, wy = row[UX], row[UY], row[VX], row[VY], row[WX], row[WY]
-            A = ux * ux + vx * vx - cut * wx * wx
-            B = ux * uy + vx * vy - cut * wx * wy
-            C = uy * uy + vy * vy - cut * wy * wy
-            det = A * C - B * B
-            if not (A > 0 and C > 0 and det > 1e-12 * A * C):
-                ellipse = False
-            else:
-                inverse = cut / det
-                ex = (C * wx - B * wy) * inverse
-                ey = (A * wy - B * wx) * inverse
-                h = cut * (1 + wx * ex + wy * ey)
-        if not ellipse:
+        r1, r2 = int(shapes[shape, u64(SHAPE_FIRST)]), int(shapes[shape, u64(SHAPE_LAST)])
+        if r1 < 0:
             # In the order of the splats: what has been noted comes first.
-            used = _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
+            used = _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change)
             noted = 0
+            row, slim = table[k], thin[k]
+            cut = f64(slim[WIDE + CUT]) * (1 + 1e-6)
             used = _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change)
             continue
-        square = cut / 2 if flat else 0.0
-        radius = math.sqrt(square)
-        inverse = h / (A * C - B * B)
-        top, wide = math.sqrt(A * inverse), math.sqrt(C * inverse)
-        tip = -B * wide / C
-        low, high = y0 - 0.5 - 1e-4 + min(ey - top, -radius), y0 - 0.5 + 1e-4 + max(ey + top, radius)
-        if high < 0 or low > height - 1:
-            continue
-        r1 = math.ceil(max(low, 0.0)) // 8 * 2
-        r2 = int(min(high, height - 1.0)) // 4
-        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all sides.
-        slack = 1e-4 + 1e-6 * (wide + abs(ex) + abs(x0))
-        slack_y = 1e-4 + 5e-7 * (top + abs(ey) + abs(y0))
-        half, lean, shrink = math.sqrt(A * h) / A, -B / A, 1 / top
+        start = f64(shapes[shape, u64(SHAPE_Y)]) - table[k, Y0]
         while r1 <= r2:
             if noted == NOTES:
-                used = _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
+                used = _emit(
+                    notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change
+                )
                 noted = 0
-            at = u64(noted * 16)
-            shapes[at], shapes[at + u64(1)], shapes[at + u64(2)] = 4 * r1 + 0.5 - slack_y - y0, ey, top
-            shapes[at + u64(3)], shapes[at + u64(4)], shapes[at + u64(5)] = shrink, half, lean
-            shapes[at + u64(6)], shapes[at + u64(7)], shapes[at + u64(8)] = wide, tip, ex
-            shapes[at + u64(9)], shapes[at + u64(10)] = square, radius
-            shapes[at + u64(11)], shapes[at + u64(12)] = x0 - 0.5 - slack, x0 - 0.5 + slack
-            shapes[at + u64(13)] = 3 + 2 * slack_y
-            notes[noted, 0], notes[noted, 1], notes[noted, 2] = k, r1 // 2, min(8, r2 // 2 - r1 // 2 + 1)
+            L.store(pieces, noted * 16, L.load(shapes, (k - first) * 16))
+            pieces[u64(noted * 16)] = start + 4 * r1
+            notes[noted, 0], notes[noted, 1] = k, r1 // SIDE
+            notes[noted, 2] = min(16 // SIDE, r2 // SIDE - r1 // SIDE + 1)
             noted += 1
             r1 += 16
-    return _emit(notes, shapes, noted, flat, columns, width, tiles_x, before, spans, used, counts, change)
+    return _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change)
 
 
 @bare
@@ -649,17 +799,18 @@ def place_cursors(changes, live, cursors, starts):
 
 
 @inlined
-def _bits(code):
-    """A half run, as :func:`outline` writes it, as one bit for each column of squares; up to 31 tiles."""
-    begin, end = code & 0xFFFF, code >> 16
-    return ((2 << end) - (1 << begin)) if end >= 0 else 0
+def _bits(code, begin):
+    """A row of a run, as :func:`outline` writes it, as one bit for each column of squares from ``begin`` on; up to 58
+    columns."""
+    low, high = (code & 0xFFFF) - begin, (code >> 16) - begin
+    return ((2 << high) - (1 << low)) if code >= 0 else 0
 
 
 @inlined
 def _columns(code, column):
-    """Bits 0 and 1: whether a half run holds this column of squares and the next."""
-    begin, end = code & 0xFFFF, code >> 16
-    return int((begin <= column) & (column <= end)) | int((begin <= column + 1) & (column + 1 <= end)) << 1
+    """Of a row of a run, the bits of SIDE columns of squares from this one on."""
+    begin, end = max((code & 0xFFFF) - column, 0), min((code >> 16) - column, SIDE - 1)
+    return ((2 << end) - (1 << begin)) if end >= begin else 0
 
 
 @bare
@@ -674,87 +825,136 @@ def scatter(first, last, spans, counts, live, before, cursor, entries):
     for place in range(first, last):
         for _ in range(counts[place]):
             tile, run = u64(spans[at, 0]), spans[at, 1]
-            upper, lower = int(spans[at, 2]), int(spans[at, 3])
+            origin = int(spans[at, 2])
+            r0, r1 = int(spans[at, CODES]), int(spans[at, CODES + 1])
+            r2, r3 = int(spans[at, CODES + 2]), int(spans[at, CODES + 3])
             at += u64(1)
-            if every and run < 31:
-                top, bottom = _bits(upper), _bits(lower) << 2
+            if every and run * SIDE <= 56:
+                b0, b1 = _bits(r0, origin), _bits(r1, origin) << SIDE
+                b2, b3 = _bits(r2, origin), _bits(r3, origin) << SIDE
                 for t in range(tile, tile + u64(run)):
                     c = u64(cursor[t])
-                    entries[c] = place | ((top & 3) | (bottom & 12)) << PLACE_BITS
+                    upper, lower = (b0 & 0x0F) | (b1 & 0xF0), (b2 & 0x0F) | (b3 & 0xF0)
+                    entries[c] = place | (upper | lower << 8) << PLACE_BITS
                     cursor[t] = int(c) + 1
-                    top >>= 2
-                    bottom >>= 2
+                    b0, b1, b2, b3 = b0 >> SIDE, b1 >> SIDE, b2 >> SIDE, b3 >> SIDE
                 continue
             if before[tile] == before[tile + u64(run)]:
                 continue
             for k in range(run):
                 t = tile + u64(k)
                 if every or live[t]:
-                    bits = _columns(upper, 2 * k) | _columns(lower, 2 * k) << 2
-                    entries[u64(cursor[t])] = place | bits << PLACE_BITS
+                    column = origin + SIDE * k
+                    upper = _columns(r0, column) | _columns(r1, column) << SIDE
+                    lower = _columns(r2, column) | _columns(r3, column) << SIDE
+                    entries[u64(cursor[t])] = place | (upper | lower << 2 * SIDE) << PLACE_BITS
                     cursor[t] += 1
 
 
 @inlined
-def _place(work, at, table, thin, i, ox, oy, flat):
-    """Row i of the table as float32 to ``work`` from ``at`` on, its coefficients moved to the tile's middle (ox,
-    oy)."""
-    i, b = u64(i), u64(at)
-    L.narrow(work, at, table, i * u64(COLUMNS))
-    L.store(work, at + WIDE, L.load(thin, i * u64(2 * COLUMNS) + u64(2 * WIDE)))
-    work[b + u64(VALUES + 2)] = thin[i, u64(WIDE + VALUES + 2)]
-    sx, sy = ox - table[i, X0], oy - table[i, Y0]
-    work[b + u64(X0)], work[b + u64(Y0)] = sx, sy
-    if flat:
-        work[b + u64(U0)] = table[i, U0] + table[i, UX] * sx + table[i, UY] * sy
-        work[b + u64(V0)] = table[i, V0] + table[i, VX] * sx + table[i, VY] * sy
-        work[b + u64(W0)] = table[i, W0] + table[i, WX] * sx + table[i, WY] * sy
-        work[b + u64(WX)], work[b + u64(WY)] = table[i, WX], table[i, WY]
-    else:
-        work[b + u64(RXY)], work[b + u64(RYY)] = table[i, RXY], table[i, RYY]
+def _slopes(exact, at):
+    """What is the same for all splats in ``exact``; see :func:`_place`."""
+    for k in range(EXACT):
+        exact[u64(at + k)] = 0.0
+    exact[u64(at + 8 + SCREEN_X)] = exact[u64(at + 16 + SCREEN_Y)] = ROOT2
+    exact[u64(at + 8 + AT_X)] = exact[u64(at + 16 + AT_Y)] = 1.0
 
 
 @inlined
-def _shade(work, at, x, y, flat, peak):
-    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere), z and 1 / z."""
-    low, high = L.spread(work, at + ZLO), L.spread(work, at + ZHI)
-    ex, ey = x + L.spread(work, at + X0), y + L.spread(work, at + Y0)
+def _place(work, at, exact, begin, table, thin, i, ox, oy, flat):
+    """Row i of the table as float32 to ``work`` from ``at`` on; and to ``exact`` from ``begin`` on what it is at the tile's
+    middle (ox, oy), and its slopes."""
+    i, b, e = u64(i), u64(at), u64(begin)
+    L.narrow(work, at, table, i * u64(COLUMNS))
+    work[b + u64(8)], work[b + u64(9)] = table[i, 8], table[i, 9]
+    L.store(work, at + WIDE, L.load(thin, i * u64(2 * COLUMNS) + u64(2 * WIDE)))
+    work[b + u64(VALUES + 2)] = thin[i, u64(WIDE + VALUES + 2)]
+    sx, sy = ox - table[i, X0], oy - table[i, Y0]
+    exact[e + u64(AT_X)], exact[e + u64(AT_Y)] = sx, sy
     if flat:
-        w = L.spread(work, at + W0) + L.spread(work, at + WX) * x + L.spread(work, at + WY) * y
-        u = L.spread(work, at + U0) + L.spread(work, at + UX) * x + L.spread(work, at + UY) * y
-        v = L.spread(work, at + V0) + L.spread(work, at + VX) * x + L.spread(work, at + VY) * y
-        r = L.inverse(w)
-        # Below 1e-30 r may be NaN, and z would be farther than anything.
-        ahead = f32(1e-30) < w
-        meets = ahead & (w <= L.spread(work, at + WMAX))
-        screen = (ex * ex + ey * ey) * L.spread(work, at + FILTER) + L.spread(work, at + SHUT)
-        rho = L.least(L.where(meets, (u * u + v * v) * (r * r), f32(HUGE)), screen)
-        z = L.where(ahead, L.least(L.most(L.spread(work, at + Z0) * r, low), high), high)
-        iz = L.least(L.most(w * L.spread(work, at + IZ0), L.spread(work, at + IZHI)), L.spread(work, at + IZLO))
+        for k in range(3):
+            gx, gy = table[i, UX + 3 * k], table[i, UY + 3 * k]
+            exact[e + u64(AT_U + k)] = table[i, U0 + 3 * k] + gx * sx + gy * sy
+            exact[e + u64(8 + AT_U + k)], exact[e + u64(16 + AT_U + k)] = gx, gy
+        # Without a filter, farther away than anything.
+        exact[e + u64(SCREEN_X)] = ROOT2 * sx if thin[i, u64(WIDE + FILTER)] > 0 else FAR
+        exact[e + u64(SCREEN_Y)] = ROOT2 * sy
     else:
-        rho = (L.spread(work, at + CA) * ex + L.spread(work, at + CB) * ey * f32(2.0)) * ex
-        rho = L.most(rho + L.spread(work, at + CC) * ey * ey, f32(0.0))
-        z, iz = low, L.spread(work, at + IZLO)
+        f11, f12, f22 = table[i, F11], table[i, F12], table[i, F22]
+        work[b + u64(CA)], work[b + u64(CB)], work[b + u64(CC)] = f11, f12, f22
+        exact[e + u64(AT_U)], exact[e + u64(AT_V)] = f11 * sx + f12 * sy, f22 * sy
+        exact[e + u64(8 + AT_U)], exact[e + u64(16 + AT_U)], exact[e + u64(16 + AT_V)] = f11, f12, f22
+
+
+@inlined
+def _refer(work, at, exact, begin, dx, dy):
+    """What depends on where pixels are counted from, as float32 to ``work`` from ``at`` on: counted from (dx, dy) off the
+    tile's middle."""
+    slope_x, slope_y = L.load8(exact, begin + 8), L.load8(exact, begin + 16)
+    L.store8(work, at, L.load8(exact, begin) + slope_x * dx + slope_y * dy)
+
+
+@inlined
+def _shade(work, at, off, x, y, screen_x, screen_y, flat, peak):
+    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere); and p, q, which :func:`_depth`
+    makes its z and 1 / z of. ``at``: its row. ``off``: what :func:`_refer` made. ``screen_x`` and ``screen_y`` are x and
+    y times the root of 2.
+
+    A 2D splat's W is clamped to the z that it may have, between WLOW and WTOP, before anything is divided by it. That bounds
+    the z of what its filter draws, and changes nothing that its intersection draws, nor adds to it. For take its centre in
+    front, and the centre's z as 1: at (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and
+    WLOW = 1 / (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than WLOW, |U| > (1 - WLOW) / |s| = E WLOW: |U| / WLOW is
+    more than E too, where nothing is drawn. Where W is more than WTOP, |U| / WTOP is more than |U| / W, which is more than E,
+    unless WTOP is that of the near plane; this is what WMAX is for.
+    """
+    if flat:
+        w = L.spread(work, off + AT_W) + L.spread(work, at + WX) * x + L.spread(work, at + WY) * y
+        u = L.spread(work, off + AT_U) + L.spread(work, at + UX) * x + L.spread(work, at + UY) * y
+        v = L.spread(work, off + AT_V) + L.spread(work, at + VX) * x + L.spread(work, at + VY) * y
+        q = L.least(L.most(w, L.spread(work, at + WLOW)), L.spread(work, at + WTOP))
+        p = L.inverse(q)
+        ex, ey = screen_x + L.spread(work, off + SCREEN_X), screen_y + L.spread(work, off + SCREEN_Y)
+        meets = w <= L.spread(work, at + WMAX)
+        rho = L.least(L.where(meets, (u * u + v * v) * (p * p), f32(HUGE)), ex * ex + ey * ey)
+    else:
+        # The row holds F11, F12 and F22 here.
+        u = L.spread(work, off + AT_U) + L.spread(work, at + CA) * x + L.spread(work, at + CB) * y
+        v = L.spread(work, off + AT_V) + L.spread(work, at + CC) * y
+        rho = u * u + v * v
+        p, q = L.spread(work, at + ZLO), L.spread(work, at + IZLO)
         if peak:
+            low, high = L.spread(work, at + ZLO), L.spread(work, at + ZHI)
+            ex, ey = x + L.spread(work, off + AT_X), y + L.spread(work, off + AT_Y)
             along = L.spread(work, at + LX) * ex + L.spread(work, at + LY) * ey + f32(1.0)
             form = (L.spread(work, at + RXX) * ex + L.spread(work, at + RXY) * ey * f32(2.0)) * ex
             across = along * along + L.most(form + L.spread(work, at + RYY) * ey * ey, f32(0.0))
-            z = L.spread(work, at + Z0) * along * L.inverse(L.most(across, f32(1e-30)))
-            z = L.least(L.most(z, low), high)
-            iz = L.inverse(z)
+            p = L.spread(work, at + Z0) * along * L.inverse(L.most(across, f32(1e-30)))
+            p = L.least(L.most(p, low), high)
+            q = L.inverse(p)
     inside = rho <= L.spread(work, at + CUT)
     alpha = L.least(L.spread(work, at + OPACITY) * _gauss(rho), f32(K.ALPHA_MAX))
-    return inside, alpha, z, iz
+    return inside, alpha, p, q
+
+
+@inlined
+def _depth(work, at, p, q, flat, peak, z, iz):
+    """z and 1 / z of a splat from what :func:`_shade` says, less these."""
+    if flat:
+        if peak:
+            return L.fma(L.spread(work, at + Z0), p, -z), L.fma(L.spread(work, at + IZ0), q, -iz)
+        return L.spread(work, at + ZLO) - z, L.spread(work, at + IZ0) - iz
+    return p - z, q - iz
 
 
 @bare
 def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thin, features, background, ndc_scale,
             color, alpha, depth, median, normal, l1, l2, state, done, tested_in, shaded_in, drawn_in, full, seen, buf,
-            work, picks):  # fmt: skip
+            work, exact, picks, places, masks):  # fmt: skip
     """Composite those of the tiles visit[first:last] that are live.
 
-    A tile's 64 pixels are four squares of 16. Splats come in blocks: their coefficients are laid out once for the tile;
-    each square then picks those that its list says may show in it, and composites them with its sums in registers.
+    A tile is 16 squares of 16 pixels. Splats come in blocks of those that show in a square that is not opaque yet: their
+    coefficients are laid out once for the tile; each square then picks those that its list says may show in it, and
+    composites them with its sums in registers.
 
     ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry, mean and spread of
     1 / z; of no height if there will be none. Per tile, ``done`` is the number of entries worked off, ``tested_in``
@@ -767,9 +967,12 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
     channels = background.shape[0]
     keep = state.shape[1] > 0
     for p in range(PIXELS):
-        # From the tile's middle: offsets are small, and so is what they round.
-        buf[XS * 64 + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
-        buf[YS * 64 + p] = f32(p // 32 * 4 + p // 4 % 4) - f32(3.5)
+        # From the middle of the tile's quarter: offsets are small, and so is what they round.
+        buf[XS * PIXELS + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
+        buf[YS * PIXELS + p] = f32(p // (16 * SIDE) % 2 * 4 + p // 4 % 4) - f32(3.5)
+    for k in range(BLOCK):
+        _slopes(exact, k * EXACT)
+    zero = L.load(buf, XS * PIXELS) * f32(0.0)
     stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
     for visited in range(first, last):
         t = visit[visited]
@@ -778,7 +981,7 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
         begin, end = starts[t], starts[t + 1]
         tested, shaded, contributing = 0, 0, 0
         ty, tx = t // tiles_x, t % tiles_x
-        ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
+        ox, oy = tx * TILE + TILE / 2, ty * TILE + TILE / 2
         rows, cols = min(TILE, height - ty * TILE), min(TILE, width - tx * TILE)
         for r in range(rows):
             # They will be written when the tile is done: the memory has time until then.
@@ -796,68 +999,101 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                 for k in range(5):
                     _prefetch_to_write(state, k * height * width + to)
         for p in range(0, PIXELS, 16):
-            L.store(buf, TT * 64 + p, f32(1.0))
+            L.store(buf, TT * PIXELS + p, f32(1.0))
         if rows < TILE or cols < TILE:
             # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
             for p in range(PIXELS):
-                if not ((buf[XS * 64 + p] + f32(4.0) < cols) & (buf[YS * 64 + p] + f32(4.0) < rows)):
-                    buf[TT * 64 + p] = f32(0.0)
-        for p in range(AA * 64, buf.shape[0], 16):
+                column, row = p // 16 % SIDE * 4 + p % 4, p // (16 * SIDE) * 4 + p // 4 % 4
+                if column >= cols or row >= rows:
+                    buf[TT * PIXELS + p] = f32(0.0)
+        for p in range(AA * PIXELS, buf.shape[0], 16):
             L.store(buf, p, f32(0.0))
         ended, reached = 0, 0
-        for q in range(4):
-            if not L.some(stop < L.load(buf, TT * 64 + q * 16)):
+        for q in range(SQUARES):
+            if not L.some(stop < L.load(buf, TT * PIXELS + q * 16)):
                 ended |= 1 << q
         e = begin
-        while e < end and ended < 15:
-            size = min(BLOCK, end - e)
-            for k in range(size):
+        while e < end and ended != EVERY:
+            size = 0
+            while e < end and size < BLOCK:
                 # The rows are anywhere in a table larger than the cache.
-                ahead = entries[min(e + k + AHEAD, end - 1)] & PLACE
+                ahead = entries[min(e + AHEAD, end - 1)] & PLACE
                 _prefetch(table, ahead * COLUMNS)
                 _prefetch(table, ahead * COLUMNS + 8)
                 _prefetch(table, ahead * COLUMNS + 16)
-                entry = entries[e + k]
-                picks[u64(BLOCK + k)] = entry >> PLACE_BITS
-                _place(work, k * ROW, table, thin, entry & PLACE, ox, oy, flat)
-                work[u64(k * ROW + STEP)] = f32(e - begin + k + 1)
-                L.store(work, WEIGHTS + k * 16, f32(0.0))
-            for q in range(4):
+                entry = entries[e]
+                squares = entry >> PLACE_BITS & ~ended
+                if squares == 0:
+                    seen[u64(e)] = f32(0.0)
+                else:
+                    places[u64(size)], masks[u64(size)] = e, squares
+                    _place(work, size * ROW, exact, size * EXACT, table, thin, entry & PLACE, ox, oy, flat)
+                    work[u64(size * ROW + STEP)] = f32(e - begin + 1)
+                    L.store(work, WEIGHTS + size * 16, f32(0.0))
+                    size += 1
+                e += 1
+            for k in range(size, BLOCK):
+                masks[u64(k)] = 0
+            for turn in range(SQUARES):
+                # The tile's quarters after one another.
+                corner = turn & 8 | turn >> 1 & 2
+                if turn & 3 == 0:
+                    dx, dy = (corner & 2) * 4.0 - 4.0, (corner & 8) - 4.0
+                    left = L.having(masks, 0, QUARTER << corner) | L.having(masks, 16, QUARTER << corner) << 16
+                    while left != 0:
+                        k = L.lowest(left)
+                        left &= left - 1
+                        _refer(work, PLACED + k * 8, exact, k * EXACT, dx, dy)
+                q = corner + (turn << 1 & 4) + (turn & 1)
                 if ended >> q & 1:
                     continue
+                left = L.having(masks, 0, 1 << q) | L.having(masks, 16, 1 << q) << 16
+                if left == 0:
+                    continue
                 s = q * 16
-                x, y = L.load(buf, XS * 64 + s), L.load(buf, YS * 64 + s)
-                picked = 0
-                for k in range(size):
-                    picks[u64(picked)] = k
-                    picked += picks[u64(BLOCK + k)] >> q & 1
-                T, A, D = L.load(buf, TT * 64 + s), L.load(buf, AA * 64 + s), L.load(buf, DD * 64 + s)
-                sum1, sum2, pairs = L.load(buf, M1 * 64 + s), L.load(buf, M2 * 64 + s), L.load(buf, L1 * 64 + s)
-                n0, n1, n2 = L.load(buf, NX * 64 + s), L.load(buf, NY * 64 + s), L.load(buf, NZ * 64 + s)
-                c0, c1, c2 = L.load(buf, C_0 * 64 + s), L.load(buf, C_1 * 64 + s), L.load(buf, C_2 * 64 + s)
-                zref, iref = L.load(buf, ZREF * 64 + s), L.load(buf, IREF * 64 + s)
-                med, medk, final = L.load(buf, MED * 64 + s), L.load(buf, MEDK * 64 + s), L.load(buf, LAST * 64 + s)
+                x, y = L.load(buf, XS * PIXELS + s), L.load(buf, YS * PIXELS + s)
+                sx, sy = x * f32(ROOT2), y * f32(ROOT2)
+                T, A, D = L.load(buf, TT * PIXELS + s), L.load(buf, AA * PIXELS + s), L.load(buf, DD * PIXELS + s)
+                sum1, sum2 = L.load(buf, M1 * PIXELS + s), L.load(buf, M2 * PIXELS + s)
+                pairs, final = L.load(buf, L1 * PIXELS + s), L.load(buf, LAST * PIXELS + s)
+                n0, n1 = L.load(buf, NX * PIXELS + s), L.load(buf, NY * PIXELS + s)
+                n2, c0 = L.load(buf, NZ * PIXELS + s), L.load(buf, C_0 * PIXELS + s)
+                c1, c2 = L.load(buf, C_1 * PIXELS + s), L.load(buf, C_2 * PIXELS + s)
+                zref, iref = L.load(buf, ZREF * PIXELS + s), L.load(buf, IREF * PIXELS + s)
+                med, medk = L.load(buf, MED * PIXELS + s), L.load(buf, MEDK * PIXELS + s)
                 # Once no pixel is, what only the first splats of a pixel decide is over: for a block at a time, so that
                 # it costs no branch that goes both ways.
                 undecided = L.some(half < T)
                 alive = stop < T
                 used = 0
-                while used < picked:
-                    k = picks[u64(used)]
+                following = L.lowest(left)
+                inside_then, a_then, p_then, q_then = _shade(
+                    work, following * ROW, PLACED + following * 8, x, y, sx, sy, flat, peak
+                )
+                while True:
+                    k, inside, a, p, iq = following, inside_then, a_then, p_then, q_then
                     b = k * ROW
-                    inside, a, z, iz = _shade(work, b, x, y, flat, peak)
+                    left &= left - 1
+                    if left != 0:
+                        # One splat ahead: a long chain of operations that wait for each other, while the sums of the
+                        # one at hand wait for nothing.
+                        following = L.lowest(left)
+                        inside_then, a_then, p_then, q_then = _shade(
+                            work, following * ROW, PLACED + following * 8, x, y, sx, sy, flat, peak
+                        )
                     hit = inside & alive
                     w = L.where(hit, a * T, f32(0.0))
                     step = L.spread(work, b + STEP)
                     if keep:
                         final = L.where(hit, step, final)
                     if undecided:
+                        z, iz = _depth(work, b, p, iq, flat, peak, zero, zero)
                         opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
                         med, medk = L.where(opens, z, med), L.where(opens, step, medk)
                         # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far
                         # away.
                         zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
-                    z, m = z - zref, iz - iref
+                    z, m = _depth(work, b, p, iq, flat, peak, zref, iref)
                     wz, wm = w * z, w * m
                     pairs = pairs + wz * A - w * D
                     A, D = A + w, D + wz
@@ -872,39 +1108,43 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                     L.store(work, WEIGHTS + k * 16, L.load(work, WEIGHTS + k * 16) + w)
                     if channels > 3:
                         L.store(work, SHARES + used * 16, w)
+                        picks[u64(used)] = k
                     drawn = L.count(hit)
                     contributing += drawn
-                    shaded += 16 if drawn > 0 else 0
+                    # 16 if there are any: no second test of the mask.
+                    shaded += (drawn + 15) & 16
                     used += 1
                     alive = stop < T
                     if not L.some(alive):
                         ended |= 1 << q
-                        reached = max(reached, e - begin + k + 1)
+                        reached = max(reached, places[u64(k)] - begin + 1)
                         break
-                L.store(buf, TT * 64 + s, T)
-                L.store(buf, AA * 64 + s, A)
-                L.store(buf, DD * 64 + s, D)
-                L.store(buf, M1 * 64 + s, sum1)
-                L.store(buf, M2 * 64 + s, sum2)
-                L.store(buf, L1 * 64 + s, pairs)
-                L.store(buf, NX * 64 + s, n0)
-                L.store(buf, NY * 64 + s, n1)
-                L.store(buf, NZ * 64 + s, n2)
-                L.store(buf, C_0 * 64 + s, c0)
-                L.store(buf, C_1 * 64 + s, c1)
-                L.store(buf, C_2 * 64 + s, c2)
-                L.store(buf, ZREF * 64 + s, zref)
-                L.store(buf, IREF * 64 + s, iref)
-                L.store(buf, MED * 64 + s, med)
-                L.store(buf, MEDK * 64 + s, medk)
-                L.store(buf, LAST * 64 + s, final)
+                    if left == 0:
+                        break
+                L.store(buf, TT * PIXELS + s, T)
+                L.store(buf, AA * PIXELS + s, A)
+                L.store(buf, DD * PIXELS + s, D)
+                L.store(buf, M1 * PIXELS + s, sum1)
+                L.store(buf, M2 * PIXELS + s, sum2)
+                L.store(buf, L1 * PIXELS + s, pairs)
+                L.store(buf, NX * PIXELS + s, n0)
+                L.store(buf, NY * PIXELS + s, n1)
+                L.store(buf, NZ * PIXELS + s, n2)
+                L.store(buf, C_0 * PIXELS + s, c0)
+                L.store(buf, C_1 * PIXELS + s, c1)
+                L.store(buf, C_2 * PIXELS + s, c2)
+                L.store(buf, ZREF * PIXELS + s, zref)
+                L.store(buf, IREF * PIXELS + s, iref)
+                L.store(buf, MED * PIXELS + s, med)
+                L.store(buf, MEDK * PIXELS + s, medk)
+                L.store(buf, LAST * PIXELS + s, final)
                 tested += 16 * used
                 for c in range(3, channels):
-                    sums = L.load(buf, (C_0 + c) * 64 + s)
+                    sums = L.load(buf, (C_0 + c) * PIXELS + s)
                     for k in range(used):
-                        f = features[u64(entries[e + picks[u64(k)]] & PLACE), u64(c)]
+                        f = features[u64(entries[u64(places[picks[u64(k)]])] & PLACE), u64(c)]
                         sums = sums + L.load(work, SHARES + k * 16) * f
-                    L.store(buf, (C_0 + c) * 64 + s, sums)
+                    L.store(buf, (C_0 + c) * PIXELS + s, sums)
             for k in range(0, size, 16):
                 b = WEIGHTS + k * 16
                 sums = L.totals(
@@ -913,66 +1153,74 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                     L.load(work, b + 128), L.load(work, b + 144), L.load(work, b + 160), L.load(work, b + 176),
                     L.load(work, b + 192), L.load(work, b + 208), L.load(work, b + 224), L.load(work, b + 240),
                 )  # fmt: skip
-                if k + 16 <= size:
-                    L.store(seen, e + k, sums)
-                else:
-                    L.store(work, SHARES, sums)
-                    for j in range(size - k):
-                        seen[u64(e + k + j)] = work[u64(SHARES + j)]
-            e += size
-        full[t] = ended == 15
-        done[t] = reached if ended == 15 else end - begin
+                L.store(work, SHARES, sums)
+                for j in range(min(16, size - k)):
+                    seen[u64(places[u64(k + j)])] = work[u64(SHARES + j)]
+        full[t] = ended == EVERY
+        done[t] = reached if ended == EVERY else end - begin
         tested_in[t] = tested
         shaded_in[t] = shaded
         drawn_in[t] = contributing
         for p in range(0, PIXELS, 16):
-            A, a1 = L.load(buf, AA * 64 + p), L.load(buf, M1 * 64 + p)
+            A, a1 = L.load(buf, AA * PIXELS + p), L.load(buf, M1 * PIXELS + p)
             covered = f32(0.0) < A
             inverse = L.where(covered, L.inverse(A), f32(0.0))
-            spread = L.most(L.load(buf, M2 * 64 + p) - a1 * a1 * inverse, f32(0.0))
-            L.store(buf, AL * 64 + p, spread)
-            L.store(buf, M2 * 64 + p, A * spread * f32(ndc_scale))
-            L.store(buf, M1 * 64 + p, L.load(buf, IREF * 64 + p) + a1 * inverse)
-            mean = L.load(buf, ZREF * 64 + p) + L.load(buf, DD * 64 + p) * inverse
-            L.store(buf, DD * 64 + p, L.where(covered, mean, f32(np.nan)))
-            L.store(buf, MED * 64 + p, L.where(covered, L.load(buf, MED * 64 + p), f32(np.nan)))
-            L.store(buf, L1 * 64 + p, L.load(buf, L1 * 64 + p) * f32(2.0))
+            spread = L.most(L.load(buf, M2 * PIXELS + p) - a1 * a1 * inverse, f32(0.0))
+            L.store(buf, AL * PIXELS + p, spread)
+            L.store(buf, M2 * PIXELS + p, A * spread * f32(ndc_scale))
+            L.store(buf, M1 * PIXELS + p, L.load(buf, IREF * PIXELS + p) + a1 * inverse)
+            mean = L.load(buf, ZREF * PIXELS + p) + L.load(buf, DD * PIXELS + p) * inverse
+            L.store(buf, DD * PIXELS + p, L.where(covered, mean, f32(np.nan)))
+            L.store(buf, MED * PIXELS + p, L.where(covered, L.load(buf, MED * PIXELS + p), f32(np.nan)))
+            L.store(buf, L1 * PIXELS + p, L.load(buf, L1 * PIXELS + p) * f32(2.0))
             through = f32(1.0) - A
             for c in range(channels):
-                at = (C_0 + c) * 64 + p
+                at = (C_0 + c) * PIXELS + p
                 L.store(buf, at, L.load(buf, at) + through * background[c])
         if rows == TILE and cols == TILE and channels == 3:
-            for k in range(16):
-                p = k // 8 * 32 + k % 2 * 16 + k // 2 % 4 * 4
-                to = (ty * TILE + k // 2) * width + tx * TILE + k % 2 * 4
-                L.copy4(alpha, to, buf, AA * 64 + p)
-                L.copy4(depth, to, buf, DD * 64 + p)
-                L.copy4(median, to, buf, MED * 64 + p)
-                L.copy4(l1, to, buf, L1 * 64 + p)
-                L.copy4(l2, to, buf, M2 * 64 + p)
-                L.interleave4(color, 3 * to, buf, C_0 * 64 + p, 64)
-                L.interleave4(normal, 3 * to, buf, NX * 64 + p, 64)
+            for k in range(PIXELS // 4):
+                r, q = k // SIDE, k % SIDE
+                p = (r // 4 * SIDE + q) * 16 + r % 4 * 4
+                to = (ty * TILE + r) * width + tx * TILE + q * 4
+                L.copy4(alpha, to, buf, AA * PIXELS + p)
+                L.copy4(depth, to, buf, DD * PIXELS + p)
+                L.copy4(median, to, buf, MED * PIXELS + p)
+                L.copy4(l1, to, buf, L1 * PIXELS + p)
+                L.copy4(l2, to, buf, M2 * PIXELS + p)
+                L.interleave4(color, 3 * to, buf, C_0 * PIXELS + p, PIXELS)
+                L.interleave4(normal, 3 * to, buf, NX * PIXELS + p, PIXELS)
                 if keep:
-                    L.copy4(state, to, buf, TT * 64 + p)
-                    L.copy4(state, to + height * width, buf, LAST * 64 + p)
-                    L.copy4(state, to + 2 * height * width, buf, MEDK * 64 + p)
-                    L.copy4(state, to + 3 * height * width, buf, M1 * 64 + p)
-                    L.copy4(state, to + 4 * height * width, buf, AL * 64 + p)
+                    L.copy4(state, to, buf, TT * PIXELS + p)
+                    L.copy4(state, to + height * width, buf, LAST * PIXELS + p)
+                    L.copy4(state, to + 2 * height * width, buf, MEDK * PIXELS + p)
+                    L.copy4(state, to + 3 * height * width, buf, M1 * PIXELS + p)
+                    L.copy4(state, to + 4 * height * width, buf, AL * PIXELS + p)
             continue
         for r in range(rows):
             for k in range(cols):
-                p = u64(r // 4 * 32 + k // 4 * 16 + r % 4 * 4 + k % 4)
+                p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
                 y, x = u64(ty * TILE + r), u64(tx * TILE + k)
-                alpha[y, x], depth[y, x], median[y, x] = buf[AA * 64 + p], buf[DD * 64 + p], buf[MED * 64 + p]
-                l1[y, x], l2[y, x] = buf[L1 * 64 + p], buf[M2 * 64 + p]
+                alpha[y, x], depth[y, x], median[y, x] = (
+                    buf[AA * PIXELS + p],
+                    buf[DD * PIXELS + p],
+                    buf[MED * PIXELS + p],
+                )
+                l1[y, x], l2[y, x] = buf[L1 * PIXELS + p], buf[M2 * PIXELS + p]
                 for c in range(channels):
-                    color[y, x, u64(c)] = buf[u64((C_0 + c) * 64) + p]
+                    color[y, x, u64(c)] = buf[u64((C_0 + c) * PIXELS) + p]
                 for c in range(3):
-                    normal[y, x, u64(c)] = buf[u64((NX + c) * 64) + p]
+                    normal[y, x, u64(c)] = buf[u64((NX + c) * PIXELS) + p]
                 if keep:
-                    state[0, y, x], state[1, y, x] = buf[TT * 64 + p], buf[LAST * 64 + p]
-                    state[2, y, x] = buf[MEDK * 64 + p]
-                    state[3, y, x], state[4, y, x] = buf[M1 * 64 + p], buf[AL * 64 + p]
+                    state[0, y, x], state[1, y, x] = buf[TT * PIXELS + p], buf[LAST * PIXELS + p]
+                    state[2, y, x] = buf[MEDK * PIXELS + p]
+                    state[3, y, x], state[4, y, x] = buf[M1 * PIXELS + p], buf[AL * PIXELS + p]
+
+
+@bare
+def hand_out(order, sums, weight):
+    """``weight`` of each splat from the sums, in WEIGHT_UNIT, by place in the order of depth."""
+    for place in range(order.shape[0]):
+        weight[u64(order[u64(place)])] = sums[u64(place)] * WEIGHT_UNIT
 
 
 @bare
@@ -990,7 +1238,8 @@ def settle(ended, starts, done, entries, seen, weight, offset, places, kept):
             for e in range(starts[t], starts[t] + done[t]):
                 weight[entries[u64(e)] & PLACE] += int(f64(seen[u64(e)]) * (1 / WEIGHT_UNIT))
                 if keep:
-                    kept[at] = entries[u64(e)]
+                    # Of what is nowhere drawn, no square is of interest to the backward pass.
+                    kept[at] = entries[u64(e)] if seen[u64(e)] > 0 else entries[u64(e)] & PLACE
                     at += 1
 
 
@@ -999,8 +1248,9 @@ BXS, BYS = 0, 1  # as in the forward pass
 (BT, BLAST, BMEDK, BZREF, BIREF, GW, GD, GM2, GL1, GMED, TOTA, BEHA, BEHD, BEHQ, GNX, GNY, GNZ, GC0, GC1,
  GC2) = range(2, 22)  # fmt: skip
 BACK_SLOTS = 22
-SUMS = ROW  # in the backward pass's work, behind the splat's row: what is summed over the tile
-BACK_WORK = SUMS + 32
+# In the backward pass's work, behind the splat's row: what is summed over the tile, and as PLACED above.
+SUMS, BACK_PLACED = ROW, ROW + 32
+BACK_WORK = BACK_PLACED + 16
 
 
 @inlined
@@ -1038,7 +1288,7 @@ def _rows_round(work, row, rows, line):
 @bare
 def backward(first, last, visit, view, tiles_x, starts, done, entries, table, thin, features, background, ndc_scale,
              alpha, depth, state, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows,
-             buf, work):  # fmt: skip
+             buf, work, exact):  # fmt: skip
     """Gradients of the tiles visit[first:last], one row of ``rows`` for each entry worked off, from place[tile] on.
 
     A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in its normal and
@@ -1051,131 +1301,147 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
     scale = f32(ndc_scale)
     zero, one, two = f32(0.0), f32(1.0), f32(2.0)
     for p in range(PIXELS):
-        buf[BXS * 64 + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
-        buf[BYS * 64 + p] = f32(p // 32 * 4 + p // 4 % 4) - f32(3.5)
+        buf[BXS * PIXELS + p] = f32(p // 16 % SIDE * 4 + p % 4) - f32(TILE / 2 - 0.5)
+        buf[BYS * PIXELS + p] = f32(p // (16 * SIDE) * 4 + p // 4 % 4) - f32(TILE / 2 - 0.5)
+    zero_lanes = L.load(buf, BXS * PIXELS) * zero
+    _slopes(exact, 0)
     for visited in range(first, last):
         t = visit[visited]
         begin, count = starts[t], done[t]
         if count == 0:
             continue
         ty, tx = t // tiles_x, t % tiles_x
-        ox, oy = tx * TILE + 4.0, ty * TILE + 4.0
+        ox, oy = tx * TILE + TILE / 2, ty * TILE + TILE / 2
         cols, tall = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
-        for p in range(BT * 64, buf.shape[0], 16):
+        for p in range(BT * PIXELS, buf.shape[0], 16):
             L.store(buf, p, zero)
         for r in range(tall):
             for k in range(cols):
-                p = u64(r // 4 * 32 + k // 4 * 16 + r % 4 * 4 + k % 4)
+                p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
                 y, x = u64(ty * TILE + r), u64(tx * TILE + k)
                 A = alpha[y, x]
                 if state[1, y, x] == 0:
                     continue
-                buf[u64(BT * 64) + p] = state[0, y, x]
-                buf[u64(BLAST * 64) + p] = state[1, y, x]
-                buf[u64(BMEDK * 64) + p] = state[2, y, x]
+                buf[u64(BT * PIXELS) + p] = state[0, y, x]
+                buf[u64(BLAST * PIXELS) + p] = state[1, y, x]
+                buf[u64(BMEDK * PIXELS) + p] = state[2, y, x]
                 # Relative to the means, the first moments vanish, and with them most terms.
-                buf[u64(BZREF * 64) + p] = depth[y, x]
-                buf[u64(BIREF * 64) + p] = state[3, y, x]
+                buf[u64(BZREF * PIXELS) + p] = depth[y, x]
+                buf[u64(BIREF * PIXELS) + p] = state[3, y, x]
                 gd = g_depth[y, x] / A
                 g2 = scale * g_l2[y, x]
                 gw = g_alpha[y, x] + g2 * state[4, y, x]
                 for c in range(channels):
                     gw -= g_color[y, x, u64(c)] * background[c]
-                    buf[u64((GC0 + c) * 64) + p] = g_color[y, x, u64(c)]
+                    buf[u64((GC0 + c) * PIXELS) + p] = g_color[y, x, u64(c)]
                 for c in range(3):
-                    buf[u64((GNX + c) * 64) + p] = g_normal[y, x, u64(c)]
-                buf[u64(GW * 64) + p] = gw
-                buf[u64(GD * 64) + p] = gd
-                buf[u64(GM2 * 64) + p] = g2 * A
-                buf[u64(GL1 * 64) + p] = two * g_l1[y, x]
-                buf[u64(GMED * 64) + p] = g_median[y, x]
-                buf[u64(TOTA * 64) + p] = A
+                    buf[u64((GNX + c) * PIXELS) + p] = g_normal[y, x, u64(c)]
+                buf[u64(GW * PIXELS) + p] = gw
+                buf[u64(GD * PIXELS) + p] = gd
+                buf[u64(GM2 * PIXELS) + p] = g2 * A
+                buf[u64(GL1 * PIXELS) + p] = two * g_l1[y, x]
+                buf[u64(GMED * PIXELS) + p] = g_median[y, x]
+                buf[u64(TOTA * PIXELS) + p] = A
         for back in range(count):
             e = begin + count - 1 - back
             entry = entries[e]
             i = entry & PLACE
+            line = place[t] + count - 1 - back
+            squares = entry >> PLACE_BITS
             ahead = entries[max(e - 8, begin)] & PLACE
             _prefetch(table, ahead * COLUMNS)
             _prefetch(table, ahead * COLUMNS + 8)
             _prefetch(table, ahead * COLUMNS + 16)
-            _place(work, 0, table, thin, i, ox, oy, flat)
-            line = place[t] + count - 1 - back
+            if squares == 0:
+                continue
+            _place(work, 0, exact, 0, table, thin, i, ox, oy, flat)
             step = f32(e - begin + 1)
             gi = g_weight[i]
             if channels > 3:
                 for c in range(3, channels):
                     rows[line, GRADIENTS + 3 + c] = zero
-            s0 = s1 = s2 = s3 = s4 = s5 = L.spread(work, X0) * zero
+            s0 = s1 = s2 = s3 = s4 = s5 = zero_lanes
             b0 = b1 = b2 = b3 = b4 = b5 = b6 = b7 = b8 = b9 = s0
             b10 = b11 = b12 = b13 = b14 = b15 = b16 = s0
             hits = 0
-            for q in range(4):
-                if not (entry >> PLACE_BITS) >> q & 1:
-                    continue
+            quarter, dx, dy = 0, 0.0, 0.0
+            while squares != 0:
+                if quarter == 0:
+                    corner = L.lowest(squares) & CORNER
+                    quarter = squares & (QUARTER << corner)
+                    dx, dy = (corner & 2) * 4.0 - 4.0, (corner & 8) - 4.0
+                    _refer(work, BACK_PLACED, exact, 0, dx, dy)
+                q = L.lowest(quarter)
+                quarter &= quarter - 1
+                squares &= ~(1 << q)
                 s = q * 16
-                x, y = L.load(buf, BXS * 64 + s), L.load(buf, BYS * 64 + s)
-                inside, a, z, iz = _shade(work, 0, x, y, flat, peak)
-                hit = inside & (step <= L.load(buf, BLAST * 64 + s))
+                x, y = L.load(buf, BXS * PIXELS + s), L.load(buf, BYS * PIXELS + s)
+                nx, ny = x - f32(dx), y - f32(dy)
+                sx, sy = nx * f32(ROOT2), ny * f32(ROOT2)
+                inside, a, p, iq = _shade(work, 0, BACK_PLACED, nx, ny, sx, sy, flat, peak)
+                z, iz = _depth(work, 0, p, iq, flat, peak, zero_lanes, zero_lanes)
+                hit = inside & (step <= L.load(buf, BLAST * PIXELS + s))
                 if not L.some(hit):
                     continue
                 hits += 1
                 a = L.where(hit, a, zero)
                 rest = L.inverse(one - a)
-                T = L.load(buf, BT * 64 + s) * rest
+                T = L.load(buf, BT * PIXELS + s) * rest
                 w = a * T
-                dz, m = z - L.load(buf, BZREF * 64 + s), iz - L.load(buf, BIREF * 64 + s)
-                gn0, gn1, gn2 = L.load(buf, GNX * 64 + s), L.load(buf, GNY * 64 + s), L.load(buf, GNZ * 64 + s)
-                gc0, gc1, gc2 = L.load(buf, GC0 * 64 + s), L.load(buf, GC1 * 64 + s), L.load(buf, GC2 * 64 + s)
-                gd, gl1 = L.load(buf, GD * 64 + s), L.load(buf, GL1 * 64 + s)
-                gm = L.load(buf, GM2 * 64 + s) * m
-                behind_a, behind_d = L.load(buf, BEHA * 64 + s), L.load(buf, BEHD * 64 + s)
-                behind_q = L.load(buf, BEHQ * 64 + s)
-                g = L.load(buf, GW * 64 + s) + gi + gd * dz + gm * m
+                dz, m = z - L.load(buf, BZREF * PIXELS + s), iz - L.load(buf, BIREF * PIXELS + s)
+                gn0, gn1 = L.load(buf, GNX * PIXELS + s), L.load(buf, GNY * PIXELS + s)
+                gn2 = L.load(buf, GNZ * PIXELS + s)
+                gc0, gc1 = L.load(buf, GC0 * PIXELS + s), L.load(buf, GC1 * PIXELS + s)
+                gc2 = L.load(buf, GC2 * PIXELS + s)
+                gd, gl1 = L.load(buf, GD * PIXELS + s), L.load(buf, GL1 * PIXELS + s)
+                gm = L.load(buf, GM2 * PIXELS + s) * m
+                behind_a, behind_d = L.load(buf, BEHA * PIXELS + s), L.load(buf, BEHD * PIXELS + s)
+                behind_q = L.load(buf, BEHQ * PIXELS + s)
+                g = L.load(buf, GW * PIXELS + s) + gi + gd * dz + gm * m
                 g = g + gn0 * L.spread(work, NORMAL) + gn1 * L.spread(work, NORMAL + 1)
                 g = g + gn2 * L.spread(work, NORMAL + 2) + gc0 * L.spread(work, VALUES)
                 g = g + gc1 * L.spread(work, VALUES + 1) + gc2 * L.spread(work, VALUES + 2)
                 if channels > 3:
                     for c in range(3, channels):
-                        upstream = L.load(buf, (GC0 + c) * 64 + s)
+                        upstream = L.load(buf, (GC0 + c) * PIXELS + s)
                         g = g + upstream * features[u64(i), u64(c)]
                         rows[line, GRADIENTS + 3 + c] += L.total(w * upstream)
                 # In front minus behind, of the weights and of the weighted depths.
                 wz = w * dz
-                lean = L.load(buf, TOTA * 64 + s) - w - two * behind_a
+                lean = L.load(buf, TOTA * PIXELS + s) - w - two * behind_a
                 g = g + gl1 * (dz * lean + wz + two * behind_d)
                 in_z = w * (gd + gl1 * lean)
-                in_z = in_z + L.where(step == L.load(buf, BMEDK * 64 + s), L.load(buf, GMED * 64 + s), zero)
+                in_z = in_z + L.where(step == L.load(buf, BMEDK * PIXELS + s), L.load(buf, GMED * PIXELS + s), zero)
                 # What 1 / z is blamed for, as a gradient in z.
                 in_z = in_z - two * w * gm * iz * iz
                 in_a = L.where(hit & (a < f32(K.ALPHA_MAX)), (T * g - behind_q * rest) * a, zero)
-                L.store(buf, BT * 64 + s, T)
-                L.store(buf, BEHQ * 64 + s, behind_q + w * g)
-                L.store(buf, BEHA * 64 + s, behind_a + w)
-                L.store(buf, BEHD * 64 + s, behind_d + wz)
+                L.store(buf, BT * PIXELS + s, T)
+                L.store(buf, BEHQ * PIXELS + s, behind_q + w * g)
+                L.store(buf, BEHA * PIXELS + s, behind_a + w)
+                L.store(buf, BEHD * PIXELS + s, behind_d + wz)
                 s0, s1, s2 = s0 + w * gn0, s1 + w * gn1, s2 + w * gn2
                 s3, s4, s5 = s3 + w * gc0, s4 + w * gc1, s5 + w * gc2
                 b0 = b0 + in_a
-                ex, ey = x + L.spread(work, X0), y + L.spread(work, Y0)
+                ex, ey = nx + L.spread(work, BACK_PLACED + AT_X), ny + L.spread(work, BACK_PLACED + AT_Y)
                 low, high, z0 = L.spread(work, ZLO), L.spread(work, ZHI), L.spread(work, Z0)
                 if flat:
                     # As in _shade.
-                    v_w = L.spread(work, W0) + L.spread(work, WX) * x + L.spread(work, WY) * y
-                    u = L.spread(work, U0) + L.spread(work, UX) * x + L.spread(work, UY) * y
-                    v = L.spread(work, V0) + L.spread(work, VX) * x + L.spread(work, VY) * y
-                    r = L.inverse(v_w)
-                    front = f32(1e-30) < v_w
-                    screen = (ex * ex + ey * ey) * L.spread(work, FILTER) + L.spread(work, SHUT)
-                    meets = front & (v_w <= L.spread(work, WMAX)) & ((u * u + v * v) * (r * r) <= screen)
-                    # Selected, not multiplied by 0: r may be infinite.
+                    v_w = L.spread(work, BACK_PLACED + AT_W) + L.spread(work, WX) * nx + L.spread(work, WY) * ny
+                    u = L.spread(work, BACK_PLACED + AT_U) + L.spread(work, UX) * nx + L.spread(work, UY) * ny
+                    v = L.spread(work, BACK_PLACED + AT_V) + L.spread(work, VX) * nx + L.spread(work, VY) * ny
+                    sx, sy = sx + L.spread(work, BACK_PLACED + SCREEN_X), sy + L.spread(work, BACK_PLACED + SCREEN_Y)
+                    meets = (v_w <= L.spread(work, WMAX)) & ((u * u + v * v) * (p * p) <= sx * sx + sy * sy)
+                    r = p
+                    # Selected, not multiplied by 0: what it is multiplied with may be infinite.
                     rs = L.where(meets, r, zero)
                     u, v = u * rs, v * rs
                     blame = in_a * rs
                     gu, gv = blame * u, blame * v
                     gw = gu * u + gv * v
-                    screened = L.where(meets, zero, in_a) * L.spread(work, FILTER)
-                    meant = z0 * r
-                    over = L.flipped(front) | (high < meant)
-                    under = front & (meant <= low)
+                    screened = L.where(meets, zero, in_a) * two
+                    under, over = L.spread(work, WTOP) <= v_w, v_w <= L.spread(work, WLOW)
+                    if not peak:
+                        under, over = zero_lanes < one, zero_lanes < zero
                     between = L.flipped(over | under)
                     rz = L.where(between, r, zero)
                     along = in_z * rz
@@ -1221,7 +1487,7 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                 rows[line, GRADIENTS + c] = work[u64(SUMS + c)]
             rows[line, OPACITY] = work[u64(SUMS + 6)] / work[u64(OPACITY)]
             if flat:
-                _rows_flat(work, table[i], rows, f64(work[u64(X0)]), f64(work[u64(Y0)]), line)
+                _rows_flat(work, table[i], rows, exact[u64(AT_X)], exact[u64(AT_Y)], line)
             else:
                 _rows_round(work, table[i], rows, line)
 
@@ -1233,8 +1499,10 @@ def reduce_rows(low, high, first, last, visit, starts, done, entries, place, row
     for visited in range(first, last):
         t = visit[visited]
         for k in range(done[t]):
-            i = entries[starts[t] + k] & PLACE
-            if low <= i < high:
+            entry = entries[starts[t] + k]
+            i = entry & PLACE
+            # What is nowhere drawn has no row.
+            if entry > PLACE and low <= i < high:
                 row = place[t] + k
                 for c in range(columns):
                     total[i, c] += rows[row, c]

@@ -1,8 +1,9 @@
-"""Sixteen float32 as one value inside numba kernels, so that a whole loop can keep its sums in vector registers.
+"""Sixteen float32, or eight float64, as one value inside numba kernels: a whole loop can keep its sums in vector registers.
 
 LLVM vectorises loops over arrays, but then every sum lives in memory: 16 loads and 16 stores for each splat and 16
 pixels, which was most of the time. ``Lanes`` has the usual arithmetic (numbers are broadcast), comparisons that give a
-``Mask``, and the functions below. LLVM splits it where the machine's vectors are shorter.
+``Mask``, and the functions below; ``Wide`` and ``WideMask`` are the same of eight float64. LLVM splits them where the
+machine's vectors are shorter.
 
 Products and sums may be fused but are not reordered: the exponential's rounding relies on that.
 """
@@ -23,6 +24,7 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 WIDTH = 16
 FUSED = ("contract",)
 FLOATS, BITS, INTS = (ir.VectorType(kind, WIDTH) for kind in (ir.FloatType(), ir.IntType(1), ir.IntType(32)))
+DOUBLES, WIDE_BITS, LONGS = (ir.VectorType(kind, 8) for kind in (ir.DoubleType(), ir.IntType(1), ir.IntType(64)))
 
 
 class Lanes(types.Type):
@@ -39,7 +41,21 @@ class Mask(types.Type):
         super().__init__("Mask")
 
 
-lanes, mask = Lanes(), Mask()
+class Wide(types.Type):
+    """Eight float64."""
+
+    def __init__(self) -> None:
+        super().__init__("Wide")
+
+
+class WideMask(types.Type):
+    """Eight truth values."""
+
+    def __init__(self) -> None:
+        super().__init__("WideMask")
+
+
+lanes, mask, wide, wide_mask = Lanes(), Mask(), Wide(), WideMask()
 
 
 @register_model(Lanes)
@@ -54,14 +70,32 @@ class _MaskModel(models.PrimitiveModel):
         super().__init__(manager, kind, BITS)
 
 
-def _spread(builder: Any, value: Any) -> Any:
-    one = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(one, ir.Constant(FLOATS, ir.Undefined), ir.Constant(INTS, [0] * WIDTH))
+@register_model(Wide)
+class _WideModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, DOUBLES)
+
+
+@register_model(WideMask)
+class _WideMaskModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, WIDE_BITS)
+
+
+def _spread(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
+    empty = ir.Constant(kind, ir.Undefined)
+    one = builder.insert_element(empty, value, ir.IntType(32)(0))
+    return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count))
 
 
 @lower_cast(types.Number, Lanes)
 def _broadcast(context: Any, builder: Any, kind: Any, _: Any, value: Any) -> Any:
     return _spread(builder, context.cast(builder, value, kind, types.float32))
+
+
+@lower_cast(types.Number, Wide)
+def _broadcast_wide(context: Any, builder: Any, kind: Any, _: Any, value: Any) -> Any:
+    return _spread(builder, context.cast(builder, value, kind, types.float64), DOUBLES)
 
 
 def _operate(symbol: Any, operands: types.Type, result: types.Type, build: Callable[[Any, Any, Any], Any]) -> None:
@@ -70,7 +104,8 @@ def _operate(symbol: Any, operands: types.Type, result: types.Type, build: Calla
         key = symbol
 
         def generic(self, args: Any, kws: Any) -> Any:
-            taken = all(a == operands or (operands == lanes and isinstance(a, types.Number)) for a in args)
+            numbers = operands in (lanes, wide)
+            taken = all(a == operands or (numbers and isinstance(a, types.Number)) for a in args)
             return signature(result, *[operands] * len(args)) if taken and operands in args else None
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -79,16 +114,24 @@ def _operate(symbol: Any, operands: types.Type, result: types.Type, build: Calla
     lower_builtin(symbol, *[type(operands)] * (1 if symbol is operator.neg else 2))(lower)
 
 
-_operate(operator.add, lanes, lanes, lambda b, x, y: b.fadd(x, y, flags=FUSED))
-_operate(operator.sub, lanes, lanes, lambda b, x, y: b.fsub(x, y, flags=FUSED))
-_operate(operator.mul, lanes, lanes, lambda b, x, y: b.fmul(x, y, flags=FUSED))
-_operate(operator.truediv, lanes, lanes, lambda b, x, y: b.fdiv(x, y, flags=FUSED))
-_operate(operator.lt, lanes, mask, lambda b, x, y: b.fcmp_ordered("<", x, y))
-_operate(operator.le, lanes, mask, lambda b, x, y: b.fcmp_ordered("<=", x, y))
-_operate(operator.eq, lanes, mask, lambda b, x, y: b.fcmp_ordered("==", x, y))
-_operate(operator.neg, lanes, lanes, lambda b, x, *_: b.fneg(x))
-_operate(operator.and_, mask, mask, lambda b, x, y: b.and_(x, y))
-_operate(operator.or_, mask, mask, lambda b, x, y: b.or_(x, y))
+for _numbers, _truths in ((lanes, mask), (wide, wide_mask)):
+    _operate(operator.add, _numbers, _numbers, lambda b, x, y: b.fadd(x, y, flags=FUSED))
+    _operate(operator.sub, _numbers, _numbers, lambda b, x, y: b.fsub(x, y, flags=FUSED))
+    _operate(operator.mul, _numbers, _numbers, lambda b, x, y: b.fmul(x, y, flags=FUSED))
+    _operate(operator.truediv, _numbers, _numbers, lambda b, x, y: b.fdiv(x, y, flags=FUSED))
+    _operate(operator.lt, _numbers, _truths, lambda b, x, y: b.fcmp_ordered("<", x, y))
+    _operate(operator.le, _numbers, _truths, lambda b, x, y: b.fcmp_ordered("<=", x, y))
+    _operate(operator.gt, _numbers, _truths, lambda b, x, y: b.fcmp_ordered(">", x, y))
+    _operate(operator.ge, _numbers, _truths, lambda b, x, y: b.fcmp_ordered(">=", x, y))
+    _operate(operator.eq, _numbers, _truths, lambda b, x, y: b.fcmp_ordered("==", x, y))
+    _operate(operator.neg, _numbers, _numbers, lambda b, x, *_: b.fneg(x))
+    _operate(operator.and_, _truths, _truths, lambda b, x, y: b.and_(x, y))
+    _operate(operator.or_, _truths, _truths, lambda b, x, y: b.or_(x, y))
+
+
+def _kind(*args: Any) -> Any:
+    """What numbers are broadcast to."""
+    return wide if wide in args or wide_mask in args else lanes
 
 
 def _pointer(context: Any, builder: Any, kind: Any, to: Any, array: Any, item: Any) -> Any:
@@ -118,6 +161,31 @@ def store(typing: Any, array: Any, item: Any, value: Any) -> Any:
 
 
 @intrinsic
+def load8(typing: Any, array: Any, item: Any) -> Any:
+    """Eight consecutive numbers of a float64 array from ``item`` on, counted flat."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, sig.args[0], DOUBLES, *args), align=8)
+
+    return wide(array, types.int64), codegen
+
+
+@intrinsic
+def store8(typing: Any, array: Any, item: Any, value: Any) -> Any:
+    """Put ``value`` into a float64 or, rounded, a float32 array from ``item`` on, counted flat."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value, kind = args[2], DOUBLES
+        if array.dtype == types.float32:
+            kind = ir.VectorType(ir.FloatType(), 8)
+            value = builder.fptrunc(value, kind)
+        builder.store(value, _pointer(context, builder, sig.args[0], kind, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, wide), codegen
+
+
+@intrinsic
 def narrow(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
     """Eight float64 of ``source`` from ``begin`` on, as float32 to ``array`` from ``item`` on; both counted flat."""
 
@@ -137,7 +205,8 @@ def where(typing: Any, chosen: Any, yes: Any, no: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.select(*args)
 
-    return lanes(mask, lanes, lanes), codegen
+    kind = _kind(chosen)
+    return kind(chosen, kind, kind), codegen
 
 
 @intrinsic
@@ -147,7 +216,8 @@ def least(typing: Any, x: Any, y: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", *args), *args)
 
-    return lanes(lanes, lanes), codegen
+    kind = _kind(x, y)
+    return kind(kind, kind), codegen
 
 
 @intrinsic
@@ -157,40 +227,76 @@ def most(typing: Any, x: Any, y: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *args), *args)
 
-    return lanes(lanes, lanes), codegen
+    kind = _kind(x, y)
+    return kind(kind, kind), codegen
 
 
 @intrinsic
 def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
     """x y + z, rounded once where the machine can."""
+    kind = _kind(x, y, z)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.v16f32"), args)
+        vector = args[0].type
+        function = ir.FunctionType(vector, [vector] * 3)
+        name = "llvm.fmuladd." + ("v8f64" if kind == wide else "v16f32")
+        return builder.call(cgutils.get_or_insert_function(builder.module, function, name), args)
 
-    return lanes(lanes, lanes, lanes), codegen
+    return kind(kind, kind, kind), codegen
+
+
+def _approach(builder: Any, x: Any, name: str) -> tuple[Any, Any]:
+    """The processor's estimate, to 14 bits, of 1 / x ("rcp14") or of 1 / sqrt(x) ("rsqrt14"), with AVX-512; and the
+    function that fuses a product and a sum."""
+    single = x.type == FLOATS
+    lanes_here = ir.IntType(x.type.count if x.type.count > 8 else 8)
+    kind = ir.FunctionType(x.type, [x.type, x.type, lanes_here])
+    whole = f"llvm.x86.avx512.{name}.{'ps' if single else 'pd'}.512"
+    estimate = cgutils.get_or_insert_function(builder.module, kind, whole)
+    kind = ir.FunctionType(x.type, [x.type] * 3)
+    fused = cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32" if single else "llvm.fma.v8f64")
+    return builder.call(estimate, [x, ir.Constant(x.type, ir.Undefined), lanes_here(-1)]), fused
 
 
 @intrinsic
 def inverse(typing: Any, x: Any) -> Any:
-    """1 / x to the last bit or two, and NaN where x is 0, infinite or below 1e-38.
+    """1 / x to the last bit or two, and NaN where x is 0, infinite or below 1e-38 (float64: 1e-308).
 
-    With AVX-512 an estimate of 14 bits and one step of Newton's: three times as fast as a division.
+    With AVX-512 an estimate of 14 bits and a step or two of Newton's: three times as fast as a division.
     """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        x, one = args[0], ir.Constant(FLOATS, [1.0] * WIDTH)
+        x, one = args[0], ir.Constant(args[0].type, [1.0] * args[0].type.count)
         if not llvm.get_host_cpu_features().get("avx512f"):
             return builder.fdiv(one, x)
-        kind = ir.FunctionType(FLOATS, [FLOATS, FLOATS, ir.IntType(WIDTH)])
-        estimate = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.rcp14.ps.512")
-        r = builder.call(estimate, [x, ir.Constant(FLOATS, ir.Undefined), ir.IntType(WIDTH)(-1)])
-        kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
-        fused = cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32")
-        miss = builder.call(fused, [builder.fneg(x), r, one])
-        return builder.call(fused, [r, miss, r])
+        r, fused = _approach(builder, x, "rcp14")
+        for _ in range(1 if x.type == FLOATS else 2):
+            miss = builder.call(fused, [builder.fneg(x), r, one])
+            r = builder.call(fused, [r, miss, r])
+        return r
 
-    return lanes(lanes), codegen
+    return _kind(x)(_kind(x)), codegen
+
+
+@intrinsic
+def inverse_root(typing: Any, x: Any) -> Any:
+    """1 / sqrt(x) of float64, to the last bits; NaN where x is 0, negative or infinite."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        x = args[0]
+        one, half = (ir.Constant(DOUBLES, [value] * 8) for value in (1.0, 0.5))
+        if not llvm.get_host_cpu_features().get("avx512f"):
+            kind = ir.FunctionType(DOUBLES, [DOUBLES])
+            return builder.fdiv(
+                one, builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f64"), [x])
+            )
+        r, fused = _approach(builder, x, "rsqrt14")
+        for _ in range(2):
+            miss = builder.call(fused, [builder.fneg(builder.fmul(x, r)), r, one])
+            r = builder.call(fused, [builder.fmul(r, half), miss, r])
+        return r
+
+    return wide(wide), codegen
 
 
 @intrinsic
@@ -202,9 +308,7 @@ def rough_root(typing: Any, x: Any) -> Any:
         if not llvm.get_host_cpu_features().get("avx512f"):
             kind = ir.FunctionType(FLOATS, [FLOATS])
             return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x])
-        kind = ir.FunctionType(FLOATS, [FLOATS, FLOATS, ir.IntType(WIDTH)])
-        estimate = cgutils.get_or_insert_function(builder.module, kind, "llvm.x86.avx512.rsqrt14.ps.512")
-        r = builder.call(estimate, [x, ir.Constant(FLOATS, ir.Undefined), ir.IntType(WIDTH)(-1)])
+        r, _ = _approach(builder, x, "rsqrt14")
         return builder.fmul(builder.fmul(x, ir.Constant(FLOATS, [1 + 2.0**-14] * WIDTH)), r)
 
     return lanes(lanes), codegen
@@ -214,10 +318,12 @@ def _unary(name: str, document: str) -> Any:
     @intrinsic
     def operation(typing: Any, x: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            kind = ir.FunctionType(FLOATS, [FLOATS])
-            return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v16f32"), args)
+            vector = args[0].type
+            kind = ir.FunctionType(vector, [vector])
+            whole = f"llvm.{name}." + ("v8f64" if x == wide else "v16f32")
+            return builder.call(cgutils.get_or_insert_function(builder.module, kind, whole), args)
 
-        return lanes(lanes), codegen
+        return _kind(x)(_kind(x)), codegen
 
     operation.__doc__ = document
     return operation
@@ -225,6 +331,29 @@ def _unary(name: str, document: str) -> Any:
 
 down = _unary("floor", "Largest whole number that is not above x, in each lane.")
 up = _unary("ceil", "Smallest whole number that is not below x, in each lane.")
+magnitude = _unary("fabs", "x without its sign, in each lane.")
+
+
+@intrinsic
+def exponent(typing: Any, x: Any) -> Any:
+    """k of x = f 2^k with f in [1, 2), for x > 0 that is not denormal."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        raw = builder.lshr(builder.bitcast(args[0], LONGS), ir.Constant(LONGS, [52] * 8))
+        return builder.sitofp(builder.sub(raw, ir.Constant(LONGS, [1023] * 8)), DOUBLES)
+
+    return wide(wide), codegen
+
+
+@intrinsic
+def fraction(typing: Any, x: Any) -> Any:
+    """f of x = f 2^k with f in [1, 2), for x > 0 that is not denormal."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        raw = builder.and_(builder.bitcast(args[0], LONGS), ir.Constant(LONGS, [(1 << 52) - 1] * 8))
+        return builder.bitcast(builder.or_(raw, ir.Constant(LONGS, [1023 << 52] * 8)), DOUBLES)
+
+    return wide(wide), codegen
 
 
 @intrinsic
@@ -234,7 +363,7 @@ def flipped(typing: Any, chosen: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return builder.not_(args[0])
 
-    return mask(mask), codegen
+    return chosen(chosen), codegen
 
 
 @intrinsic
@@ -301,15 +430,18 @@ def totals8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
     return _fold1(low, low)
 
 
+def _as_bits(builder: Any, chosen: Any) -> Any:
+    return builder.bitcast(chosen, ir.IntType(chosen.type.count))
+
+
 @intrinsic
 def count(typing: Any, chosen: Any) -> Any:
     """How many lanes are chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], ir.IntType(WIDTH))
-        return builder.zext(builder.ctpop(bits), ir.IntType(64))
+        return builder.zext(builder.ctpop(_as_bits(builder, args[0])), ir.IntType(64))
 
-    return types.int64(mask), codegen
+    return types.int64(chosen), codegen
 
 
 @intrinsic
@@ -317,10 +449,20 @@ def some(typing: Any, chosen: Any) -> Any:
     """Whether any lane is chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], ir.IntType(WIDTH))
-        return builder.icmp_unsigned("!=", bits, ir.IntType(WIDTH)(0))
+        bits = _as_bits(builder, args[0])
+        return builder.icmp_unsigned("!=", bits, bits.type(0))
 
-    return types.boolean(mask), codegen
+    return types.boolean(chosen), codegen
+
+
+@intrinsic
+def as_bits(typing: Any, chosen: Any) -> Any:
+    """A bit for each lane that is chosen."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.zext(_as_bits(builder, args[0]), ir.IntType(64))
+
+    return types.int64(chosen), codegen
 
 
 @intrinsic
@@ -333,7 +475,84 @@ def spread(typing: Any, array: Any, item: Any) -> Any:
     return lanes(array, types.int64), codegen
 
 
+@intrinsic
+def having(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
+    """Which of sixteen int32 of ``array`` from ``item`` on, counted flat, have one of these bits: a bit for each."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        words = builder.load(_pointer(context, builder, sig.args[0], INTS, *args[:2]), align=4)
+        mask = _spread(builder, builder.trunc(args[2], ir.IntType(32)), INTS)
+        found = builder.icmp_unsigned("!=", builder.and_(words, mask), ir.Constant(INTS, [0] * WIDTH))
+        return builder.zext(_as_bits(builder, found), ir.IntType(64))
+
+    return types.int64(array, types.int64, types.int64), codegen
+
+
+@intrinsic
+def lowest(typing: Any, bits: Any) -> Any:
+    """The place of the lowest bit that is set; ``bits`` must not be 0."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.IntType(1)(1))
+
+    return types.int64(types.int64), codegen
+
+
+@intrinsic
+def store_ends(typing: Any, array: Any, item: Any, first: Any, last: Any) -> Any:
+    """Put first | last << 16, of sixteen whole numbers each, into an int32 array from ``item`` on, counted flat."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        low, high = (builder.fptosi(value, INTS) for value in args[2:])
+        both = builder.or_(low, builder.shl(high, ir.Constant(INTS, [16] * WIDTH)))
+        builder.store(both, _pointer(context, builder, sig.args[0], INTS, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, lanes, lanes), codegen
+
+
+@intrinsic
+def store_whole(typing: Any, array: Any, item: Any, value: Any) -> Any:
+    """Put sixteen whole numbers into an int32 array from ``item`` on, counted flat."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        whole = builder.fptosi(args[2], INTS)
+        builder.store(whole, _pointer(context, builder, sig.args[0], INTS, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, lanes), codegen
+
+
+def _swap(step: int) -> Any:
+    @intrinsic
+    def swapped(typing: Any, x: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            places = ir.Constant(INTS, [k ^ step for k in range(WIDTH)])
+            return builder.shuffle_vector(args[0], ir.Constant(FLOATS, ir.Undefined), places)
+
+        return lanes(lanes), codegen
+
+    swapped.__doc__ = f"Lane k of x in lane k ^ {step}."
+    return swapped
+
+
+swapped1, swapped2 = _swap(1), _swap(2)
+
+
 QUAD = ir.VectorType(ir.FloatType(), 4)
+FOUR = ir.VectorType(ir.IntType(32), 4)
+
+
+@intrinsic
+def copy_whole4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
+    """Four int32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted flat."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = builder.load(_pointer(context, builder, sig.args[2], FOUR, *args[2:]), align=4)
+        builder.store(value, _pointer(context, builder, sig.args[0], FOUR, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, source, types.int64), codegen
 
 
 @intrinsic

@@ -45,7 +45,7 @@ class Render:
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is not seen. From backend
             "cuda" it carries no gradient.
         counters: how much work it was: "splats" (in), "visible" (can show in the picture), "tile_pairs" (splats over
-            8 x 8 tiles), "pairs" (splats over pixels whose intersection was computed), "composited" (those of them in a
+            16 x 16 tiles), "pairs" (splats over pixels whose intersection was computed), "composited" (those of them in a
             4 x 4 square that the splat draws to), "contributing" (those drawn), "tiles". These are the "cpu" backend's;
             "reference" has "splats", "pairs" and "contributing", "cuda" only "splats".
         camera: the camera, with the pose that was used.

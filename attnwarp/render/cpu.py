@@ -1,10 +1,10 @@
-"""The CPU backend: numba kernels over tiles of 8 x 8 pixels, float32 with a float64 set-up.
+"""The CPU backend: numba kernels over tiles of 16 x 16 pixels, float32 with a float64 set-up.
 
 1. ``depths``, ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back. From here on a splat is known
    by its place in this order.
 2. ``project``: each splat's outline, depth and colour as seen by the camera, in float64. In deep scenes of the nearest
    ones only; the others follow if a tile is not opaque by then, and only those that can show in such a tile.
-3. ``outline`` and ``scatter``: the splats of each tile, and of its four squares of 4 x 4 pixels; exact outlines, no
+3. ``outline`` and ``scatter``: the splats of each tile, and of its squares of 4 x 4 pixels; exact outlines, no
    bounding circles. Lists that would be too long together are made for some of the tiles after the others.
 4. ``forward``: composite tile by tile, square by square, until every pixel is opaque.
 5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
@@ -28,14 +28,16 @@ from attnwarp.render.reference import Inputs, Outputs
 
 PIECE = 4096
 """Splats in one job of what is done splat by splat."""
-GROUP, GROUPS = 1024, 16
+GROUP, GROUPS = 1024, 8
 """Splats that are set up and binned by one job: at least so many, and in about so many jobs."""
-NEIGHBOURS = 8
+ROWS = 3.0
+"""Rows of tiles that a splat is expected to show in, to begin with."""
+NEIGHBOURS = 4
 """Edge of a block of tiles that are visited together."""
 FRONT = 512
 """Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
-ENTRIES = 8
-"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 8 bytes each."""
+ENTRIES = 4
+"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 12 bytes each."""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
@@ -118,12 +120,13 @@ class _Scene:
         self.features = _pool.empty((m if self.channels > 3 else 0, self.channels), np.float32)
         self.counts = _pool.empty(m, np.int32)
         self.ready = 0
+        self.rows = ROWS
         self.groups: list[tuple[int, int]] = []
         self.spans: list[np.ndarray] = []
         self.changes: list[np.ndarray] = []
         # Filled in the end, tile by tile of the lists that were used.
         self.starts = np.zeros(self.tiles, np.int64)
-        self.entries = np.empty(0, np.uint32)
+        self.entries = np.empty(0, np.int64)
 
     def front(self) -> int:
         """How many of the nearest splats to begin with: all, unless they would make lists far longer than needed."""
@@ -145,22 +148,26 @@ class _Scene:
 
         def work(index: int) -> None:
             begin, end = groups[index]
+            shapes = _pool.empty((end - begin, 16), np.float32)
             kernels.project(
                 begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
-                self.channels, wanted, self.table, self.thin, self.features,
+                self.channels, wanted, self.table, self.thin, self.features, shapes,
+                _aligned(2 * kernels.SETUP).view(np.float64), _aligned(kernels.SETUP_NARROW), np.empty(16),
             )  # fmt: skip
-            columns, shapes = _aligned(16 + 32 * kernels.NOTES), _aligned(16 * kernels.NOTES)
+            codes, pieces = _aligned(48 * kernels.NOTES).view(np.int32), _aligned(16 * kernels.NOTES)
             notes = np.empty((kernels.NOTES, 3), np.int64)
-            room = 6 * (end - begin) + 256
+            room = int(self.rows * (end - begin)) + 256
             while True:
                 runs = _pool.empty((room, kernels.RUN), np.int32)
                 used = kernels.outline(
-                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, runs, self.counts,
-                    changes[index], columns, shapes, notes,
+                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, shapes, runs,
+                    self.counts, changes[index], codes, pieces, notes,
                 )  # fmt: skip
                 if used <= room:
                     break
                 room = used
+                # Only for how much is set aside for the next ones.
+                self.rows = 1.1 * used / (end - begin)
                 changes[index] = 0
             spans[index] = runs[:used]
 
@@ -190,7 +197,7 @@ class _Scene:
         changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
         cursors = _pool.empty(changes.shape, np.int64)
         kernels.place_cursors(changes, live, cursors, starts)
-        entries = _pool.empty(int(starts[-1]), np.uint32)
+        entries = _pool.empty(int(starts[-1]), np.int64)
         before = np.concatenate([[0], np.cumsum(live)])
         _threads.run(
             kernels.scatter,
@@ -243,7 +250,8 @@ class _Composite(torch.autograd.Function):
                         (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
                          scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
                          done, tested, shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS),
-                         _aligned(kernels.WORK), np.empty(2 * kernels.BLOCK, np.int64))
+                         _aligned(kernels.WORK), _aligned(2 * kernels.BLOCK * kernels.EXACT).view(np.float64),
+                         *np.empty((2, kernels.BLOCK), np.int64), np.empty(kernels.BLOCK, np.int32))
                         for job in scene.visits(starts)
                     ],
                 )  # fmt: skip
@@ -251,7 +259,7 @@ class _Composite(torch.autograd.Function):
                 pairs += int(tested[band].sum())
                 composited += int(shaded[band].sum())
                 ended = band if last else band & full
-                kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.uint32)
+                kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.int64)
                 kernels.settle(ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept)
                 lists.append(kept)
             live = live & ~full
@@ -260,7 +268,7 @@ class _Composite(torch.autograd.Function):
             count = len(scene.order)
         scene.entries = _join(lists)
         weight = _pool.zeros(len(scene.means), np.float32)
-        weight[scene.order] = weight_of * kernels.WEIGHT_UNIT
+        kernels.hand_out(scene.order, weight_of, weight)
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
@@ -355,7 +363,8 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
             [
                 (begin, end, visit, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table,
                  scene.thin, scene.features, scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream,
-                 place, rows, _aligned(slots * kernels.PIXELS), _aligned(kernels.BACK_WORK))
+                 place, rows, _aligned(slots * kernels.PIXELS), _aligned(kernels.BACK_WORK),
+                 _aligned(2 * kernels.EXACT).view(np.float64))
                 for begin, end in itertools.pairwise(edges)
             ],
         )  # fmt: skip

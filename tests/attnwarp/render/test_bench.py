@@ -55,30 +55,3 @@ def test_hardly_a_pair_is_computed_where_a_splat_does_not_show(kind) -> None:
     is left out is what the comparisons with the reference show.)"""
     counters = render(bench.scene(kind, 500, 0.1), bench.camera(128), backend="cpu").counters
     assert counters["composited"] <= counters["pairs"] <= 1.05 * counters["composited"]
-
-
-def test_lanes_against_numpy() -> None:
-    """The building blocks that are estimates made better, or sums in another order."""
-    import numba
-
-    from attnwarp.render import _lanes as lanes
-
-    @numba.njit
-    def work(x, y):
-        lanes.store(y, 0, lanes.inverse(lanes.load(x, 0)))
-        lanes.store(y, 16, lanes.rough_root(lanes.load(x, 0)))
-        a, b, c, d = lanes.load(x, 16), lanes.load(x, 32), lanes.load(x, 48), lanes.load(x, 64)
-        lanes.store(y, 32, lanes.totals(a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c))
-        lanes.store(y, 48, lanes.totals8(a, b, c, d, d, c, b, a))
-
-    random = np.random.default_rng(0)
-    for scale in (1e-12, 1e-3, 1.0, 1e6):
-        x = (scale * random.uniform(0.5, 2, 80)).astype(np.float32)
-        y = np.zeros(64, np.float32)
-        work(x, y)
-        assert np.abs(y[:16] * x[:16].astype(float) - 1).max() < 2e-7
-        ratio = y[16:32] / np.sqrt(x[:16].astype(float))
-        assert ratio.min() > 1 - 2e-7 and ratio.max() < 1 + 1.4e-4
-        a, b, c, d = x[16:].reshape(4, 16).sum(axis=1, dtype=float)
-        assert y[32:48] == pytest.approx([a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c], rel=1e-6)
-        assert y[48:] == pytest.approx([a, b, c, d, d, c, b, a] * 2, rel=1e-6)

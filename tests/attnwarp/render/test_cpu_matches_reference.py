@@ -49,6 +49,23 @@ def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Ten
     return result
 
 
+def excess(inputs: reference.Inputs) -> dict[str, float]:
+    """How far each output of the CPU backend lies outside of what it may be."""
+    expected, actual = bracket(inputs), cpu.render(inputs)
+    worst = {}
+    for name in OUTPUTS:
+        value, (low, high) = getattr(actual, name).double(), expected[name]
+        assert value.dtype == torch.float64
+        assert torch.equal(value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)), name
+        assert bool(value.isnan()[low.isnan()].all()), name
+        # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene units, weight in
+        # pixels, features of any size).
+        beyond = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
+        beyond = beyond[torch.isfinite(beyond)]
+        worst[name] = max(0.0, float(beyond.max())) if beyond.numel() else 0.0
+    return worst
+
+
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("block", range(8))
 def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_splats) -> None:
@@ -66,29 +83,31 @@ def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_s
         if seed % 3 == 0:
             options["features"] = torch.tensor(rng.normal(size=(count, seed % 7 + 1)))
             options["background"] = torch.tensor(rng.normal(size=seed % 7 + 1))
-        inputs = prepared(splats, camera, **options)
-        expected, actual = bracket(inputs), cpu.render(inputs)
-        for name in OUTPUTS:
-            value, (low, high) = getattr(actual, name).double(), expected[name]
-            assert value.dtype == torch.float64
-            assert torch.equal(value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)), name
-            assert bool(value.isnan()[low.isnan()].all()), (seed, name)
-            # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene units, weight in
-            # pixels, features of any size).
-            excess = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
-            excess = excess[torch.isfinite(excess)]
-            worst[name] = max(worst[name], float(excess.max()) if excess.numel() else 0.0)
+        for name, found in excess(prepared(splats, camera, **options)).items():
+            worst[name] = max(worst[name], found)
+    assert max(worst.values()) < 1e-5, worst
+
+
+@pytest.mark.parametrize(("kind", "mode", "antialiased"), MODES)
+@pytest.mark.parametrize(("width", "height"), [(300, 35), (32, 32), (49, 130)])
+def test_pictures_of_many_tiles_agree(kind, mode, antialiased, width, height, make_camera, make_splats) -> None:
+    """Whole tiles and cut ones, and splats that cover more tiles than a row of bits holds."""
+    camera = make_camera(11, width, height)
+    splats = make_splats(11, kind, 40, camera)
+    splats.scales[::4] *= 8
+    options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
+    worst = excess(prepared(splats, camera, ndc=(constants.NEAR, constants.NDC_FAR), **options))
     assert max(worst.values()) < 1e-5, worst
 
 
 @pytest.mark.parametrize(("kind", "mode", "antialiased"), [*MODES, ("3d", "peak", False), ("3d", "center", True)])
-@pytest.mark.parametrize("harmonic", [True, False])
+@pytest.mark.parametrize(("harmonic", "size"), [(True, (29, 21)), (False, (29, 21)), (True, (70, 45))])
 def test_gradients_of_every_output_agree_with_autograd(
-    kind, mode, antialiased, harmonic, make_camera, make_splats
+    kind, mode, antialiased, harmonic, size, make_camera, make_splats
 ) -> None:
     if not harmonic and (mode == "center" or antialiased):
         return  # the colour's path is independent of these
-    camera = make_camera(5, 29, 21)
+    camera = make_camera(5, *size)
     start = make_splats(5, kind, 30, camera)
     generator = torch.Generator().manual_seed(1)
     features = torch.randn(30, 5, generator=generator, dtype=torch.float64)

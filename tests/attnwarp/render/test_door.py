@@ -116,7 +116,8 @@ def test_features_replace_colour_in_any_number_of_channels() -> None:
 def test_counters_say_what_was_done() -> None:
     counters = render(gaussians(), camera()).counters
     assert counters["splats"] == counters["visible"] == 3
-    assert counters["tiles"] == 4
+    assert counters["tiles"] == 1
+    assert render(gaussians(), camera(17, 33)).counters["tiles"] == 2 * 3
     assert 0 < counters["contributing"] <= counters["composited"] <= counters["pairs"]
     assert counters["pairs"] % 16 == counters["composited"] % 16 == 0
 

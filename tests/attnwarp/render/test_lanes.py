@@ -1,0 +1,114 @@
+"""The building blocks of the CPU kernels, against numpy and plain loops."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from attnwarp.render import _kernels as kernels
+from attnwarp.render import _lanes as lanes
+
+
+def test_estimates_made_better_and_sums_in_another_order() -> None:
+    @numba.njit
+    def work(x, y):
+        lanes.store(y, 0, lanes.inverse(lanes.load(x, 0)))
+        lanes.store(y, 16, lanes.rough_root(lanes.load(x, 0)))
+        a, b, c, d = lanes.load(x, 16), lanes.load(x, 32), lanes.load(x, 48), lanes.load(x, 64)
+        lanes.store(y, 32, lanes.totals(a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c))
+        lanes.store(y, 48, lanes.totals8(a, b, c, d, d, c, b, a))
+
+    random = np.random.default_rng(0)
+    for scale in (1e-12, 1e-3, 1.0, 1e6):
+        x = (scale * random.uniform(0.5, 2, 80)).astype(np.float32)
+        y = np.zeros(64, np.float32)
+        work(x, y)
+        assert np.abs(y[:16] * x[:16].astype(float) - 1).max() < 2e-7
+        ratio = y[16:32] / np.sqrt(x[:16].astype(float))
+        assert ratio.min() > 1 - 2e-7 and ratio.max() < 1 + 1.4e-4
+        a, b, c, d = x[16:].reshape(4, 16).sum(axis=1, dtype=float)
+        assert y[32:48] == pytest.approx([a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c], rel=1e-6)
+        assert y[48:] == pytest.approx([a, b, c, d, d, c, b, a] * 2, rel=1e-6)
+
+
+def test_eight_float64_to_the_last_bits() -> None:
+    @numba.njit
+    def work(x, y):
+        given = lanes.load8(x, 0)
+        lanes.store8(y, 0, lanes.inverse(given))
+        lanes.store8(y, 8, lanes.inverse_root(given))
+        lanes.store8(y, 16, kernels._root(given))
+        lanes.store8(y, 24, kernels._log(given))
+
+    random = np.random.default_rng(0)
+    y = np.zeros(32)
+    for scale in (1e-200, 1e-12, 1 / 255, 1.0, 255.0, 1e6, 1e200):
+        for _ in range(50):
+            x = scale * random.uniform(0.5, 2, 8)
+            work(x, y)
+            for found, exact in zip(y.reshape(4, 8)[:3], (1 / x, 1 / np.sqrt(x), np.sqrt(x)), strict=True):
+                assert np.abs(found / exact - 1).max() < 1e-15
+            assert np.abs(y[24:] - np.log(x)).max() < 1e-12 * max(1, np.abs(np.log(x)).max())
+    work(np.zeros(8), y)
+    assert (y[16:24] == 0).all()
+
+
+def test_float64_are_rounded_to_float32_when_stored_so() -> None:
+    @numba.njit
+    def work(x, y):
+        lanes.store8(y, 3, lanes.load8(x, 0) * 1.0)
+
+    x, y = np.random.default_rng(0).normal(size=8), np.full(12, 7, np.float32)
+    work(x, y)
+    assert (y[3:11] == x.astype(np.float32)).all() and (y[[0, 1, 2, 11]] == 7).all()
+
+
+def test_bits_of_sixteen_words() -> None:
+    @numba.njit
+    def work(words, wanted):
+        left, seen = lanes.having(words, 0, wanted), 0
+        while left != 0:
+            k = lanes.lowest(left)
+            left &= left - 1
+            seen = seen * 16 + k
+        return lanes.having(words, 0, wanted), seen
+
+    random = np.random.default_rng(0)
+    for wanted in (1, 1 << 15, 0x33 << 10, 0xFFFF):
+        words = random.integers(0, 1 << 16, 16).astype(np.int32) & random.integers(0, 1 << 16, 16).astype(np.int32)
+        places = [k for k in range(16) if int(words[k]) & wanted]
+        found, order = work(words, wanted)
+        assert found == sum(1 << k for k in places)
+        assert order == int("0" + "".join(f"{k:x}" for k in places), 16) & ((1 << 64) - 1) or len(places) > 15
+
+
+def test_ends_and_neighbours() -> None:
+    @numba.njit
+    def work(x, y, ends, whole):
+        first, last = lanes.load(x, 0), lanes.load(x, 16)
+        lanes.store_ends(ends, 0, first, last)
+        lanes.store_whole(whole, 0, last)
+        lanes.store(y, 0, lanes.swapped1(first))
+        lanes.store(y, 16, lanes.swapped2(first))
+
+    x = np.r_[np.arange(16) * 2000 + 0.75, np.arange(16) - 1].astype(np.float32)
+    y, ends, whole = np.zeros(32, np.float32), np.zeros(16, np.int32), np.zeros(16, np.int32)
+    work(x, y, ends, whole)
+    assert (ends & 0xFFFF == np.arange(16) * 2000).all()
+    assert (ends >> 16 == np.arange(16) - 1).all() and (whole == np.arange(16) - 1).all()
+    assert (y[:16] == x[:16].reshape(8, 2)[:, ::-1].ravel()).all()
+    assert (y[16:] == x[:16].reshape(4, 2, 2)[:, ::-1].ravel()).all()
+
+
+@pytest.mark.parametrize(("begin", "end"), [(0, 0), (2, 9), (5, 55), (0, 55)])
+def test_a_row_of_squares_as_bits(begin, end) -> None:
+    """Of a run from column 40 on, in both ways that lists are filled."""
+    code = 40 + begin | 40 + end << 16
+    row = [begin <= column <= end for column in range(56)]
+    assert kernels._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
+    for column in range(0, 56, kernels.SIDE):
+        part = row[column : column + kernels.SIDE]
+        assert kernels._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
+    nothing = 32767 | -1 << 16
+    assert kernels._bits(nothing, 40) == kernels._columns(nothing, 40) == 0
