@@ -94,14 +94,14 @@ def camera(size: int) -> Camera:
 def measure_peak(threads: int, milliseconds: float = 15) -> float:
     """Floating-point operations a second in independent fused multiply-adds held in registers, on ``threads``
     threads."""
-    from attnwarp.render import _peak
+    from attnwarp.render._kernels import peak
 
-    operations = 2.0 * 16 * _peak.CHAINS * 64
+    operations = 2.0 * 16 * peak.CHAINS * 64
     rounds = int(milliseconds * 1e-3 * 2e11 / operations)
-    jobs = [(rounds, _peak.start()) for _ in range(threads)]
-    _peak.multiply_add(1, _peak.start())
+    jobs = [(rounds, peak.start()) for _ in range(threads)]
+    peak.multiply_add(1, peak.start())
     start = time.process_time()
-    _threads.run(_peak.multiply_add, jobs)
+    _threads.run(peak.multiply_add, jobs)
     return operations * rounds * threads / (time.process_time() - start)
 
 

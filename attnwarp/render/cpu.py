@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from attnwarp.render import _kernels as kernels
 from attnwarp.render import _pool, _threads, order
+from attnwarp.render._kernels import compositing, differentiating, layout, listing, projecting
 from attnwarp.render.reference import Inputs, Outputs
 
 PIECE = 4096
@@ -86,36 +86,36 @@ class _Scene:
         self.channels = inputs.channels
         n = len(self.means)
         pose, K = _array(inputs.pose, np.float64), _array(inputs.K, np.float64)
-        view = np.zeros(kernels.VIEW)
+        view = np.zeros(layout.VIEW)
         view[:9] = pose[:3, :3].reshape(-1)
-        view[kernels.TX : kernels.TX + 3] = pose[:3, :3] @ _array(inputs.origin, np.float64) + pose[:3, 3]
-        view[kernels.FX :] = (
+        view[layout.TX : layout.TX + 3] = pose[:3, :3] @ _array(inputs.origin, np.float64) + pose[:3, 3]
+        view[layout.FX :] = (
             K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2], inputs.width, inputs.height, inputs.near,
             inputs.kind == "2d", inputs.depth == "center", inputs.antialiased, inputs.harmonic,
         )  # fmt: skip
         self.view = view
-        self.tiles_x = -(-inputs.width // kernels.TILE)
-        self.tiles_y = -(-inputs.height // kernels.TILE)
+        self.tiles_x = -(-inputs.width // layout.TILE)
+        self.tiles_y = -(-inputs.height // layout.TILE)
         self.tiles = self.tiles_x * self.tiles_y
         self.visit = _visit(self.tiles_x, self.tiles_y)
         key = _pool.empty(n, np.float32)
         pieces = _threads.ranges(n, PIECE)
         listed = np.zeros((len(pieces), 1))
         _threads.run(
-            kernels.depths,
+            projecting.depths,
             [
                 (*piece, view, self.means, self.quats, self.scales, self.opacities, key, listed[k])
                 for k, piece in enumerate(pieces)
             ],
         )
         self.listed = float(listed.sum())
-        self.order, ties = kernels.radix_order(
+        self.order, ties = projecting.radix_order(
             key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
         )
         if len(ties):
             order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties)
         m = len(self.order)
-        self.thin = _pool.empty((m, 2 * kernels.COLUMNS), np.float32)
+        self.thin = _pool.empty((m, 2 * layout.COLUMNS), np.float32)
         self.table = self.thin.view(np.float64)
         self.features = _pool.empty((m if self.channels > 3 else 0, self.channels), np.float32)
         self.counts = _pool.empty(m, np.int32)
@@ -143,23 +143,23 @@ class _Scene:
             (self.ready + first, self.ready + last)
             for first, last in _threads.ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
         ]
-        spans: list[np.ndarray] = [np.empty((0, kernels.RUN), np.int32)] * len(groups)
+        spans: list[np.ndarray] = [np.empty((0, layout.RUN), np.int32)] * len(groups)
         changes = _pool.zeros((len(groups), self.tiles + 1), np.int32)
 
         def work(index: int) -> None:
             begin, end = groups[index]
             shapes = _pool.empty((end - begin, 16), np.float32)
-            kernels.project(
+            projecting.project(
                 begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
                 self.channels, wanted, self.table, self.thin, self.features, shapes,
-                _aligned(2 * kernels.SETUP).view(np.float64), _aligned(kernels.SETUP_NARROW), np.empty(16),
+                _aligned(2 * projecting.SETUP).view(np.float64), _aligned(projecting.SETUP_NARROW), np.empty(16),
             )  # fmt: skip
-            codes, pieces = _aligned(48 * kernels.NOTES).view(np.int32), _aligned(16 * kernels.NOTES)
-            notes = np.empty((kernels.NOTES, 3), np.int64)
+            codes, pieces = _aligned(48 * listing.NOTES).view(np.int32), _aligned(16 * listing.NOTES)
+            notes = np.empty((listing.NOTES, 3), np.int64)
             room = int(self.rows * (end - begin)) + 256
             while True:
-                runs = _pool.empty((room, kernels.RUN), np.int32)
-                used = kernels.outline(
+                runs = _pool.empty((room, layout.RUN), np.int32)
+                used = listing.outline(
                     begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, shapes, runs,
                     self.counts, changes[index], codes, pieces, notes,
                 )  # fmt: skip
@@ -184,7 +184,7 @@ class _Scene:
             return []
         lengths = np.cumsum(sum(changes.sum(axis=0, dtype=np.int64) for changes in self.changes)[:-1])
         upto = np.cumsum((lengths * live)[self.visit])
-        most = ENTRIES * (self.tiles * kernels.PIXELS + len(self.order))
+        most = ENTRIES * (self.tiles * layout.PIXELS + len(self.order))
         if upto[-1] <= most:
             return [live]
         band = np.empty(self.tiles, np.int64)
@@ -196,11 +196,11 @@ class _Scene:
         starts = np.zeros(self.tiles + 1, np.int64)
         changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
         cursors = _pool.empty(changes.shape, np.int64)
-        kernels.place_cursors(changes, live, cursors, starts)
+        listing.place_cursors(changes, live, cursors, starts)
         entries = _pool.empty(int(starts[-1]), np.int64)
         before = np.concatenate([[0], np.cumsum(live)])
         _threads.run(
-            kernels.scatter,
+            listing.scatter,
             [
                 (*group, spans, self.counts, live, before, cursors[k], entries)
                 for k, (group, spans) in enumerate(zip(self.groups, self.spans, strict=True))
@@ -232,7 +232,7 @@ class _Composite(torch.autograd.Function):
         state = _pool.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
         done, tested, shaded, drawn = (np.zeros(scene.tiles, np.int64) for _ in range(4))
         full = np.zeros(scene.tiles, np.bool_)
-        slots = kernels.SLOTS + max(0, scene.channels - 3)
+        slots = compositing.SLOTS + max(0, scene.channels - 3)
         live = np.ones(scene.tiles, np.bool_)
         count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
@@ -245,13 +245,13 @@ class _Composite(torch.autograd.Function):
                 starts, entries = scene.bin(band)
                 seen = _pool.empty(len(entries), np.float32)
                 _threads.run(
-                    kernels.forward,
+                    compositing.forward,
                     [
                         (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
                          scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
-                         done, tested, shaded, drawn, full, seen, _aligned(slots * kernels.PIXELS),
-                         _aligned(kernels.WORK), _aligned(2 * kernels.BLOCK * kernels.EXACT).view(np.float64),
-                         *np.empty((2, kernels.BLOCK), np.int64), np.empty(kernels.BLOCK, np.int32))
+                         done, tested, shaded, drawn, full, seen, _aligned(slots * layout.PIXELS),
+                         _aligned(compositing.WORK), _aligned(2 * compositing.BLOCK * layout.EXACT).view(np.float64),
+                         *np.empty((2, compositing.BLOCK), np.int64), np.empty(compositing.BLOCK, np.int32))
                         for job in scene.visits(starts)
                     ],
                 )  # fmt: skip
@@ -260,7 +260,9 @@ class _Composite(torch.autograd.Function):
                 composited += int(shaded[band].sum())
                 ended = band if last else band & full
                 kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.int64)
-                kernels.settle(ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept)
+                compositing.settle(
+                    ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept
+                )
                 lists.append(kept)
             live = live & ~full
             if last or not live.any():
@@ -268,7 +270,7 @@ class _Composite(torch.autograd.Function):
             count = len(scene.order)
         scene.entries = _join(lists)
         weight = _pool.zeros(len(scene.means), np.float32)
-        kernels.hand_out(scene.order, weight_of, weight)
+        compositing.hand_out(scene.order, weight_of, weight)
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
@@ -307,7 +309,7 @@ class _Composite(torch.autograd.Function):
         pieces = _threads.ranges(scene.ready, PIECE)
         g_view = np.zeros((len(pieces), 12))
         _threads.run(
-            kernels.project_backward,
+            differentiating.project_backward,
             [
                 (*piece, scene.order, scene.view, scene.means, scene.quats, scene.scales, scene.opacities,
                  scene.values, scene.channels, scene.table, total, gm, gq, gs, go, gv, g_view[k])
@@ -338,13 +340,13 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
     One row for each splat of each tile would be more than should be held at once, so groups of tiles take turns.
     """
     n = scene.ready
-    columns = kernels.GRADIENTS + 3 + max(3, scene.channels)
+    columns = layout.GRADIENTS + 3 + max(3, scene.channels)
     total = _pool.zeros((n, columns), np.float64)
     done, visit = ctx.done, scene.visit
     before = np.concatenate([[0], np.cumsum(done[visit])])
     room = ROWS_AT_ONCE
     buffer = np.empty((0, columns), np.float32)
-    slots = kernels.BACK_SLOTS + max(0, scene.channels - 3)
+    slots = differentiating.BACK_SLOTS + max(0, scene.channels - 3)
     first = 0
     while first < scene.tiles:
         last = max(first + 1, int(np.searchsorted(before, before[first] + room, side="right")) - 1)
@@ -359,19 +361,19 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
         edges = sorted({first, *(int(c) for c in cuts if first < c < last), last})
         _threads.run(
-            kernels.backward,
+            differentiating.backward,
             [
                 (begin, end, visit, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table,
                  scene.thin, scene.features, scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream,
-                 place, rows, _aligned(slots * kernels.PIXELS), _aligned(kernels.BACK_WORK),
-                 _aligned(2 * kernels.EXACT).view(np.float64))
+                 place, rows, _aligned(slots * layout.PIXELS), _aligned(differentiating.BACK_WORK),
+                 _aligned(2 * layout.EXACT).view(np.float64))
                 for begin, end in itertools.pairwise(edges)
             ],
         )  # fmt: skip
         # Each thread takes some of the splats and all of the rows: whoever adds, the order is that of the tiles.
         share = -(-n // _threads.count())
         _threads.run(
-            kernels.reduce_rows,
+            differentiating.reduce_rows,
             [
                 (low, high, first, last, visit, scene.starts, done, scene.entries, place, rows, total)
                 for low, high in _threads.ranges(n, max(1, share))

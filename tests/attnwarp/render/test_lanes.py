@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import numba
 import numpy as np
 import pytest
 
-from attnwarp.render import _kernels as kernels
-from attnwarp.render import _lanes as lanes
+from attnwarp.render._kernels import compositing, differentiating, lanes, layout, listing, projecting
 
 
 def test_estimates_made_better_and_sums_in_another_order() -> None:
@@ -38,8 +40,8 @@ def test_eight_float64_to_the_last_bits() -> None:
         given = lanes.load8(x, 0)
         lanes.store8(y, 0, lanes.inverse(given))
         lanes.store8(y, 8, lanes.inverse_root(given))
-        lanes.store8(y, 16, kernels._root(given))
-        lanes.store8(y, 24, kernels._log(given))
+        lanes.store8(y, 16, projecting._root(given))
+        lanes.store8(y, 24, projecting._log(given))
 
     random = np.random.default_rng(0)
     y = np.zeros(32)
@@ -106,9 +108,23 @@ def test_a_row_of_squares_as_bits(begin, end) -> None:
     """Of a run from column 40 on, in both ways that lists are filled."""
     code = 40 + begin | 40 + end << 16
     row = [begin <= column <= end for column in range(56)]
-    assert kernels._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
-    for column in range(0, 56, kernels.SIDE):
-        part = row[column : column + kernels.SIDE]
-        assert kernels._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
+    assert listing._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
+    for column in range(0, 56, layout.SIDE):
+        part = row[column : column + layout.SIDE]
+        assert listing._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
     nothing = 32767 | -1 << 16
-    assert kernels._bits(nothing, 40) == kernels._columns(nothing, 40) == 0
+    assert listing._bits(nothing, 40) == listing._columns(nothing, 40) == 0
+
+
+def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
+    """numba itself looks at the file of a function only, not at those of what was inlined into it."""
+    render = tmp_path / "render"
+    shutil.copytree(Path(layout.__file__).parent, render / "_kernels")
+    shutil.copy(Path(layout.__file__).parent.parent / "constants.py", render)
+    assert layout.fingerprint(render / "_kernels") == layout.FINGERPRINT
+    for file in (render / "_kernels" / "lanes.py", render / "constants.py"):
+        file.write_text(file.read_text() + "\n")
+        assert layout.fingerprint(render / "_kernels") != layout.FINGERPRINT
+        file.write_text(file.read_text()[:-1])
+    for dispatcher in (compositing.forward, differentiating.backward, projecting.project, listing.outline):
+        assert dispatcher._cache._cache_file._source_stamp == layout.FINGERPRINT

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from attnwarp.render import _lanes as L
+from attnwarp.render._kernels import lanes as L
 
 CHAINS = 12
 """Independent chains of 16 lanes: enough to hide the latency of both multiply-add units, few enough for registers of
