@@ -30,6 +30,8 @@ PIECE = 4096
 """Splats in one job of what is done splat by splat."""
 GROUP, GROUPS = 1024, 8
 """Splats that are set up and binned by one job: at least so many, and in about so many jobs."""
+WIDEST = 4 * 32767 // layout.TILE * layout.TILE
+"""Pixels: columns of squares are kept in 15 bits."""
 ROWS = 3.0
 """Rows of tiles that a splat is expected to show in, to begin with."""
 NEIGHBOURS = 4
@@ -96,6 +98,10 @@ class _Scene:
         self.view = view
         self.tiles_x = -(-inputs.width // layout.TILE)
         self.tiles_y = -(-inputs.height // layout.TILE)
+        if self.tiles_x > WIDEST // layout.TILE:
+            raise ValueError(
+                f"camera: {inputs.width} pixels wide; the CPU backend draws up to {WIDEST}: render it in parts"
+            )
         self.tiles = self.tiles_x * self.tiles_y
         self.visit = _visit(self.tiles_x, self.tiles_y)
         key = _pool.empty(n, np.float32)

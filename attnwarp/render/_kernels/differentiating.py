@@ -79,7 +79,8 @@ def _rows_round(work, row, rows, line):
 def backward(first, last, visit, view, tiles_x, starts, done, entries, table, thin, features, background, ndc_scale,
              alpha, depth, state, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows,
              buf, work, exact):  # fmt: skip
-    """Gradients of the tiles visit[first:last], one row of ``rows`` for each entry worked off, from place[tile] on.
+    """Gradients of the tiles visit[first:last], one row of ``rows`` for each entry worked off, from place[tile] on;
+    none is written for entries without squares, which are nowhere drawn.
 
     A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in its normal and
     values. Splats are visited back to front: the transmittance before each is recovered by division from what the
@@ -229,7 +230,8 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                     gu, gv = blame * u, blame * v
                     gw = gu * u + gv * v
                     screened = L.where(meets, zero, in_a) * two
-                    under, over = L.spread(work, WTOP) <= v_w, v_w <= L.spread(work, WLOW)
+                    # Strictly: a splat that faces the camera has WLOW = WTOP = W, and its depth is its plane's.
+                    under, over = L.spread(work, WTOP) < v_w, v_w < L.spread(work, WLOW)
                     if not peak:
                         under, over = zero_lanes < one, zero_lanes < zero
                     between = L.flipped(over | under)

@@ -260,7 +260,7 @@ def _approach(builder: Any, x: Any, name: str) -> tuple[Any, Any]:
 
 @intrinsic
 def inverse(typing: Any, x: Any) -> Any:
-    """1 / x to the last bit or two, and NaN where x is 0, infinite or below 1e-38 (float64: 1e-308).
+    """1 / x to the last bit or two; anything where x is 0, infinite or below 1e-38 (float64: 1e-308).
 
     With AVX-512 an estimate of 14 bits and a step or two of Newton's: three times as fast as a division.
     """
@@ -280,7 +280,7 @@ def inverse(typing: Any, x: Any) -> Any:
 
 @intrinsic
 def inverse_root(typing: Any, x: Any) -> Any:
-    """1 / sqrt(x) of float64, to the last bits; NaN where x is 0, negative or infinite."""
+    """1 / sqrt(x) of float64, to the last bits; anything where x is 0, negative or infinite."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]

@@ -38,7 +38,7 @@ def _compiled(**options: Any) -> Any:
 
     def decorate(function: Any) -> Any:
         dispatcher = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options)(function)
-        # Where no folder can be written there is no file.
+        # There is none where numba is told to compile nothing.
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if file is not None:
             file._source_stamp = FINGERPRINT
@@ -67,7 +67,7 @@ EVERY = (1 << SQUARES) - 1  # a bit for each
 # A projected splat is a row of 192 bytes, three cache lines: WIDE columns of float64, then float32. The table is passed
 # twice, as float64 (M, COLUMNS) and as float32 (M, 2 COLUMNS), "thin", in which column c >= WIDE stands at c + WIDE.
 # The reference point is the projected centre, or the principal point for a 2D splat whose centre is not in front;
-# coefficients are per pixel of offset from it, and are moved to each tile's middle in float64.
+# coefficients are per pixel of offset from it, and are moved to each quarter of a tile in float64.
 X0, Y0 = 0, 1
 UX, UY, U0, VX, VY, V0, WX, WY, W0 = 2, 3, 4, 5, 6, 7, 8, 9, 10  # 2D: u = U / W, v = V / W, z = Z0 / W
 CA, CB, CC, LX, LY, RXX, RXY, RYY = 2, 3, 4, 5, 6, 7, 8, 9  # 3D: conic; z = Z0 l / (l^2 + r)

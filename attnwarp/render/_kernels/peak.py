@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from attnwarp.render._kernels import lanes as L
+from attnwarp.render._kernels.layout import jit
 
 CHAINS = 12
 """Independent chains of 16 lanes: enough to hide the latency of both multiply-add units, few enough for registers of
 either width (LLVM splits a vector of 16 in two where the machine's are shorter)."""
 
 
-@nb.njit(nogil=True, cache=True, error_model="numpy")
+@jit
 def multiply_add(rounds, result):
     """64 ``rounds`` times a = a b + c in each of CHAINS vectors; what becomes of them goes to ``result`` (16), so that
     none is left out.

@@ -35,7 +35,7 @@ C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
 
 @inlined
 def _root(x):
-    """The square root of eight float64 >= 0, to the last bits; NaN where they are negative or infinite."""
+    """The square root of eight float64 >= 0, to the last bits; anything where they are negative or infinite."""
     return x * L.inverse_root(L.most(x, 1e-300))
 
 
@@ -245,7 +245,9 @@ def project(
         a22 = q02 * R20 + q12 * R21 + q22 * R22
         opacity = L.load8(work, 8 * IN_O)
         spread = _root(s0 * a20 * (s0 * a20) + s1 * a21 * (s1 * a21) + s2 * a22 * (s2 * a22))
-        x0, y0 = L.where(ahead, at_x, cx), L.where(ahead, at_y, cy)
+        x0, y0 = at_x, at_y
+        if flat:
+            x0, y0 = L.where(ahead, at_x, cx), L.where(ahead, at_y, cy)
         L.store8(work, 8 * (OUT + X0), x0)
         L.store8(work, 8 * (OUT + Y0), y0)
         length = _root(c0 * c0 + c1 * c1 + c2 * c2)
@@ -346,10 +348,10 @@ def project(
         reach = spread * K.EXTENT_SIGMAS
         low, high = L.most(c2 - reach, near), L.most(c2 + reach, near)
         if flat:
-            # Where it shows by its intersection, z lies between these; 1e-30: if its centre is not in front, W must
+            # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not in front, W must
             # be positive, else it may be anything, see shade.
             L.store8(slim, 8 * (WTOP - WIDE), depth * L.inverse(low))
-            L.store8(slim, 8 * (WLOW - WIDE), L.where(ahead, depth * L.inverse(high), 1e-30))
+            L.store8(slim, 8 * (WLOW - WIDE), L.where(ahead, depth * L.inverse(high), 1e-20))
         if center:
             low = high = L.most(c2, near)
         if not flat:
@@ -396,7 +398,8 @@ def project(
         row1 = L.down(L.up(L.most(begin, 0.0)) * (1 / TILE)) * SIDE
         row2 = L.down(L.least(end, height - 1.0) * 0.25)
         # What is drawn but is no ellipse begins in row -1.
-        row1, row2 = L.where(ellipse | L.flipped(drawn), row1, -1.0), L.where(shows, row2, -2.0)
+        row1, row2 = L.where(shows, row1, 1.0), L.where(shows, row2, -2.0)
+        row1 = L.where(ellipse | L.flipped(drawn), row1, -1.0)
         b = 8 * SHAPES
         L.store8(slim, b + 8 * SHAPE_Y, 0.5 - slack_y)
         L.store8(slim, b + 8 * SHAPE_EY, ey)
