@@ -271,7 +271,7 @@ def _draw_consistency(rows: Sequence[Row], out: Path) -> Path:
                     )  # fmt: skip
             ax.set(xlabel="yaw, degrees", ylabel="mean CIEDE2000", yscale="log")
             ax.set_title(scene, loc="left", fontsize=9.5)
-        axes[0].legend()
+        axes[-1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return path
 
 
@@ -298,7 +298,7 @@ def _draw_flow(rows: Sequence[Row], out: Path) -> Path:
             else:
                 ax.set_ylim(0, 1)
             ax.set_title(title, loc="left", fontsize=9.5)
-        axes[0].legend()
+        axes[-1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return path
 
 

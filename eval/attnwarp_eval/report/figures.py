@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from matplotlib.axes import Axes
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import BboxBase
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
 """Okabe and Ito's colours, which people with any kind of colour vision can tell apart."""
@@ -160,6 +162,7 @@ def cost_front(
     cost = [points[n][0].mean for n in names]
     error = [points[n][1].mean for n in names]
     kept = front(cost, error)
+    notes = []
     for i, name in enumerate(names):
         seconds, quality = points[name]
         if not (np.isfinite(seconds.mean) and np.isfinite(quality.mean)):
@@ -171,8 +174,15 @@ def cost_front(
             seconds.mean, quality.mean, color=colour, marker="o" if on else "x", markersize=5, linewidth=0,
             elinewidth=0.8, capsize=2, xerr=_bars(seconds), yerr=_bars(quality),
         )  # fmt: skip
-        axes.annotate(
-            name, (seconds.mean, quality.mean), textcoords="offset points", xytext=(5, 5), fontsize=7.5, color=colour
+        notes.append(
+            axes.annotate(
+                name,
+                (seconds.mean, quality.mean),
+                textcoords="offset points",
+                xytext=(5, 5),
+                fontsize=7.5,
+                color=colour,
+            )
         )
     if kept:
         axes.step(
@@ -181,7 +191,25 @@ def cost_front(
     axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log" if log else "linear")
     axes.set_title(title, loc="left", fontsize=9.5)
     axes.margins(0.2)
+    _move_apart(axes, notes)
     return [names[i] for i in kept]
+
+
+def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:
+    """Raise each note, from the lowest on, until it covers none of those below."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()
+    points = 72 / figure.dpi
+    settled: list[BboxBase] = []
+    for note in sorted(notes, key=lambda note: note.get_window_extent().y0):
+        box = note.get_window_extent()
+        raised = 0.0
+        while covered := [other for other in settled if box.overlaps(other)]:
+            up = max(other.y1 for other in covered) - box.y0 + 1
+            box, raised = box.translated(0, up), raised + up
+        note.xyann = (5, 5 + raised * points)
+        settled.append(box)
 
 
 def _bars(value: Interval) -> list[list[float]] | None:
