@@ -75,6 +75,51 @@ def _rows_round(work, row, rows, line):
     rows[line, Z0], rows[line, ZLO], rows[line, ZHI] = work[b + u64(14)], work[b + u64(12)], work[b + u64(13)]
 
 
+@inlined
+def _load_tile(buf, corner, width, height, background, scale, alpha, depth, state, g_color, g_alpha, g_depth, g_median,
+               g_normal, g_l1, g_l2):  # fmt: skip
+    """What the backward pass needs of a whole tile of three channels, whose first pixel is ``corner``, to its buffer."""
+    image = width * height
+    for k in range(PIXELS // 4):
+        r, q = k // SIDE, k % SIDE
+        p = (r // 4 * SIDE + q) * 16 + r % 4 * 4
+        at = corner + r * width + q * 4
+        L.copy4(buf, BT * PIXELS + p, state, at)
+        L.copy4(buf, BLAST * PIXELS + p, state, at + image)
+        L.copy4(buf, BMEDK * PIXELS + p, state, at + 2 * image)
+        L.copy4(buf, BIREF * PIXELS + p, state, at + 3 * image)
+        L.copy4(buf, BEHQ * PIXELS + p, state, at + 4 * image)
+        L.copy4(buf, BZREF * PIXELS + p, depth, at)
+        L.copy4(buf, TOTA * PIXELS + p, alpha, at)
+        L.copy4(buf, GW * PIXELS + p, g_alpha, at)
+        L.copy4(buf, GD * PIXELS + p, g_depth, at)
+        L.copy4(buf, GM2 * PIXELS + p, g_l2, at)
+        L.copy4(buf, GL1 * PIXELS + p, g_l1, at)
+        L.copy4(buf, GMED * PIXELS + p, g_median, at)
+        L.separate4(buf, GNX * PIXELS + p, PIXELS, g_normal, 3 * at)
+        L.separate4(buf, GC0 * PIXELS + p, PIXELS, g_color, 3 * at)
+    for p in range(0, PIXELS, 16):
+        # Selected, not multiplied: where nothing is drawn, depth is NaN, and gradients may be anything.
+        drawn = L.load(buf, BLAST * PIXELS + p) > f32(0.0)
+        A = L.where(drawn, L.load(buf, TOTA * PIXELS + p), f32(1.0))
+        g2 = L.load(buf, GM2 * PIXELS + p) * scale
+        gw = L.load(buf, GW * PIXELS + p) + g2 * L.load(buf, BEHQ * PIXELS + p)
+        for c in range(3):
+            at = (GC0 + c) * PIXELS + p
+            gw = gw - L.load(buf, at) * background[c]
+            L.store(buf, at, L.where(drawn, L.load(buf, at), f32(0.0)))
+            at = (GNX + c) * PIXELS + p
+            L.store(buf, at, L.where(drawn, L.load(buf, at), f32(0.0)))
+        L.store(buf, GW * PIXELS + p, L.where(drawn, gw, f32(0.0)))
+        L.store(buf, GD * PIXELS + p, L.where(drawn, L.load(buf, GD * PIXELS + p) / A, f32(0.0)))
+        L.store(buf, GM2 * PIXELS + p, L.where(drawn, g2 * A, f32(0.0)))
+        L.store(buf, GL1 * PIXELS + p, L.where(drawn, L.load(buf, GL1 * PIXELS + p) * f32(2.0), f32(0.0)))
+        L.store(buf, GMED * PIXELS + p, L.where(drawn, L.load(buf, GMED * PIXELS + p), f32(0.0)))
+        L.store(buf, BZREF * PIXELS + p, L.where(drawn, L.load(buf, BZREF * PIXELS + p), f32(0.0)))
+        L.store(buf, TOTA * PIXELS + p, L.where(drawn, A, f32(0.0)))
+        L.store(buf, BEHQ * PIXELS + p, f32(0.0))
+
+
 @bare
 def backward(first, last, visit, view, tiles_x, starts, done, entries, table, thin, features, background, ndc_scale,
              alpha, depth, state, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows,
@@ -106,33 +151,38 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
         cols, tall = min(TILE, width - tx * TILE), min(TILE, height - ty * TILE)
         for p in range(BT * PIXELS, buf.shape[0], 16):
             L.store(buf, p, zero)
-        for r in range(tall):
-            for k in range(cols):
-                p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
-                y, x = u64(ty * TILE + r), u64(tx * TILE + k)
-                A = alpha[y, x]
-                if state[1, y, x] == 0:
-                    continue
-                buf[u64(BT * PIXELS) + p] = state[0, y, x]
-                buf[u64(BLAST * PIXELS) + p] = state[1, y, x]
-                buf[u64(BMEDK * PIXELS) + p] = state[2, y, x]
-                # Relative to the means, the first moments vanish, and with them most terms.
-                buf[u64(BZREF * PIXELS) + p] = depth[y, x]
-                buf[u64(BIREF * PIXELS) + p] = state[3, y, x]
-                gd = g_depth[y, x] / A
-                g2 = scale * g_l2[y, x]
-                gw = g_alpha[y, x] + g2 * state[4, y, x]
-                for c in range(channels):
-                    gw -= g_color[y, x, u64(c)] * background[c]
-                    buf[u64((GC0 + c) * PIXELS) + p] = g_color[y, x, u64(c)]
-                for c in range(3):
-                    buf[u64((GNX + c) * PIXELS) + p] = g_normal[y, x, u64(c)]
-                buf[u64(GW * PIXELS) + p] = gw
-                buf[u64(GD * PIXELS) + p] = gd
-                buf[u64(GM2 * PIXELS) + p] = g2 * A
-                buf[u64(GL1 * PIXELS) + p] = two * g_l1[y, x]
-                buf[u64(GMED * PIXELS) + p] = g_median[y, x]
-                buf[u64(TOTA * PIXELS) + p] = A
+        if tall == TILE and cols == TILE and channels == 3:
+            corner = ty * TILE * width + tx * TILE
+            _load_tile(buf, corner, width, height, background, scale, alpha, depth, state, g_color, g_alpha, g_depth, g_median,
+                       g_normal, g_l1, g_l2)  # fmt: skip
+        else:
+            for r in range(tall):
+                for k in range(cols):
+                    p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
+                    y, x = u64(ty * TILE + r), u64(tx * TILE + k)
+                    A = alpha[y, x]
+                    if state[1, y, x] == 0:
+                        continue
+                    buf[u64(BT * PIXELS) + p] = state[0, y, x]
+                    buf[u64(BLAST * PIXELS) + p] = state[1, y, x]
+                    buf[u64(BMEDK * PIXELS) + p] = state[2, y, x]
+                    # Relative to the means, the first moments vanish, and with them most terms.
+                    buf[u64(BZREF * PIXELS) + p] = depth[y, x]
+                    buf[u64(BIREF * PIXELS) + p] = state[3, y, x]
+                    gd = g_depth[y, x] / A
+                    g2 = scale * g_l2[y, x]
+                    gw = g_alpha[y, x] + g2 * state[4, y, x]
+                    for c in range(channels):
+                        gw -= g_color[y, x, u64(c)] * background[c]
+                        buf[u64((GC0 + c) * PIXELS) + p] = g_color[y, x, u64(c)]
+                    for c in range(3):
+                        buf[u64((GNX + c) * PIXELS) + p] = g_normal[y, x, u64(c)]
+                    buf[u64(GW * PIXELS) + p] = gw
+                    buf[u64(GD * PIXELS) + p] = gd
+                    buf[u64(GM2 * PIXELS) + p] = g2 * A
+                    buf[u64(GL1 * PIXELS) + p] = two * g_l1[y, x]
+                    buf[u64(GMED * PIXELS) + p] = g_median[y, x]
+                    buf[u64(TOTA * PIXELS) + p] = A
         for back in range(count):
             e = begin + count - 1 - back
             entry = entries[e]

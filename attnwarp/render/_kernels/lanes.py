@@ -589,3 +589,23 @@ def interleave4(typing: Any, array: Any, item: Any, source: Any, begin: Any, ste
         return context.get_dummy_value()
 
     return types.void(array, types.int64, source, types.int64, types.int64), codegen
+
+
+@intrinsic
+def separate4(typing: Any, array: Any, item: Any, step: Any, source: Any, begin: Any) -> Any:
+    """The reverse of :func:`interleave4`: four triples of ``source`` from ``begin`` on, their first numbers to ``array`` from
+    ``item`` on, the second to + ``step``, the third to + 2 ``step``."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        item, step = args[1:3]
+        twelve = ir.VectorType(ir.FloatType(), 12)
+        triples = builder.load(_pointer(context, builder, sig.args[3], twelve, *args[3:]), align=4)
+        empty = ir.Constant(twelve, ir.Undefined)
+        for part in range(3):
+            places = ir.Constant(ir.VectorType(ir.IntType(32), 4), [part, part + 3, part + 6, part + 9])
+            to = _pointer(context, builder, sig.args[0], QUAD, args[0], item)
+            builder.store(builder.shuffle_vector(triples, empty, places), to, align=4)
+            item = builder.add(item, step)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, source, types.int64), codegen
