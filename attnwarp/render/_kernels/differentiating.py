@@ -341,6 +341,10 @@ def reduce_rows(low, high, first, last, visit, starts, done, entries, place, row
     for visited in range(first, last):
         t = visit[visited]
         for k in range(done[t]):
+            ahead = (entries[min(starts[t] + k + 8, entries.shape[0] - 1)] & PLACE) * columns
+            prefetch(total, ahead)
+            prefetch(total, ahead + 8)
+            prefetch(total, ahead + 16)
             entry = entries[starts[t] + k]
             i = entry & PLACE
             # What is nowhere drawn has no row.
