@@ -20,7 +20,7 @@ test-all: lint
 	$(BIN)/python -m pytest
 
 bench: venv
-	$(BIN)/python -m attnwarp.render.bench
+	$(BIN)/python -m benchmarks.render
 
 lint: venv
 	$(BIN)/ruff check .

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp import _check
+from attnwarp import check
 
 Array = npt.NDArray[np.float64]
 
@@ -47,10 +47,10 @@ class Camera:
     def __post_init__(self) -> None:
         K = np.array(self.K, dtype=np.float64)
         pose = np.array(self.world_to_camera, dtype=np.float64)
-        _check.shape(K, (3, 3), "K")
-        _check.shape(pose, (4, 4), "world_to_camera")
-        _check.finite(K, "K")
-        _check.finite(pose, "world_to_camera")
+        check.shape(K, (3, 3), "K")
+        check.shape(pose, (4, 4), "world_to_camera")
+        check.finite(K, "K")
+        check.finite(pose, "world_to_camera")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"width, height: got {self.width} x {self.height}, expected at least 1 x 1")
         if K[0, 0] <= 0 or K[1, 1] <= 0:

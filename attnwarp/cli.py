@@ -74,11 +74,11 @@ def _use_threads(threads: int | None) -> None:
     import cv2
     import torch
 
-    from attnwarp.render import _threads
+    from attnwarp.render.threads import set_thread_count
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    _threads.choose(threads or len(os.sched_getaffinity(0)))
+    set_thread_count(threads or len(os.sched_getaffinity(0)))
 
 
 @app.command()
@@ -223,7 +223,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     """The settings, the curve, and the held-out views beside their pictures."""
     from dataclasses import asdict
 
-    from attnwarp.io._file import write_atomically
+    from attnwarp.io.file import write_atomically
 
     lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
     said = json.dumps({**result.settings.to_dict(), "extent": result.extent, "stopped": result.stopped}, indent=2)
@@ -271,7 +271,7 @@ def render(
         _check_out(out)
 
         from attnwarp.io import read_ply
-        from attnwarp.io._file import write_atomically
+        from attnwarp.io.file import write_atomically
         from attnwarp.render import render as draw
 
         _use_threads(threads)
@@ -321,7 +321,7 @@ def _write_image(path: Path, rgb: Any) -> None:
     import cv2
     import numpy as np
 
-    from attnwarp.io._file import write_atomically
+    from attnwarp.io.file import write_atomically
 
     pixels = np.round(255 * np.clip(rgb[..., ::-1], 0, 1)).astype(np.uint8)
     _, data = cv2.imencode(".png", pixels)

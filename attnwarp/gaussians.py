@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 
 Kind = Literal["2d", "3d"]
 
@@ -48,13 +48,13 @@ class Gaussians:
     antialiased: bool = False
 
     def __post_init__(self) -> None:
-        _check.one_of(self.kind, ("2d", "3d"), "kind")
+        check.one_of(self.kind, ("2d", "3d"), "kind")
         n = self.means.shape[0] if self.means.ndim else 0
-        _check.shape(self.means, ("N", 3), "means")
-        _check.shape(self.quats, (n, 4), "quats")
-        _check.shape(self.scales, (n, 2 if self.kind == "2d" else 3), "scales")
-        _check.shape(self.opacities, (n,), "opacities")
-        _check.shape(self.sh, (n, "K", 3), "sh")
+        check.shape(self.means, ("N", 3), "means")
+        check.shape(self.quats, (n, 4), "quats")
+        check.shape(self.scales, (n, 2 if self.kind == "2d" else 3), "scales")
+        check.shape(self.opacities, (n,), "opacities")
+        check.shape(self.sh, (n, "K", 3), "sh")
         if self.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(
                 f"sh: got {self.sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16 (degree 0 to 3)"
@@ -63,10 +63,10 @@ class Gaussians:
             tensor = getattr(self, name)
             if tensor.dtype not in (torch.float32, torch.float64):
                 raise ValueError(f"{name}: got {tensor.dtype}, expected float32 or float64")
-            _check.finite(tensor, name)
+            check.finite(tensor, name)
         self.origin = np.array(self.origin, dtype=np.float64)
-        _check.shape(self.origin, (3,), "origin")
-        _check.finite(self.origin, "origin")
+        check.shape(self.origin, (3,), "origin")
+        check.finite(self.origin, "origin")
         self._refuse(self.quats.detach().norm(dim=-1) == 0, "quats", "zero quaternion")
         self._refuse((self.scales.detach() <= 0).any(dim=-1), "scales", "a scale that is not positive")
         opacity = self.opacities.detach()
@@ -89,7 +89,7 @@ class Gaussians:
     @staticmethod
     def sh_from_rgb(rgb: torch.Tensor) -> torch.Tensor:
         """(N, 1, 3) degree-0 coefficients of (N, 3) sRGB colours in [0, 1]."""
-        _check.shape(rgb, ("N", 3), "rgb")
+        check.shape(rgb, ("N", 3), "rgb")
         return ((rgb - 0.5) / SH_C0)[:, None, :]
 
     def rotations(self) -> torch.Tensor:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.render import Render
 
 Tensor = torch.Tensor
@@ -190,7 +190,7 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
     Raises:
         ValueError: another form.
     """
-    _check.one_of(form, ("l1", "l2_ndc"), "form")
+    check.one_of(form, ("l1", "l2_ndc"), "form")
     return view.distortion_l1.mean() / scale if form == "l1" else view.distortion_l2_ndc.mean()
 
 

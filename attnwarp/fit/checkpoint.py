@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from attnwarp.io import FileFormatError
-from attnwarp.io._file import write_atomically
+from attnwarp.io.file import write_atomically
 
 FORMAT = 1
 """Raised when a checkpoint's content changes meaning; older ones are then refused rather than misread."""

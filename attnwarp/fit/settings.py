@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.gaussians import Kind
 from attnwarp.losses import Distortion
 
@@ -106,9 +106,9 @@ class FitSettings:
     min_gain: float = 0.02
 
     def __post_init__(self) -> None:
-        _check.one_of(self.kind, ("2d", "3d"), "kind")
-        _check.one_of(self.distortion_form, get_args(Distortion), "distortion_form")
-        _check.one_of(self.background, get_args(Background), "background")
+        check.one_of(self.kind, ("2d", "3d"), "kind")
+        check.one_of(self.distortion_form, get_args(Distortion), "distortion_form")
+        check.one_of(self.background, get_args(Background), "background")
         for name in ("densify", "antialiased"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
@@ -154,7 +154,7 @@ class FitSettings:
             ValueError: a key that is no field, or a value out of range.
         """
         for key in data:
-            _check.one_of(key, [field.name for field in fields(cls)], "fit setting")
+            check.one_of(key, [field.name for field in fields(cls)], "fit setting")
         return cls(**data)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians, Kind
 
@@ -58,16 +58,16 @@ def from_points(
     """
     from scipy.spatial import cKDTree
 
-    _check.one_of(kind, ("2d", "3d"), "kind")
+    check.one_of(kind, ("2d", "3d"), "kind")
     if not 0 <= sh_degree <= 3:
         raise ValueError(f"sh_degree: got {sh_degree}, expected 0 to 3")
     xyz = np.asarray(points, dtype=np.float64)
-    _check.shape(xyz, ("P", 3), "points")
-    _check.finite(xyz, "points")
+    check.shape(xyz, ("P", 3), "points")
+    check.finite(xyz, "points")
     if len(xyz) == 0:
         raise ValueError("points: got none, expected at least one")
     rgb = np.full((len(xyz), 3), 128, np.uint8) if colors is None else np.asarray(colors)
-    _check.shape(rgb, (len(xyz), 3), "colors")
+    check.shape(rgb, (len(xyz), 3), "colors")
     if rgb.dtype != np.uint8:
         raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
     # Two splats at one place have no distance to be sized by, and would stay together for ever.

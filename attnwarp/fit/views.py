@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.io import Dataset, FileFormatError
 
@@ -56,7 +56,7 @@ class Views:
             if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
                 raise ValueError(f"{name}: got {image.dtype}, expected uint8, uint16, float32 or float64")
             if image.dtype.kind == "f":
-                _check.finite(image, name)
+                check.finite(image, name)
                 if image.min() < 0 or image.max() > 1:
                     raise ValueError(f"{name}: got values in [{image.min()}, {image.max()}], expected [0, 1]")
 

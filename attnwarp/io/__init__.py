@@ -1,8 +1,8 @@
 """Files: splats as PLY and .splat, cameras as transforms.json and COLMAP models."""
 
-from attnwarp.io._file import FileFormatError
 from attnwarp.io.colmap import read_colmap
 from attnwarp.io.dataset import Dataset
+from attnwarp.io.file import FileFormatError
 from attnwarp.io.folder import read_dataset
 from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
 from attnwarp.io.splat import write_splat

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp.io._file import FileFormatError, existing_file
 from attnwarp.io.dataset import Dataset, Missing, with_images
+from attnwarp.io.file import FileFormatError, existing_file
 
 Array = npt.NDArray[np.float64]
 

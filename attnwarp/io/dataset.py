@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.io._file import FileFormatError
+from attnwarp.io.file import FileFormatError
 
 Array = npt.NDArray[np.float64]
 
@@ -56,18 +56,18 @@ class Dataset:
                 raise ValueError(f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as cameras")
         if self.points is not None:
             self.points = np.asarray(self.points, dtype=np.float64)
-            _check.shape(self.points, ("P", 3), "points")
-            _check.finite(self.points, "points")
+            check.shape(self.points, ("P", 3), "points")
+            check.finite(self.points, "points")
         if self.colors is not None:
             if self.points is None:
                 raise ValueError("colors: given without points")
-            _check.shape(self.colors, (len(self.points), 3), "colors")
+            check.shape(self.colors, (len(self.points), 3), "colors")
             if self.colors.dtype != np.uint8:
                 raise ValueError(f"colors: got {self.colors.dtype}, expected uint8")
         if self.applied_transform is not None:
             self.applied_transform = np.asarray(self.applied_transform, dtype=np.float64)
-            _check.shape(self.applied_transform, (3, 4), "applied_transform")
-            _check.finite(self.applied_transform, "applied_transform")
+            check.shape(self.applied_transform, (3, 4), "applied_transform")
+            check.finite(self.applied_transform, "applied_transform")
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -143,7 +143,7 @@ def with_images(
     Returns:
         the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None where missing.
     """
-    _check.one_of(missing_images, ("error", "none"), "missing_images")
+    check.one_of(missing_images, ("error", "none"), "missing_images")
     absent = [path for path in paths if not path.is_file()]
     if absent and missing_images == "error":
         first = ", ".join(str(path) for path in absent[:3])

@@ -6,10 +6,10 @@ import os
 from pathlib import Path
 from typing import Literal
 
-from attnwarp import _check
-from attnwarp.io._file import FileFormatError
+from attnwarp import check
 from attnwarp.io.colmap import find_model, read_colmap
 from attnwarp.io.dataset import Dataset, Missing
+from attnwarp.io.file import FileFormatError
 from attnwarp.io.transforms import SPLITS, read_transforms
 
 Format = Literal["transforms", "colmap"]
@@ -45,7 +45,7 @@ def read_dataset(
     """
     path = Path(path)
     if format is not None:
-        _check.one_of(format, ("transforms", "colmap"), "format")
+        check.one_of(format, ("transforms", "colmap"), "format")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if format is None:

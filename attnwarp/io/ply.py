@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.gaussians import Gaussians, Kind
-from attnwarp.io._file import FileFormatError, existing_file, write_atomically
+from attnwarp.io.file import FileFormatError, existing_file, write_atomically
 
 Array = npt.NDArray[np.float64]
 Columns = dict[str, npt.NDArray[Any]]
@@ -68,7 +68,7 @@ def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialia
     """
     path = existing_file(path)
     if kind is not None:
-        _check.one_of(kind, ("2d", "3d"), "kind")
+        check.one_of(kind, ("2d", "3d"), "kind")
     columns, comments = _read_vertices(path)
     _refuse_other_formats(path, columns)
     n = len(columns["x"]) if "x" in columns else 0
@@ -207,13 +207,13 @@ def write_points(path: str | os.PathLike[str], points: npt.ArrayLike, colors: np
     from plyfile import PlyData, PlyElement
 
     xyz = np.asarray(points, dtype=np.float64)
-    _check.shape(xyz, ("P", 3), "points")
-    _check.finite(xyz, "points")
+    check.shape(xyz, ("P", 3), "points")
+    check.finite(xyz, "points")
     dtype = [(name, "<f8") for name in "xyz"]
     rgb = None
     if colors is not None:
         rgb = np.asarray(colors)
-        _check.shape(rgb, (len(xyz), 3), "colors")
+        check.shape(rgb, (len(xyz), 3), "colors")
         if rgb.dtype != np.uint8:
             raise ValueError(f"colors: got {rgb.dtype}, expected uint8")
         dtype += [(name, "u1") for name in ("red", "green", "blue")]

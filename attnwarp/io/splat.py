@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from attnwarp.gaussians import SH_C0, Gaussians
-from attnwarp.io._file import write_atomically
+from attnwarp.io.file import write_atomically
 from attnwarp.io.ply import THIRD_SCALE
 
 RECORD = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from attnwarp import _check
+from attnwarp import check
 from attnwarp.camera import ORTHONORMAL_TOLERANCE, Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import constants
@@ -89,7 +89,7 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
         camera: its camera.
         pose: (4, 4) world-to-camera transform in place of the camera's.
     """
-    _check.shape(depth, (camera.height, camera.width), "depth")
+    check.shape(depth, (camera.height, camera.width), "depth")
     rays = torch.as_tensor(camera.directions(), dtype=depth.dtype)
     defined = torch.isfinite(depth)
     points = rays * torch.where(defined, depth, 1.0)[..., None]
@@ -168,7 +168,7 @@ def render(
         raise TypeError(f"gaussians: got {type(gaussians).__name__}, expected attnwarp.Gaussians")
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: got {type(camera).__name__}, expected attnwarp.Camera")
-    _check.one_of(backend, BACKENDS, "backend")
+    check.one_of(backend, BACKENDS, "backend")
     chosen = ("cuda" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(
         gaussians, camera, depth, background, features, sh_degree, near, antialiased, pose, ndc, on_cpu=chosen != "cuda"
@@ -222,7 +222,7 @@ def _prepare(
         raise ValueError("depth: 'intersection' needs flat splats; for kind '3d' use 'peak', the maximum along the ray")
     if kind == "2d" and mode == "peak":
         raise ValueError("depth: 'peak' is for kind '3d'; a 2D splat has an 'intersection' with the ray")
-    _check.one_of(mode, DEPTHS[kind], "depth")
+    check.one_of(mode, DEPTHS[kind], "depth")
     if not (np.isfinite(near) and near > 0):
         raise ValueError(f"near: got {near}, expected a positive depth in scene units")
     if len(ndc) != 2 or not (np.isfinite(ndc).all() and 0 < ndc[0] < ndc[1]):
@@ -232,11 +232,11 @@ def _prepare(
     if features is not None:
         if sh_degree is not None:
             raise ValueError("sh_degree: has no meaning beside features, which replace the spherical harmonics")
-        _check.shape(features, (len(gaussians), "C"), "features")
+        check.shape(features, (len(gaussians), "C"), "features")
         if features.shape[1] < 1:
             raise ValueError("features: got 0 channels, expected at least 1")
         _floating(features, "features", device)
-        _check.finite(features, "features")
+        check.finite(features, "features")
         values = features
     else:
         values = gaussians.sh
@@ -251,9 +251,9 @@ def _prepare(
         behind = background if isinstance(background, Tensor) else torch.tensor(background, device=device)
         if not behind.is_floating_point() and not behind.requires_grad:
             behind = behind.float()
-        _check.shape(behind, (channels,), "background")
+        check.shape(behind, (channels,), "background")
         _floating(behind, "background", device)
-        _check.finite(behind, "background")
+        check.finite(behind, "background")
     return Inputs(
         kind=kind,
         means=gaussians.means,
@@ -287,10 +287,10 @@ def _checked_pose(pose: Tensor | None, camera: Camera) -> Tensor:
         return torch.tensor(camera.world_to_camera)
     if not isinstance(pose, Tensor):
         raise TypeError(f"pose: got {type(pose).__name__}, expected a (4, 4) tensor")
-    _check.shape(pose, (4, 4), "pose")
+    check.shape(pose, (4, 4), "pose")
     if pose.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"pose: got {pose.dtype}, expected float32 or float64")
-    _check.finite(pose, "pose")
+    check.finite(pose, "pose")
     values = pose.detach().double().cpu()
     if not torch.equal(values[3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)):
         raise ValueError(f"pose: got last row {values[3].tolist()}, expected [0, 0, 0, 1]")

@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from attnwarp.render import _pool, _threads, order
-from attnwarp.render._kernels import compositing, differentiating, layout, listing, projecting
+from attnwarp.render import _pool, order
+from attnwarp.render._kernels import backward, binning, layout, projection, rasterization
 from attnwarp.render.reference import Inputs, Outputs
+from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 PIECE = 4096
 """Splats in one job of what is done splat by splat."""
@@ -105,17 +106,17 @@ class _Scene:
         self.tiles = self.tiles_x * self.tiles_y
         self.visit = _visit(self.tiles_x, self.tiles_y)
         key = _pool.empty(n, np.float32)
-        pieces = _threads.ranges(n, PIECE)
+        pieces = ranges(n, PIECE)
         listed = np.zeros((len(pieces), 1))
-        _threads.run(
-            projecting.depths,
+        run_jobs(
+            projection.depths,
             [
                 (*piece, view, self.means, self.quats, self.scales, self.opacities, key, listed[k])
                 for k, piece in enumerate(pieces)
             ],
         )
         self.listed = float(listed.sum())
-        self.order, ties = projecting.radix_order(
+        self.order, ties = projection.radix_order(
             key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
         )
         if len(ties):
@@ -147,7 +148,7 @@ class _Scene:
         before = np.concatenate([[0], np.cumsum(live)])
         groups = [
             (self.ready + first, self.ready + last)
-            for first, last in _threads.ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
+            for first, last in ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
         ]
         spans: list[np.ndarray] = [np.empty((0, layout.RUN), np.int32)] * len(groups)
         changes = _pool.zeros((len(groups), self.tiles + 1), np.int32)
@@ -155,17 +156,17 @@ class _Scene:
         def work(index: int) -> None:
             begin, end = groups[index]
             shapes = _pool.empty((end - begin, 16), np.float32)
-            projecting.project(
+            projection.project(
                 begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
                 self.channels, wanted, self.table, self.thin, self.features, shapes,
-                _aligned(2 * projecting.SETUP).view(np.float64), _aligned(projecting.SETUP_NARROW), np.empty(16),
+                _aligned(2 * projection.SETUP).view(np.float64), _aligned(projection.SETUP_NARROW), np.empty(16),
             )  # fmt: skip
-            codes, pieces = _aligned(48 * listing.NOTES).view(np.int32), _aligned(16 * listing.NOTES)
-            notes = np.empty((listing.NOTES, 3), np.int64)
+            codes, pieces = _aligned(48 * binning.NOTES).view(np.int32), _aligned(16 * binning.NOTES)
+            notes = np.empty((binning.NOTES, 3), np.int64)
             room = int(self.rows * (end - begin)) + 256
             while True:
                 runs = _pool.empty((room, layout.RUN), np.int32)
-                used = listing.outline(
+                used = binning.outline(
                     begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, shapes, runs,
                     self.counts, changes[index], codes, pieces, notes,
                 )  # fmt: skip
@@ -177,7 +178,7 @@ class _Scene:
                 changes[index] = 0
             spans[index] = runs[:used]
 
-        _threads.run(work, [(k,) for k in range(len(groups))])
+        run_jobs(work, [(k,) for k in range(len(groups))])
         self.ready = count
         self.groups += groups
         self.spans += spans
@@ -202,11 +203,11 @@ class _Scene:
         starts = np.zeros(self.tiles + 1, np.int64)
         changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
         cursors = _pool.empty(changes.shape, np.int64)
-        listing.place_cursors(changes, live, cursors, starts)
+        binning.place_cursors(changes, live, cursors, starts)
         entries = _pool.empty(int(starts[-1]), np.int64)
         before = np.concatenate([[0], np.cumsum(live)])
-        _threads.run(
-            listing.scatter,
+        run_jobs(
+            binning.scatter,
             [
                 (*group, spans, self.counts, live, before, cursors[k], entries)
                 for k, (group, spans) in enumerate(zip(self.groups, self.spans, strict=True))
@@ -216,7 +217,7 @@ class _Scene:
 
     def visits(self, starts: np.ndarray) -> list[tuple[int, int]]:
         """Consecutive places in ``visit``, in pieces of about equal work."""
-        pieces = 8 * _threads.count()
+        pieces = 8 * thread_count()
         cost = np.cumsum(np.diff(starts)[self.visit] + 16)
         cuts = np.unique(np.searchsorted(cost, np.linspace(0, cost[-1], pieces + 1)[1:-1]))
         edges = [0, *(int(c) for c in cuts if 0 < c < self.tiles), self.tiles]
@@ -238,7 +239,7 @@ class _Composite(torch.autograd.Function):
         state = _pool.empty((5, h if any(ctx.needs_input_grad) else 0, w), np.float32)
         done, tested, shaded, drawn = (np.zeros(scene.tiles, np.int64) for _ in range(4))
         full = np.zeros(scene.tiles, np.bool_)
-        slots = compositing.SLOTS + max(0, scene.channels - 3)
+        slots = rasterization.SLOTS + max(0, scene.channels - 3)
         live = np.ones(scene.tiles, np.bool_)
         count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
@@ -250,14 +251,14 @@ class _Composite(torch.autograd.Function):
             for band in scene.bands(live):
                 starts, entries = scene.bin(band)
                 seen = _pool.empty(len(entries), np.float32)
-                _threads.run(
-                    compositing.forward,
+                run_jobs(
+                    rasterization.forward,
                     [
                         (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
                          scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
                          done, tested, shaded, drawn, full, seen, _aligned(slots * layout.PIXELS),
-                         _aligned(compositing.WORK), _aligned(2 * compositing.BLOCK * layout.EXACT).view(np.float64),
-                         *np.empty((2, compositing.BLOCK), np.int64), np.empty(compositing.BLOCK, np.int32))
+                         _aligned(rasterization.WORK), _aligned(2 * rasterization.BLOCK * layout.EXACT).view(np.float64),
+                         *np.empty((2, rasterization.BLOCK), np.int64), np.empty(rasterization.BLOCK, np.int32))
                         for job in scene.visits(starts)
                     ],
                 )  # fmt: skip
@@ -266,7 +267,7 @@ class _Composite(torch.autograd.Function):
                 composited += int(shaded[band].sum())
                 ended = band if last else band & full
                 kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.int64)
-                compositing.settle(
+                rasterization.settle(
                     ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept
                 )
                 lists.append(kept)
@@ -276,7 +277,7 @@ class _Composite(torch.autograd.Function):
             count = len(scene.order)
         scene.entries = _join(lists)
         weight = _pool.zeros(len(scene.means), np.float32)
-        compositing.hand_out(scene.order, weight_of, weight)
+        rasterization.hand_out(scene.order, weight_of, weight)
         counters.update(
             splats=len(scene.means),
             visible=len(scene.order),
@@ -312,10 +313,10 @@ class _Composite(torch.autograd.Function):
         )
         parameters = (scene.means, scene.quats, scene.scales, scene.opacities, scene.values)
         gm, gq, gs, go, gv = (_pool.zeros(part.shape, part.dtype) for part in parameters)
-        pieces = _threads.ranges(scene.ready, PIECE)
+        pieces = ranges(scene.ready, PIECE)
         g_view = np.zeros((len(pieces), 12))
-        _threads.run(
-            differentiating.project_backward,
+        run_jobs(
+            backward.project_backward,
             [
                 (*piece, scene.order, scene.view, scene.means, scene.quats, scene.scales, scene.opacities,
                  scene.values, scene.channels, scene.table, total, gm, gq, gs, go, gv, g_view[k])
@@ -352,7 +353,7 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
     before = np.concatenate([[0], np.cumsum(done[visit])])
     room = ROWS_AT_ONCE
     buffer = np.empty((0, columns), np.float32)
-    slots = differentiating.BACK_SLOTS + max(0, scene.channels - 3)
+    slots = backward.BACK_SLOTS + max(0, scene.channels - 3)
     first = 0
     while first < scene.tiles:
         last = max(first + 1, int(np.searchsorted(before, before[first] + room, side="right")) - 1)
@@ -363,26 +364,26 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         rows = buffer[:count]
         place = _pool.empty(scene.tiles, np.int64)
         place[visit] = before[:-1] - before[first]
-        pieces = 8 * _threads.count()
+        pieces = 8 * thread_count()
         cuts = np.searchsorted(before, np.linspace(before[first], before[last], pieces + 1)[1:-1])
         edges = sorted({first, *(int(c) for c in cuts if first < c < last), last})
-        _threads.run(
-            differentiating.backward,
+        run_jobs(
+            backward.backward,
             [
                 (begin, end, visit, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table,
                  scene.thin, scene.features, scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream,
-                 place, rows, _aligned(slots * layout.PIXELS), _aligned(differentiating.BACK_WORK),
+                 place, rows, _aligned(slots * layout.PIXELS), _aligned(backward.BACK_WORK),
                  _aligned(2 * layout.EXACT).view(np.float64))
                 for begin, end in itertools.pairwise(edges)
             ],
         )  # fmt: skip
         # Each thread takes some of the splats and all of the rows: whoever adds, the order is that of the tiles.
-        share = -(-n // _threads.count())
-        _threads.run(
-            differentiating.reduce_rows,
+        share = -(-n // thread_count())
+        run_jobs(
+            backward.reduce_rows,
             [
                 (low, high, first, last, visit, scene.starts, done, scene.entries, place, rows, total)
-                for low, high in _threads.ranges(n, max(1, share))
+                for low, high in ranges(n, max(1, share))
             ],
         )
         first = last

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.content import digest
-from attnwarp_eval.errors import InputError
+from attnwarp.errors import InputError
+from attnwarp_eval.files import digest
 
 
 def cache_dir() -> Path:

@@ -16,7 +16,7 @@ Weights = Annotated[Path, typer.Option(help="Folder that gets weights and cards.
 Threads = Annotated[int, typer.Option(min=1, help="Of training and rendering.")]
 
 DATA, OUT = Path("../runs/encoders/data"), Path("../runs/encoders")
-WEIGHTS = Path(__file__).parent.parent / "attnwarp_eval" / "encoders" / "weights"
+WEIGHTS = Path(__file__).parents[2] / "attnwarp" / "encoders" / "weights"
 NAMES = ("clip-small", "dino-small", "perceptual-small")
 
 
@@ -67,7 +67,7 @@ def assess(name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIG
     """Measure an encoder on what it has never seen, and write its card; the checkpoint, if there is one, says how long training took."""
     import torch
 
-    from attnwarp_eval.encoders.bundled import load
+    from attnwarp.encoders.bundled import load
     from training import assess as questions
     from training.cards import card
 

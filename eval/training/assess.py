@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.encoders.base import Image, PerceptualDistance, TextImageEncoder, TokenEncoder
+from attnwarp.encoders.base import Image, PerceptualDistance, TextImageEncoder, TokenEncoder
 from training.clip import true_of
 from training.data import SIZE, SPLITS, Pictures, load, looks_of
 from training.distort import HELD_OUT_KINDS, TRAIN_KINDS

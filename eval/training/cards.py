@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from attnwarp_eval.encoders._weights import sha256_of
+from attnwarp.encoders._weights import sha256_of
 
 ABOUT = {
     "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
 
-from attnwarp_eval.encoders.nets import ClipSmall
+from attnwarp.encoders.nets import ClipSmall
 from training import naming
 from training.common import Run, channels_last, crops, groups, rate, settings
 from training.naming import Heads, pictures_of, scrambled, warm_start

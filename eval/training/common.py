@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
-from attnwarp_eval.errors import InputError
+from attnwarp.errors import InputError
 
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)

@@ -134,8 +134,8 @@ def render_world(
     looks = looks_of(seed, world.thing, split)
     if split.path_traced:
         from attnwarp_eval.colors import to_srgb
-        from attnwarp_eval.plan import plan
         from attnwarp_eval.truth import mitsuba
+        from attnwarp_eval.truth.plan import plan
 
         # Baking textures as finely as truth wants them takes ten times as long as the small picture itself.
         mitsuba.TEXELS = TEXELS

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from attnwarp_eval.encoders.nets import DinoSmall
+from attnwarp.encoders.nets import DinoSmall
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
 from training.data import Pictures, load
 

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from attnwarp_eval.encoders.nets import ClipSmall
+from attnwarp.encoders.nets import ClipSmall
 from training.common import Run, channels_last, crops, groups, rate, settings
 from training.data import Pictures, load
 from training.worlds import COLORS, FINISHES, GROUNDS, OBJECTS, TIMES

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 
-from attnwarp_eval.encoders.nets import PerceptualSmall
+from attnwarp.encoders.nets import PerceptualSmall
 from training.common import Run, channels_last, rate, settings
 from training.data import load
 from training.distort import MARGIN, TRAIN_KINDS, distorted, draw_pair

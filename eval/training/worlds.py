@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.scene import Scene
-from attnwarp_eval.scene_spec import SceneSpec
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.spec import SceneSpec
 from training.objects import RECIPES, body
 
 OBJECTS = tuple(RECIPES)

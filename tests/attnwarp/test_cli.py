@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from attnwarp import Camera, Gaussians
 from attnwarp.cli import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
-from attnwarp.render import _threads, render
+from attnwarp.render import render
+from attnwarp.render.threads import set_thread_count
 
 ATTNWARP = [sys.executable, "-m", "attnwarp.cli"]
 
@@ -28,7 +29,7 @@ def threads_as_before():
     yield
     torch.set_num_threads(before[0])
     cv2.setNumThreads(before[1])
-    _threads.choose(None)
+    set_thread_count(None)
 
 
 def in_process(*arguments):
@@ -137,8 +138,8 @@ def test_the_ply_opens_in_another_reader(data, tmp_path):
 
 
 def test_the_number_of_threads_changes_no_bit(data, tmp_path):
-    for threads in (1, 3):
-        done = in_process("fit", data, "--out", tmp_path / str(threads), "--iterations", 20, "--threads", threads)
+    for count in (1, 3):
+        done = in_process("fit", data, "--out", tmp_path / str(count), "--iterations", 20, "--threads", count)
         assert done.exit_code == 0, done.stderr
     assert (tmp_path / "1" / "splats.ply").read_bytes() == (tmp_path / "3" / "splats.ply").read_bytes()
 

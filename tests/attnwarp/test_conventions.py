@@ -8,8 +8,8 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import render
-from attnwarp.visibility import angle_between, resize_mask
-from attnwarp.warp import correspond, in_bounds, sample
+from attnwarp.warp.correspondence import correspond, in_bounds, sample
+from attnwarp.warp.view import angle_between, resize_mask
 
 IDENTITY = np.eye(4)
 

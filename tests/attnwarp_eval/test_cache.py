@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from attnwarp.errors import InputError
 from attnwarp_eval import cache
-from attnwarp_eval.cli import app
-from attnwarp_eval.errors import InputError
+from attnwarp_eval.cli.main import app
 
 
 def test_arrays_read_back_bit_for_bit_and_a_damaged_file_is_no_file(tmp_path, monkeypatch):

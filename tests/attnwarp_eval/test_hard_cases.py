@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
-from attnwarp_eval.bodies import BodySpec
-from attnwarp_eval.scene_file import load_scene
-from attnwarp_eval.shapes import Box, Mesh, MeshNotice, Rectangle, Sphere
-from attnwarp_eval.splats import surface_splats
+from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Rectangle, Sphere
+from attnwarp_eval.splats.surface import surface_splats
 from attnwarp_eval.truth import AMBIGUOUS, Geometry, appearance, two_view
 
 GROUND = Rectangle(np.zeros(3), np.array([50.0, 0, 0]), np.array([0, 50.0, 0]))

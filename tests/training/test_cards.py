@@ -7,8 +7,8 @@ from training.cards import card
 
 
 def encoder():
-    from attnwarp_eval.encoders.base import EncoderInfo
-    from attnwarp_eval.encoders.nets import PerceptualSmall
+    from attnwarp.encoders.base import EncoderInfo
+    from attnwarp.encoders.nets import PerceptualSmall
 
     about = EncoderInfo("perceptual-small", "perceptual", "bundled", "", "")
     return type("Stub", (), {"net": PerceptualSmall(), "about": about})()
@@ -32,8 +32,8 @@ def test_a_card_says_how_long_training_took_where_the_checkpoint_is_at_hand(tmp_
 
 
 def test_a_card_has_the_hash_of_each_file_and_the_one_that_results_name(tmp_path):
-    from attnwarp_eval.encoders import load_encoder
-    from attnwarp_eval.encoders.bundled import WEIGHTS
+    from attnwarp.encoders import load_encoder
+    from attnwarp.encoders.bundled import WEIGHTS
 
     facts = _facts("perceptual-small", encoder(), tmp_path)
     weights, words = WEIGHTS / "clip-small.safetensors", WEIGHTS / "clip-small.tokenizer.json"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from attnwarp_eval.errors import InputError
+from attnwarp.errors import InputError
 from training import clip, common, dino, naming, perceptual
 from training.common import Run, minutes, rate, settings
 from training.data import DATA_PROTOCOL, SPLITS

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from attnwarp_eval.colors import to_linear
-from attnwarp_eval.plan import plan
 from attnwarp_eval.truth.mitsuba import render_plan
+from attnwarp_eval.truth.plan import plan
 from training import render, worlds
 from training.clip import make_tokenizer, true_of, wrong
 from training.data import SPLITS, looks_of
@@ -35,7 +35,7 @@ def _look(rng, **said):
 
 @pytest.mark.parametrize("word", RECIPES)
 def test_every_thing_stands_on_the_ground_and_is_about_a_unit_wide_or_tall(word):
-    from attnwarp_eval.bodies import BodySpec
+    from attnwarp_eval.scene.bodies import BodySpec
 
     for instance in (0, 1, 100_000):
         low, high = BodySpec.model_validate(body(word, instance, resolution=40)).mesh().bounds()

@@ -1,6 +1,6 @@
-"""Metrics of edited views: pure functions, pictures in and figures out, nothing read or written.
+"""Metrics of depth, warps, masks and edited views: pure functions, arrays in and figures out, no I/O.
 
-What each figure is stands in :data:`attnwarp_eval.metric.METRICS`, and at length in docs/metrics.md. A figure that is
+What each figure is stands in :data:`attnwarp_eval.metrics.registry.METRICS`, and at length in docs/metrics.md. A figure that is
 undefined (nothing to measure it on) is NaN, never 0, with a count beside it.
 """
 
@@ -16,31 +16,47 @@ from attnwarp_eval.metrics.consistency import (
     optical_flow,
     view_dependent,
 )
+from attnwarp_eval.metrics.depth import depth_error
 from attnwarp_eval.metrics.embedding import Similarity, clip_similarity, directional_similarity, image_similarity
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
 from attnwarp_eval.metrics.image import EditPsnr, edit_psnr, image_error, ms_ssim, mse, perceptual, psnr, ssim, ssim_map
+from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
+from attnwarp_eval.metrics.registry import METRICS, at_size, metric
+from attnwarp_eval.metrics.warp import endpoint_error, feature_error
 
 __all__ = [
+    "COUNTS",
+    "METRICS",
     "Disagreement",
     "EditPsnr",
     "Flow",
     "Similarity",
+    "YawBin",
     "approximation_error",
+    "at_size",
+    "by_yaw",
     "clip_similarity",
+    "confusion",
     "cross_view",
+    "depth_error",
     "directional_similarity",
     "edit_psnr",
+    "endpoint_error",
+    "feature_error",
     "fidelity",
     "flow_consistency",
     "flow_error",
     "image_error",
     "image_similarity",
+    "mask_error",
+    "metric",
     "ms_ssim",
     "mse",
     "nearest_answer",
     "optical_flow",
     "perceptual",
     "psnr",
+    "scores",
     "ssim",
     "ssim_map",
     "view_dependent",

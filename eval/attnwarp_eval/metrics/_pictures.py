@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp import _check
-from attnwarp_eval.arrays import Array, Mask
-from attnwarp_eval.arrays import mask as checked_mask
+from attnwarp import check
+from attnwarp_eval.metrics.arrays import Array, Mask
+from attnwarp_eval.metrics.arrays import mask as checked_mask
 
 
 def picture(value: Any, name: str, *, within: Mask | None = None, shape: tuple[int, ...] | None = None) -> Array:
@@ -23,7 +23,7 @@ def picture(value: Any, name: str, *, within: Mask | None = None, shape: tuple[i
     if array.dtype not in (np.float32, np.float64):
         remedy = "; divide by 255" if array.dtype == np.uint8 else ""
         raise ValueError(f"{name}: got {array.dtype}, expected float32 or float64 in [0, 1]{remedy}")
-    _check.shape(array, ("H", "W", 3), name)
+    check.shape(array, ("H", "W", 3), name)
     if shape is not None and array.shape[:2] != tuple(shape[:2]):
         got = " x ".join(map(str, array.shape[:2]))
         raise ValueError(f"{name}: got {got} pixels (H x W), expected {shape[0]} x {shape[1]}")
@@ -50,7 +50,7 @@ def region(value: Any, shape: tuple[int, ...], name: str = "mask") -> Mask:
 def pair(image: Any, target: Any, mask: Any, names: tuple[str, str] = ("image", "target")) -> tuple[Array, Array, Mask]:
     """Two pictures of one size and where they count, checked; see :func:`picture`."""
     first = np.asarray(image)
-    _check.shape(first, ("H", "W", 3), names[0])
+    check.shape(first, ("H", "W", 3), names[0])
     inside = region(mask, first.shape)
     return (
         picture(first, names[0], within=inside),

@@ -7,7 +7,7 @@ do that, :func:`flow_error` says how far the flow is from the truth, and :func:`
 figure. Both paths share everything but where they look.
 
 Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light; at exact positions in float64
-(``cv2.remap`` rounds positions to 1/32 px, and the sampler of :mod:`attnwarp.warp` is what is being judged).
+(``cv2.remap`` rounds positions to 1/32 px, and the sampler of :mod:`attnwarp.warp.correspondence` is what is being judged).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp import _check
-from attnwarp_eval.arrays import Array, Mask, mean, quantile, share
+from attnwarp import check
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.metrics._pictures import picture, region
+from attnwarp_eval.metrics.arrays import Array, Mask, mean, quantile, share
 
 if TYPE_CHECKING:
     from attnwarp_eval.truth import TwoView
@@ -156,7 +156,7 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
     Raises:
         ValueError: pictures of different sizes or not sRGB in [0, 1]; another method.
     """
-    _check.one_of(method, ("dis", "farneback"), "method")
+    check.one_of(method, ("dis", "farneback"), "method")
     target = picture(target_srgb, "target_srgb")
     source = picture(source_srgb, "source_srgb", shape=target.shape)
     height, width = shape = target.shape[:2]

@@ -1,7 +1,7 @@
 """What is computed from embeddings of pictures and texts. Pure: arrays in, arrays out; no network, no file.
 
 Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what the figures mean:
-keep its :class:`attnwarp_eval.encoders.EncoderInfo` beside them.
+keep its :class:`attnwarp.encoders.EncoderInfo` beside them.
 """
 
 from __future__ import annotations

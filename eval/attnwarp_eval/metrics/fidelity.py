@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.arrays import Mask
 from attnwarp_eval.metrics._pictures import picture, region
+from attnwarp_eval.metrics.arrays import Mask
 from attnwarp_eval.metrics.image import Distance, edit_psnr, ms_ssim, mse, perceptual, psnr_of_mse, ssim
 
 
@@ -27,8 +27,8 @@ def fidelity(
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
         truth_srgb: the same view of the scene as it should be after the edit
-            (:meth:`attnwarp_eval.scene.Scene.edited`).
-        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.edited.edit_mask`). All True for an edit of the light,
+            (:meth:`attnwarp_eval.scene.scene.Scene.edited`).
+        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.truth.edits.edit_mask`). All True for an edit of the light,
             which leaves nothing outside: those figures are NaN.
         original_srgb: the view before the edit; without it nothing is said about preservation.
         distance: a perceptual distance; without it there is none. Inside and outside it is masked as

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.arrays import Array, Mask, mean, share
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.metrics._pictures import pair
+from attnwarp_eval.metrics.arrays import Array, Mask, mean, share
 
 Distance = Callable[[Array, Array], float]
 """A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""

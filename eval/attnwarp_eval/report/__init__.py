@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from attnwarp_eval.ablation.store import Store
+    from attnwarp_eval.study.store import Store
 
 __all__ = ["write_report"]
 
@@ -23,10 +23,10 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     Returns:
         The files written, the one a person opens first at the end.
     """
-    from attnwarp_eval.ablation.store import write_atomic
+    from attnwarp_eval.document.write import markdown, page
     from attnwarp_eval.report.build import build
     from attnwarp_eval.report.results import Results
-    from attnwarp_eval.report.write import markdown, page
+    from attnwarp_eval.study.store import write_atomic
 
     results = Results.of(store)
     report = build(results, store.root, timings=timings, pictures=pictures)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from attnwarp_eval.metric import metric as metric_of
-from attnwarp_eval.report.model import Section, Table
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.metrics.registry import metric as metric_of
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.words import mean_of, number, spread
-from attnwarp_eval.statistics import benjamini_hochberg, paired, verdict
+from attnwarp_eval.statistics.intervals import benjamini_hochberg, paired, verdict
 
 COLUMNS = {
     "warp": {

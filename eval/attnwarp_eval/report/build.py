@@ -7,21 +7,21 @@ import math
 from pathlib import Path
 from typing import Any
 
-from attnwarp_eval.checks import metric as metric_of
-from attnwarp_eval.checks.occlusion import by_yaw
-from attnwarp_eval.report import figures
+from attnwarp_eval.document import figures
+from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.metrics.occlusion import by_yaw
+from attnwarp_eval.metrics.registry import metric as metric_of
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.calibration import calibration
 from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.report.effects import effects
 from attnwarp_eval.report.fits import fits
 from attnwarp_eval.report.fronts import fronts
-from attnwarp_eval.report.model import Gallery, Picture, Report, Section, Table
-from attnwarp_eval.report.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.sensitivity import sensitivity
 from attnwarp_eval.report.words import number, spread
-from attnwarp_eval.statistics import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE
 
 YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
 """Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from attnwarp_eval.report.model import Section, Table
+from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.words import number
 

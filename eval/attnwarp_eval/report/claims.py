@@ -10,7 +10,7 @@ from typing import Any, Literal
 import yaml
 
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics import ByView, Interval, agreement, benjamini_hochberg, interval, paired
+from attnwarp_eval.statistics.intervals import ByView, Interval, agreement, benjamini_hochberg, interval, paired
 
 Verdict = Literal["holds", "does not hold", "can't tell"]
 
@@ -87,7 +87,7 @@ class Finding:
 
 def load_claims() -> list[Claim]:
     """The claims that ship with the package."""
-    text = (resources.files("attnwarp_eval") / "claims.yaml").read_text()
+    text = (resources.files("attnwarp_eval.report") / "claims.yaml").read_text()
     return [Claim(**_tuples(entry)) for entry in yaml.safe_load(text)]
 
 

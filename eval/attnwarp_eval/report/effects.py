@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from attnwarp_eval.effects_table import USUAL, plan_words
-from attnwarp_eval.report.model import Section, Table
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.effects.table import USUAL, plan_words
 from attnwarp_eval.report.results import Results
 
 

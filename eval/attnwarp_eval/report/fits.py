@@ -7,11 +7,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from attnwarp_eval.content import canonical_json
-from attnwarp_eval.report import figures
-from attnwarp_eval.report.model import Picture, Section, Table
+from attnwarp_eval.document import figures
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.files import canonical_json
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, interval
 
 CURVES: dict[str, tuple[str, Callable[[dict[str, Any]], float | None]]] = {
     "PSNR of held-out views": ("dB", lambda point: point["psnr"]),

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.checks import metric as metric_of
-from attnwarp_eval.report import figures
-from attnwarp_eval.report.model import Picture, Section, Table
+from attnwarp_eval.document import figures
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.metrics.registry import metric as metric_of
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.words import number, spread
-from attnwarp_eval.statistics import Interval, Ratio, interval, time_ratio
+from attnwarp_eval.statistics.intervals import Interval, Ratio, interval, time_ratio
 
 STAGES = {"depth": "render", "warp": "pair"}
 """Which of the timing probe's stages is the cost of which probe's figures."""

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from attnwarp_eval.ablation.parts import Splats, Variant
-from attnwarp_eval.ablation.store import Store, StoreError
-from attnwarp_eval.checks import metric as metric_of
-from attnwarp_eval.checks.occlusion import COUNTS
-from attnwarp_eval.content import canonical_json
+from attnwarp_eval.files import canonical_json
+from attnwarp_eval.metrics.occlusion import COUNTS
+from attnwarp_eval.metrics.registry import metric as metric_of
+from attnwarp_eval.study.parts import Splats, Variant
+from attnwarp_eval.study.store import Store, StoreError
 
 
 @dataclass

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.ablation.sensitivity import CONDITIONS, RIGHT, STRENGTHS
-from attnwarp_eval.metric import metric as metric_of
-from attnwarp_eval.report import figures
-from attnwarp_eval.report.model import Picture, Section, Table
+from attnwarp_eval.document import figures
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.metrics.registry import metric as metric_of
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.words import number, spread
-from attnwarp_eval.statistics import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.study.probes.sensitivity import CONDITIONS, RIGHT, STRENGTHS
 
 STEPS = tuple(c.name for c in CONDITIONS[: len(STRENGTHS)])
 """Conditions of rising strength; the last is the right result."""

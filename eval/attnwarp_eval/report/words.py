@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, interval
 
 
 def number(value: float | None, digits: int = 3) -> str:

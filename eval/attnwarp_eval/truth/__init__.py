@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.mitsuba import appearance, render_plan
-from attnwarp_eval.truth.pairs import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView, edge_band, two_view
 from attnwarp_eval.truth.raycast import Geometry, Hits, RayHits
+from attnwarp_eval.truth.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView, edge_band, two_view
 
 __all__ = [
     "AMBIGUOUS",

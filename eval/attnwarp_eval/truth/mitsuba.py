@@ -1,4 +1,4 @@
-"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.plan` plans them.
+"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.plan` plans them.
 
 Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else ``scalar_rgb``, which works
 everywhere: see :mod:`attnwarp_eval.truth.llvm`.
@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
-from attnwarp_eval.optics import (
+from attnwarp_eval.scene.materials import (
     GlassMaterial,
     InteriorSpec,
     MetalMaterial,
@@ -30,12 +30,12 @@ from attnwarp_eval.optics import (
     PointSpec,
     SpotSpec,
 )
-from attnwarp_eval.plan import Pass, Plan, beam, plan, sampler, smooth_objects
-from attnwarp_eval.scene import Scene
-from attnwarp_eval.scene_spec import ObjectSpec, SkySpec, SunSpec
-from attnwarp_eval.shapes import Box, Mesh, Rectangle, Sphere
-from attnwarp_eval.textures import albedo, linear_rgb
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
+from attnwarp_eval.scene.spec import ObjectSpec, SkySpec, SunSpec
+from attnwarp_eval.scene.textures import albedo, linear_rgb
 from attnwarp_eval.truth.llvm import SCALAR, variant
+from attnwarp_eval.truth.plan import Pass, Plan, beam, plan, sampler, smooth_objects
 from attnwarp_eval.truth.raycast import Geometry
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 

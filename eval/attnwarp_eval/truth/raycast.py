@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval._open3d import open3d
-from attnwarp_eval.scene import Scene
-from attnwarp_eval.shapes import Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.truth.analytic import nearest_hit
 
 Array = npt.NDArray[np.float64]
@@ -82,7 +82,7 @@ class Geometry:
     """The surfaces of a scene, ready to be traced.
 
     Args:
-        scene: a :class:`~attnwarp_eval.scene.Scene`, or the shapes themselves.
+        scene: a :class:`~attnwarp_eval.scene.scene.Scene`, or the shapes themselves.
 
     Attributes:
         center: (3,) float64 middle of the bounding box.

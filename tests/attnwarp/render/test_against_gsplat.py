@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from attnwarp import Camera
-from attnwarp.render import _gsplat_torch, api, constants, reference, render
+from attnwarp.render import api, constants, reference, render
+from benchmarks import gsplat_torch
 
 
 def scene(kind: str, make_splats, opacity: float = 0.5):
@@ -30,7 +31,7 @@ def scene(kind: str, make_splats, opacity: float = 0.5):
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_3dgs_agrees_whole(backend, antialiased, make_splats) -> None:
     splats, camera = scene("3d", make_splats)
-    judged = _gsplat_torch.render(splats, camera, antialiased=antialiased, depth=True)
+    judged = gsplat_torch.render(splats, camera, antialiased=antialiased, depth=True)
     view = render(splats, camera, backend=backend, antialiased=antialiased, depth="center")
     # Both in float64 up to the pairs that lie on the 1/255 threshold; float32 for the CPU backend.
     tolerance = 1e-9 if backend == "reference" else 2e-6
@@ -54,7 +55,7 @@ def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
         leaves = [getattr(splats, name).clone().requires_grad_() for name in names]
         traced = dataclasses.replace(splats, **dict(zip(names, leaves, strict=True)))
         if judged:
-            view = _gsplat_torch.render(traced, camera, antialiased=antialiased, depth=True)
+            view = gsplat_torch.render(traced, camera, antialiased=antialiased, depth=True)
         else:
             view = render(traced, camera, backend=backend, antialiased=antialiased, depth="center")
         depth = torch.where(view.depth.isnan(), 0.0, view.depth)
@@ -73,7 +74,7 @@ def test_3dgs_gradients_agree(backend, antialiased, make_splats) -> None:
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_2dgs_agrees_in_colour_alpha_and_normals(backend, make_splats) -> None:
     splats, camera = scene("2d", make_splats)
-    judged = _gsplat_torch.render(splats, camera, depth=True)
+    judged = gsplat_torch.render(splats, camera, depth=True)
     view = render(splats, camera, backend=backend, depth="center")
     tolerance = 1e-9 if backend == "reference" else 1e-5
     assert judged.normal is not None
@@ -87,7 +88,7 @@ def test_2dgs_agrees_in_colour_alpha_and_normals(backend, make_splats) -> None:
 def test_2dgs_differs_where_gsplat_centres_the_filter_on_the_box(make_splats) -> None:
     """The documented difference, seen: the middle of a tilted splat's box is not where its centre projects."""
     splats, camera = scene("2d", make_splats)
-    shifted = _gsplat_torch.render(splats, camera, true_center=False)
+    shifted = gsplat_torch.render(splats, camera, true_center=False)
     view = render(splats, camera, backend="reference")
     assert float((view.alpha - shifted.alpha).abs().max()) > 1e-3
 
@@ -97,7 +98,7 @@ def test_an_off_centre_principal_point_agrees(make_splats) -> None:
     K = camera.K.copy()
     K[:2, 2] = [9.0, 33.0]
     camera = Camera(K, camera.world_to_camera, camera.width, camera.height)
-    judged = _gsplat_torch.render(splats, camera)
+    judged = gsplat_torch.render(splats, camera)
     view = render(splats, camera)
     assert float((view.color - judged.color).abs().max()) < 2e-6
     assert np.isfinite(judged.seconds)
@@ -114,7 +115,7 @@ def without_stop(splats, camera) -> reference.Outputs:
 def test_the_clamp_of_alpha_is_the_whole_difference_of_an_opaque_splat(kind, facing, front_camera, monkeypatch) -> None:
     camera = front_camera()
     splat = facing([[0, 0, 4]], scales=0.5, opacities=1.0, kind=kind)
-    judged = _gsplat_torch.render(splat, camera)
+    judged = gsplat_torch.render(splat, camera)
     view = render(splat, camera, backend="reference")
     difference = judged.alpha - view.alpha
     # 0.999 there, 0.99 here, where the splat is more opaque than that; the same elsewhere.
@@ -133,7 +134,7 @@ def test_the_early_stop_is_the_whole_difference_of_a_stack(kind, facing, front_c
     """gsplat leaves out the splat that brings the transmittance to 1e-4; here it is drawn, and the ray ends behind it."""
     camera = front_camera()
     stack = facing([[0, 0, z] for z in (4, 5, 6, 7)], scales=0.5, opacities=0.98, kind=kind)
-    stopped, whole = (_gsplat_torch.render(stack, camera, stop=stop) for stop in (True, False))
+    stopped, whole = (gsplat_torch.render(stack, camera, stop=stop) for stop in (True, False))
     view = render(stack, camera, backend="reference")
     at = (16, 16)
     # Transmittances in the middle: 0.02, 4e-4, 8e-6, 1.6e-7. gsplat ends after the second, this after the third.
@@ -152,8 +153,8 @@ def test_the_box_is_the_whole_difference_of_a_tilted_2d_splat_nearby(facing, fro
     """3.33 times the box of one sigma is less than the box of 3.33 sigma, in perspective."""
     camera = front_camera(96, 60.0)
     splat = facing([[0, 0, 2]], scales=0.5, opacities=0.9, normals=[[np.sin(1.0), 0, -np.cos(1.0)]])
-    boxed = _gsplat_torch.render(splat, camera, box=True)
-    whole = _gsplat_torch.render(splat, camera)
+    boxed = gsplat_torch.render(splat, camera, box=True)
+    whole = gsplat_torch.render(splat, camera)
     view = render(splat, camera, backend="reference")
     assert float((view.alpha - whole.alpha).abs().max()) < 1e-9
     cut = (view.alpha - boxed.alpha).abs() > 1e-9
@@ -164,7 +165,7 @@ def test_the_box_is_the_whole_difference_of_a_tilted_2d_splat_nearby(facing, fro
 
 def test_the_box_takes_nothing_from_a_3d_splat_but_what_is_below_the_threshold(make_splats) -> None:
     splats, camera = scene("3d", make_splats)
-    boxed, whole = (_gsplat_torch.render(splats, camera, box=box) for box in (True, False))
+    boxed, whole = (gsplat_torch.render(splats, camera, box=box) for box in (True, False))
     # exp(-3.33^2 / 2) = 1 / 256: below 1 / 255 at any opacity. Only the image's own clamp of the Jacobian could matter.
     assert float((boxed.color - whole.color).abs().max()) < 1e-9
 
@@ -177,7 +178,7 @@ def test_the_filters_centre_is_the_whole_difference_of_a_thin_2d_splat(facing, f
         [[0, 0, 2]], scales=torch.tensor([0.4, 0.002]), opacities=0.9, normals=[[np.sqrt(0.5), 0, -np.sqrt(0.5)]]
     )
     view = render(splat, camera, backend="reference")
-    true, shifted = (_gsplat_torch.render(splat, camera, true_center=true) for true in (True, False))
+    true, shifted = (gsplat_torch.render(splat, camera, true_center=true) for true in (True, False))
     assert float((view.alpha - true.alpha).abs().max()) < 1e-9
     x = torch.arange(96) + 0.5
     ours, theirs = (float((alpha * x).sum() / alpha.sum()) for alpha in (view.alpha, shifted.alpha))

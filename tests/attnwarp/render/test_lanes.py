@@ -9,7 +9,8 @@ import numba
 import numpy as np
 import pytest
 
-from attnwarp.render._kernels import compositing, differentiating, lanes, layout, listing, peak, projecting
+from attnwarp.render._kernels import backward, binning, lanes, layout, projection, rasterization
+from benchmarks import peak
 
 
 def test_estimates_made_better_and_sums_in_another_order() -> None:
@@ -40,8 +41,8 @@ def test_eight_float64_to_the_last_bits() -> None:
         given = lanes.load8(x, 0)
         lanes.store8(y, 0, lanes.inverse(given))
         lanes.store8(y, 8, lanes.inverse_root(given))
-        lanes.store8(y, 16, projecting._root(given))
-        lanes.store8(y, 24, projecting._log(given))
+        lanes.store8(y, 16, projection._root(given))
+        lanes.store8(y, 24, projection._log(given))
 
     random = np.random.default_rng(0)
     y = np.zeros(32)
@@ -108,12 +109,12 @@ def test_a_row_of_squares_as_bits(begin, end) -> None:
     """Of a run from column 40 on, in both ways that lists are filled."""
     code = 40 + begin | 40 + end << 16
     row = [begin <= column <= end for column in range(56)]
-    assert listing._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
+    assert binning._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
     for column in range(0, 56, layout.SIDE):
         part = row[column : column + layout.SIDE]
-        assert listing._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
+        assert binning._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
     nothing = 32767 | -1 << 16
-    assert listing._bits(nothing, 40) == listing._columns(nothing, 40) == 0
+    assert binning._bits(nothing, 40) == binning._columns(nothing, 40) == 0
 
 
 def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
@@ -127,10 +128,10 @@ def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
         assert layout.fingerprint(render / "_kernels") != layout.FINGERPRINT
         file.write_text(file.read_text()[:-1])
     for dispatcher in (
-        compositing.forward,
-        differentiating.backward,
-        projecting.project,
-        listing.outline,
+        rasterization.forward,
+        backward.backward,
+        projection.project,
+        binning.outline,
         peak.multiply_add,
     ):
         assert dispatcher._cache._cache_file._source_stamp == layout.FINGERPRINT

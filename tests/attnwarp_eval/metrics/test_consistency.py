@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.warp import sample_at
+from attnwarp.warp.correspondence import sample_at
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_linear, to_srgb
-from attnwarp_eval.features import SolidField
-from attnwarp_eval.metric import metric
-from attnwarp_eval.scene_file import load_scene
-from attnwarp_eval.shapes import Rectangle
+from attnwarp_eval.metrics.registry import metric
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.shapes import Rectangle
 from attnwarp_eval.truth import Geometry, appearance, two_view
+from attnwarp_eval.truth.features import SolidField
 
 
 @pytest.fixture(scope="module")

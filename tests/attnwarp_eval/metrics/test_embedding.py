@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from attnwarp_eval.metric import METRICS
 from attnwarp_eval.metrics import Similarity, clip_similarity, directional_similarity, image_similarity
 from attnwarp_eval.metrics.embedding import TINY_DISPLACEMENT, TINY_NORM
+from attnwarp_eval.metrics.registry import METRICS
 
 E = np.eye(4)
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from attnwarp_eval import metrics
-from attnwarp_eval.edited import edit_mask
-from attnwarp_eval.metric import metric
-from attnwarp_eval.scene_file import load_scene
+from attnwarp_eval.metrics.registry import metric
+from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry, appearance, to_srgb
+from attnwarp_eval.truth.edits import edit_mask
 
 SIZE = 48
 

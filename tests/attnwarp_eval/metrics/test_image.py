@@ -17,7 +17,7 @@ from torchmetrics.functional.image import (
 
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_linear
-from attnwarp_eval.metric import METRICS, metric
+from attnwarp_eval.metrics.registry import METRICS, metric
 
 
 def pictures(height=40, width=52, seed=0, noise=0.15):
@@ -415,7 +415,7 @@ def test_a_perceptual_distance_refuses_what_the_others_do():
 
 
 def test_the_bundled_distance_of_a_masked_picture_is_that_of_the_picture_put_into_its_target():
-    from attnwarp_eval.encoders import load_encoder
+    from attnwarp.encoders import load_encoder
 
     encoder = load_encoder("perceptual-small", "perceptual")
     image, target = pictures(64, 64)

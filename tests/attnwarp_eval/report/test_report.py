@@ -4,8 +4,8 @@ import copy
 
 import pytest
 
-from attnwarp_eval.ablation.study import Study
-from attnwarp_eval.checks.occlusion import COUNTS
+from attnwarp_eval.document.write import inline, markdown
+from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report import calibration
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build
@@ -13,8 +13,8 @@ from attnwarp_eval.report.claims import Claim, judge
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.words import number, spread
-from attnwarp_eval.report.write import inline, markdown
-from attnwarp_eval.statistics import interval
+from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.study.study import Study
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"

@@ -5,13 +5,13 @@ import math
 
 import pytest
 
-from attnwarp_eval.ablation.sensitivity import CONDITIONS, RIGHT
-from attnwarp_eval.ablation.study import Study
+from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.build import build
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.report.sensitivity import FLAWS, ROWS, beats, curve, power, sensitivity, share
-from attnwarp_eval.report.write import markdown
-from attnwarp_eval.statistics import interval
+from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.study.probes.sensitivity import CONDITIONS, RIGHT
+from attnwarp_eval.study.study import Study
 
 ENVIRONMENT = {
     "versions": {"python": "3"}, "machine": {"system": "Linux", "arch": "x", "cores": 2},

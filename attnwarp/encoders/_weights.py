@@ -1,0 +1,66 @@
+"""Files of weights: finding them, naming them by content, and running them the same way everywhere."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from attnwarp.errors import InputError
+
+
+def sha256_of(files: Sequence[Path]) -> str:
+    """SHA-256 of the files' bytes, one after the other in the order of their names."""
+    total = hashlib.sha256()
+    for path in sorted(files, key=lambda p: p.name):
+        with path.open("rb") as stream:
+            while block := stream.read(1 << 22):
+                total.update(block)
+    return total.hexdigest()
+
+
+def state_of(path: Path) -> dict[str, torch.Tensor]:
+    """The tensors of a .safetensors, .pth, .pt or .bin file, on the CPU; nothing in it is executed.
+
+    Raises:
+        InputError: not such a file, or one that holds something else than tensors by name.
+    """
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:  # the two readers raise many kinds, all of which mean the same to a person
+        first = str(error).strip().splitlines()[:1]
+        raise InputError(f"{path}: cannot be read as weights ({''.join(first)}); fetch the file again") from None
+    if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
+        state = state["state_dict"]
+    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
+        raise InputError(f"{path}: holds no dictionary of tensors, expected a state dict")
+    return {str(key): value for key, value in state.items()}
+
+
+def device_of(name: str) -> torch.device:
+    """A device by name. Raises InputError where there is none of that name."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device {name!r}: unknown, expected cpu or cuda") from None
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device {name!r}: not supported, expected cpu or cuda")
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device {name!r}: this machine or this torch has no CUDA; name cpu")
+    return device
+
+
+@contextmanager
+def full_float32() -> Iterator[None]:
+    """No gradients, and true float32 in convolutions: cuDNN would take TF32, of 10 bits, by default."""
+    with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+        yield

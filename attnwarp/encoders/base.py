@@ -1,0 +1,173 @@
+"""What an encoder is: the protocols that bundled and real ones share, and the checks at their doors.
+
+Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+Kind = Literal["clip", "dino", "perceptual"]
+
+Array = npt.NDArray[Any]
+Image = npt.NDArray[Any]
+"""(H, W, 3) sRGB, floating, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class EncoderInfo:
+    """Which encoder gave a figure. It stands beside every result, since figures of two encoders do not compare.
+
+    Attributes:
+        name: what :func:`attnwarp.encoders.load_encoder` was asked for.
+        kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a distance of images).
+        source: "bundled", or the folder or file that the weights were read from.
+        weights_sha256: of the weights' file; where there are several, of their bytes in the order of their names.
+        preprocessing: in words, what happens to a picture before the network sees it.
+        size: side in px of the square that the network sees; None: pictures go in at their own size.
+        dim: length of an embedding; None where there is none.
+    """
+
+    name: str
+    kind: Kind
+    source: str
+    weights_sha256: str
+    preprocessing: str
+    size: int | None = None
+    dim: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+@runtime_checkable
+class ImageEncoder(Protocol):
+    """Pictures to embeddings."""
+
+    @property
+    def about(self) -> EncoderInfo:
+        """Which encoder this is."""
+        ...
+
+    def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N, D) float64 embeddings, not normalised; (0, D) of an empty list.
+
+        Args:
+            images: N pictures (H, W, 3), sRGB, floating, in [0, 1]; each of its own size. What becomes of a picture
+                does not depend on the others in the list.
+
+        Raises:
+            ValueError: a picture of another shape, dtype or range; the message names its index.
+        """
+        ...
+
+
+@runtime_checkable
+class TextImageEncoder(ImageEncoder, Protocol):
+    """Pictures and texts to one space, as CLIP."""
+
+    def texts(self, texts: Sequence[str]) -> npt.NDArray[np.float64]:
+        """(N, D) float64 embeddings, not normalised; (0, D) of an empty list."""
+        ...
+
+
+@runtime_checkable
+class TokenEncoder(ImageEncoder, Protocol):
+    """Pictures to an embedding each and to a grid of patch embeddings, as DINO."""
+
+    def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N, h, w, D) float64 embeddings of the patches, row by row as they lie in the preprocessed picture."""
+        ...
+
+
+@runtime_checkable
+class PerceptualDistance(Protocol):
+    """A distance of pictures that follows what people see, as LPIPS."""
+
+    @property
+    def about(self) -> EncoderInfo:
+        """Which network this is."""
+        ...
+
+    def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N,) float64 distances, 0 for equal pictures.
+
+        Args:
+            a, b: N pictures each, (H, W, 3), sRGB, floating, in [0, 1] (the scaling to [-1, 1] happens inside);
+                ``a[i]`` and ``b[i]`` of one size, which may differ from pair to pair.
+
+        Raises:
+            ValueError: lists of different lengths, a pair of different sizes, a bad picture; the message names the
+                index.
+        """
+        ...
+
+
+Encoder = ImageEncoder | TextImageEncoder | TokenEncoder | PerceptualDistance
+
+
+def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.NDArray[np.float32]]:
+    """The pictures in float32, as they came in every other respect.
+
+    Raises:
+        TypeError: one picture where a list was expected.
+        ValueError: not (H, W, 3), not floating, not finite, or out of [0, 1]; the message names the index.
+    """
+    if isinstance(images, np.ndarray) and images.ndim == 3:
+        raise TypeError(f"{name}: got one picture of shape {images.shape}, expected a list of pictures")
+    return [checked_image(image, f"{name}[{i}]") for i, image in enumerate(images)]
+
+
+def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
+    """One picture in float32. Raises ValueError, see :func:`checked_images`."""
+    array = np.asarray(image)
+    if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+        raise ValueError(f"{name}: got shape {array.shape}, expected (H, W, 3) with at least one pixel")
+    if array.dtype.kind != "f":
+        raise ValueError(f"{name}: got {array.dtype}, expected floating sRGB in [0, 1]; divide 8 bits by 255")
+    # Tested in its own dtype: a float64 of 1e300 must be refused as out of range, not overflow on the way.
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite, expected none")
+    low, high = float(array.min()), float(array.max())
+    if low < 0 or high > 1:
+        raise ValueError(f"{name}: got values in [{low:g}, {high:g}], expected [0, 1]")
+    return array.astype(np.float32)
+
+
+def checked_pairs(
+    a: Sequence[Image], b: Sequence[Image]
+) -> list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Pairs of pictures in float32, equal in size within each pair.
+
+    Raises:
+        TypeError, ValueError: as :func:`checked_images`; lists of different lengths; a pair of different sizes.
+    """
+    left, right = checked_images(a, "a"), checked_images(b, "b")
+    if len(left) != len(right):
+        raise ValueError(f"b: got {len(right)} pictures, expected {len(left)}, as a")
+    for i, (one, other) in enumerate(zip(left, right, strict=True)):
+        if one.shape != other.shape:
+            raise ValueError(
+                f"b[{i}]: got {other.shape[1]} x {other.shape[0]} px, expected {one.shape[1]} x {one.shape[0]}, as a[{i}]"
+            )
+    return list(zip(left, right, strict=True))
+
+
+def checked_texts(texts: Sequence[str]) -> list[str]:
+    """The texts.
+
+    Raises:
+        TypeError: one string where a list was expected, or something that is not a string.
+    """
+    if isinstance(texts, str):
+        raise TypeError(f"texts: got one string {texts!r}, expected a list of strings")
+    for i, text in enumerate(texts):
+        if not isinstance(text, str):
+            raise TypeError(f"texts[{i}]: got {type(text).__name__}, expected a string")
+    return list(texts)

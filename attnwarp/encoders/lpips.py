@@ -1,0 +1,244 @@
+"""LPIPS from local weights: a torchvision backbone (AlexNet, VGG16, SqueezeNet 1.1) and the published linear layers.
+
+The networks are written here, with torchvision's names for their tensors, so that torchvision need not be installed.
+
+Source: R. Zhang, P. Isola, A. A. Efros, E. Shechtman, O. Wang, "The Unreasonable Effectiveness of Deep Features as a
+Perceptual Metric", CVPR 2018, and its released weights, version 0.1.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import nn
+
+from attnwarp.encoders._weights import device_of, full_float32, sha256_of, state_of
+from attnwarp.encoders.base import EncoderInfo, Image, checked_pairs
+from attnwarp.errors import InputError
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+"""The published scaling layer: (x - shift) / scale of x in [-1, 1], which is ImageNet's normalisation."""
+
+EPSILON = 1e-10
+"""Added to a feature's norm before dividing, as published: it matters only where no channel responds at all."""
+
+SUFFIXES = (".pth", ".pt", ".bin", ".safetensors")
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """One of the three networks.
+
+    Attributes:
+        name: LPIPS's word for it.
+        file: torchvision's word for its weights.
+        taps: index of the last layer of each stage in torchvision's ``features``.
+        channels: of each stage.
+        smallest: shortest side in px of a picture that reaches the last stage.
+    """
+
+    name: str
+    file: str
+    taps: tuple[int, ...]
+    channels: tuple[int, ...]
+    smallest: int
+
+
+BACKBONES = {
+    b.name: b
+    for b in (
+        Backbone("alex", "alexnet-owt-7be5be79.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31),
+        Backbone("vgg", "vgg16-397923af.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
+        Backbone(
+            "squeeze", "squeezenet1_1-b8a52dc0.pth", (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512), 17
+        ),
+    )
+}
+
+
+class Fire(nn.Module):
+    """SqueezeNet's block: a 1x1 convolution that narrows, then 1x1 and 3x3 side by side."""
+
+    def __init__(self, inputs: int, narrow: int, wide: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(inputs, narrow, 1)
+        self.expand1x1 = nn.Conv2d(narrow, wide, 1)
+        self.expand3x3 = nn.Conv2d(narrow, wide, 3, padding=1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """(N, inputs, h, w) to (N, 2 wide, h, w)."""
+        x = self.squeeze(x).relu()
+        return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], dim=1)
+
+
+def features(name: str) -> nn.Sequential:
+    """torchvision's ``features`` of a network up to LPIPS's last stage; its tensors are named as there, ``0.weight``."""
+    if name == "alex":
+        layers: list[nn.Module] = [nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
+        layers += [nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
+        for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
+            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
+    elif name == "vgg":
+        layers, inputs = [], 3
+        for i, (outputs, count) in enumerate(((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))):
+            layers += [nn.MaxPool2d(2, 2)] if i else []
+            for _ in range(count):
+                layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
+                inputs = outputs
+    elif name == "squeeze":
+
+        def pool() -> nn.Module:
+            return nn.MaxPool2d(3, 2, ceil_mode=True)
+
+        layers = [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool(), Fire(64, 16, 64), Fire(128, 16, 64), pool()]
+        layers += [Fire(128, 32, 128), Fire(256, 32, 128), pool(), Fire(256, 48, 192), Fire(384, 48, 192)]
+        layers += [Fire(384, 64, 256), Fire(512, 64, 256)]
+    else:
+        raise ValueError(f"name: got {name!r}, expected one of {', '.join(BACKBONES)}")
+    return nn.Sequential(*layers)
+
+
+class Lpips:
+    """The distance; see :class:`attnwarp.encoders.PerceptualDistance`.
+
+    Args:
+        backbone: which network.
+        network: its ``features``, see :func:`features`.
+        weights: the linear layers, one (channels,) tensor a stage.
+        about: what it is.
+        device: where it computes.
+    """
+
+    def __init__(
+        self, backbone: Backbone, network: nn.Sequential, weights: Sequence[torch.Tensor], about: EncoderInfo,
+        device: torch.device | str = "cpu",
+    ) -> None:  # fmt: skip
+        self.about = about
+        self._backbone = backbone
+        self._device = torch.device(device)
+        self._network = network.to(self._device, torch.float32).eval()
+        self._weights = [w.to(self._device, torch.float32).reshape(1, -1, 1, 1) for w in weights]
+
+    def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N,) float64; see :class:`attnwarp.encoders.PerceptualDistance`.
+
+        Raises:
+            ValueError: also for pictures smaller than the network can take.
+        """
+        pairs = checked_pairs(a, b)
+        for i, (one, _) in enumerate(pairs):
+            if min(one.shape[:2]) < self._backbone.smallest:
+                raise ValueError(
+                    f"a[{i}]: got {one.shape[1]} x {one.shape[0]} px, expected sides of at least "
+                    f"{self._backbone.smallest} px for LPIPS with {self._backbone.name}"
+                )
+        # Pair by pair: VGG's first stage holds 64 floats a pixel, 134 MB for one pair of 512 x 512.
+        return np.array([self._pair(one, other) for one, other in pairs], dtype=np.float64)
+
+    def _pair(self, a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> float:
+        if np.array_equal(a, b):
+            return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
+        with full_float32():
+            both = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2).to(self._device)
+            shift, scale = (torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE))
+            x = (2 * both - 1 - shift) / scale
+            total = 0.0
+            stage = 0
+            for i, layer in enumerate(self._network):
+                x = layer(x)
+                if i == self._backbone.taps[stage]:
+                    unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
+                    weighted = ((unit[0] - unit[1]) ** 2)[None] * self._weights[stage]
+                    total += float(weighted.sum(1).mean(dtype=torch.float64))
+                    stage += 1
+        return total
+
+
+def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
+    """LPIPS from one file that holds everything, or from a folder with a backbone and linear layers.
+
+    Args:
+        place: a state dict saved from an LPIPS network (``net.slice1.0.weight``, ``lin0.model.1.weight``, ...), or a
+            folder with torchvision's state dict of a backbone (``features.0.weight``, ...) and one or more of the
+            published files of linear layers, of which the fitting one is taken.
+        name: what the caller named it by.
+        device: "cpu" or "cuda".
+
+    Raises:
+        InputError: nothing there, something missing, or more than one that fits.
+    """
+    where = device_of(device)
+    if place.is_file():
+        files = [place]
+    elif place.is_dir():
+        files = sorted(p for p in place.iterdir() if p.suffix in SUFFIXES and p.is_file())
+    else:
+        files = []
+    if not files:
+        raise InputError(f"{name}: {place} is no file and no folder with weights. {_HOW}")
+    networks: list[tuple[Path, Backbone, dict[str, torch.Tensor]]] = []
+    linears: list[tuple[Path, list[torch.Tensor]]] = []
+    for path in files:
+        state = state_of(path)
+        layers = _backbone_tensors(state)
+        found = next((b for b in BACKBONES.values() if layers and _fits(b, layers)), None)
+        if found is not None:
+            networks.append((path, found, layers))
+        if lines := _linear_tensors(state):
+            linears.append((path, lines))
+    if len(networks) != 1:
+        what = "no backbone" if not networks else "several backbones: " + ", ".join(p.name for p, _, _ in networks)
+        raise InputError(f"{name}: {place} holds {what}, expected one. {_HOW}")
+    path, backbone, layers = networks[0]
+    fitting = [(p, ws) for p, ws in linears if tuple(w.numel() for w in ws) == backbone.channels]
+    if len(fitting) != 1:
+        what = "no" if not fitting else "several files of"
+        raise InputError(f"{name}: {place} holds {what} linear layers for {backbone.name}, expected one file. {_HOW}")
+    used = sorted({path, fitting[0][0]})
+    if not all(bool(torch.isfinite(v).all()) for v in [*layers.values(), *fitting[0][1]]):
+        raise InputError(f"{name}: weights in {place} are NaN or infinite; fetch the files again")
+    with torch.device("meta"):  # no time spent on random weights that are replaced at once
+        network = features(backbone.name)
+    network.load_state_dict(layers, assign=True)
+    about = EncoderInfo(
+        name=name,
+        kind="perceptual",
+        source=", ".join(str(p) for p in used),
+        weights_sha256=sha256_of(used),
+        preprocessing=f"LPIPS 0.1 with {backbone.name}: [0, 1] to [-1, 1], minus {SHIFT}, over {SCALE}; not resized",
+    )
+    return Lpips(backbone, network, fitting[0][1], about, where)
+
+
+_HOW = (
+    "Place there two files: the backbone's weights as torchvision publishes them ("
+    + ", ".join(b.file for b in BACKBONES.values())
+    + ") and the file of linear layers of the lpips package, version 0.1 (alex.pth, vgg.pth or squeeze.pth). Or name one "
+    "file saved with torch.save(lpips.LPIPS(net='alex').state_dict(), FILE) on a machine that has that package"
+)
+
+
+def _backbone_tensors(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The backbone's tensors by torchvision's names without ``features.``, whichever way they were saved."""
+    # lpips numbers the layers inside its slices as torchvision does: net.slice3.6.weight is features.6.weight.
+    pattern = re.compile(r"(?:module\.)?(?:features|net\.slice\d+|net\.slices\.\d+)\.(\d+\..+)")
+    return {m[1]: v for key, v in state.items() if (m := pattern.fullmatch(key))}
+
+
+def _fits(backbone: Backbone, layers: dict[str, torch.Tensor]) -> bool:
+    with torch.device("meta"):
+        expected = {key: tuple(value.shape) for key, value in features(backbone.name).state_dict().items()}
+    return expected == {key: tuple(value.shape) for key, value in layers.items()}
+
+
+def _linear_tensors(state: dict[str, torch.Tensor]) -> list[torch.Tensor]:
+    pattern = re.compile(r"(?:module\.)?lin(\d+)\.model\.\d+\.weight")
+    found = {int(m[1]): value.detach().flatten() for key, value in state.items() if (m := pattern.fullmatch(key))}
+    return [found[i] for i in sorted(found)]

@@ -1,0 +1,201 @@
+"""What happens to a picture before a pretrained network sees it, read from the file that lies beside the weights.
+
+The resizing is Pillow's own filter, as in the encoders' reference pipelines, but on floating values: those pipelines
+round to 8 bits before and after it, which here would turn differences below 1/255 into noise.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.errors import InputError
+
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+
+_FILES = ("preprocessor_config.json", "processor_config.json")
+_FAMILIES = ("CLIPImageProcessor", "CLIPFeatureExtractor", "BitImageProcessor")
+_FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5: "Hamming"}
+"""Pillow's numbers for its filters, which are what the file holds."""
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """Resize, crop, scale, normalise; in this order, each left out where it is None.
+
+    Attributes:
+        resize: side in px that the shorter edge is resized to (the other one rounded down), or (height, width).
+        resample: Pillow's number of the filter.
+        crop: (height, width) in px, cut from the centre; a smaller picture is padded with black.
+        scale: what [0, 1] is multiplied by, 1 for networks that expect [0, 1].
+        mean, std: per channel, after the scaling.
+    """
+
+    resize: int | tuple[int, int] | None
+    resample: int = 3
+    crop: tuple[int, int] | None = None
+    scale: float = 1.0
+    mean: tuple[float, ...] = (0.0, 0.0, 0.0)
+    std: tuple[float, ...] = (1.0, 1.0, 1.0)
+
+    @property
+    def shape(self) -> tuple[int, int] | None:
+        """(height, width) of what comes out; None where it depends on the picture."""
+        return self.crop or (self.resize if isinstance(self.resize, tuple) else None)
+
+    def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """(H, W, 3) in [0, 1] to (3, h, w), normalised."""
+        if self.resize is not None:
+            image = resize(image, _target(image, self.resize), self.resample)
+        if self.crop is not None:
+            image = center_crop(image, self.crop)
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        scaled = (image * np.float32(self.scale) - mean) / std
+        return np.ascontiguousarray(scaled.transpose(2, 0, 1), dtype=np.float32)
+
+    def __str__(self) -> str:
+        steps = []
+        if self.resize is not None:
+            to = self.resize
+            what = f"the shorter edge to {to}" if isinstance(to, int) else f"to {to[1]} x {to[0]}"
+            steps.append(f"resized {what} px ({_FILTERS[self.resample]}, antialiased, floating)")
+        if self.crop is not None:
+            steps.append(f"the central {self.crop[1]} x {self.crop[0]} px cut out")
+        if self.scale != 1:
+            steps.append(f"times {self.scale:g}")
+        mean, std = (", ".join(f"{v:.4g}" for v in values) for values in (self.mean, self.std))
+        return "; ".join([*steps, f"minus ({mean}), over ({std})"])
+
+
+def resize(image: npt.NDArray[np.float32], size: tuple[int, int], resample: int = 3) -> npt.NDArray[np.float32]:
+    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, which widens it when a picture gets smaller.
+
+    Args:
+        image: the picture.
+        size: (h, w) in px.
+        resample: Pillow's number of the filter; 3 is bicubic.
+
+    Returns:
+        The picture in [0, 1]: a cubic overshoots at edges, and is clipped there as 8 bits would be.
+    """
+    from PIL import Image
+
+    if image.shape[:2] == size:
+        return image
+    channels = []
+    for c in range(3):
+        channel = np.ascontiguousarray(image[..., c])
+        # One axis, then the other, as in 8 bits, where the overshoot is cut off after each. Which axis comes first is
+        # Pillow's affair where a picture is squeezed to another shape; the cut-off values differ there, and no others.
+        for shape in ((size[1], image.shape[0]), (size[1], size[0])):
+            channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
+        channels.append(channel)
+    return np.stack(channels, axis=2)
+
+
+def center_crop(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.NDArray[np.float32]:
+    """The central (h, w) px of (H, W, 3); black where the picture is smaller."""
+    out = np.zeros((*size, image.shape[2]), image.dtype)
+    window = []
+    for have, want in zip(image.shape[:2], size, strict=True):
+        start = (have - want) // 2
+        low, high = max(start, 0), min(start + want, have)
+        window.append((slice(low - start, high - start), slice(low, high)))
+    out[window[0][0], window[1][0]] = image[window[0][1], window[1][1]]
+    return out
+
+
+def _target(image: npt.NDArray[np.float32], wanted: int | tuple[int, int]) -> tuple[int, int]:
+    if isinstance(wanted, tuple):
+        return wanted
+    height, width = image.shape[:2]
+    long = int(wanted * max(height, width) / min(height, width))
+    return (wanted, long) if height <= width else (long, wanted)
+
+
+def read_preprocessing(folder: Path) -> Preprocessing:
+    """Read preprocessor_config.json, or the part of processor_config.json that newer versions write.
+
+    What the file leaves out is as CLIP's: shorter edge to 224 px, bicubic, the central 224 x 224 px, CLIP's mean and
+    deviation.
+
+    Raises:
+        InputError: neither file, not JSON, or something that is not known here; the message names file and key.
+    """
+    path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
+    if path is None:
+        raise InputError(f"{folder}: no {' or '.join(_FILES)}; place the one that was published with the weights there")
+    said = read_json(path)
+    if path.name == _FILES[1]:
+        said = said.get("image_processor") or {}
+    family = said.get("image_processor_type") or said.get("feature_extractor_type") or "CLIPImageProcessor"
+    if str(family).removesuffix("Fast").removesuffix("Pil") not in _FAMILIES:
+        raise InputError(f"{path}: image_processor_type is {family!r}, expected one of {', '.join(_FAMILIES)}")
+    if said.get("do_pad"):
+        raise InputError(f"{path}: do_pad is true, which is not supported; encoders that pad are not known here")
+    rescale = float(said.get("rescale_factor", 1 / 255)) if said.get("do_rescale", True) else 1.0
+    normalise = said.get("do_normalize", True)
+    try:
+        return Preprocessing(
+            resize=_size(said.get("size", 224), edge=True) if said.get("do_resize", True) else None,
+            resample=_resample(said.get("resample", 3)),
+            crop=_pair(said.get("crop_size", 224)) if said.get("do_center_crop", True) else None,
+            # The file speaks of 0 .. 255. A factor of 1/255 that was rounded on its way must still give exactly 1.
+            scale=1.0 if abs(rescale * 255 - 1) < 1e-6 else rescale * 255,
+            mean=_three(said.get("image_mean", CLIP_MEAN)) if normalise else (0.0, 0.0, 0.0),
+            std=_three(said.get("image_std", CLIP_STD)) if normalise else (1.0, 1.0, 1.0),
+        )
+    except (TypeError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: {error}; place the file that was published with the weights") from None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file that holds an object. Raises InputError naming the file."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: not JSON ({error}); fetch the file again") from None
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: holds a {type(value).__name__}, expected an object")
+    return value
+
+
+def _size(value: Any, *, edge: bool) -> int | tuple[int, int]:
+    if isinstance(value, dict):
+        keys = {key for key, side in value.items() if side is not None}
+        if edge and keys == {"shortest_edge"}:
+            return _side(value["shortest_edge"])
+        if keys == {"height", "width"}:
+            return _side(value["height"]), _side(value["width"])
+        raise ValueError(f"size {value} is not known here, expected shortest_edge, or height and width")
+    return _side(value)
+
+
+def _pair(value: Any) -> tuple[int, int]:
+    size = _size(value, edge=False)
+    return size if isinstance(size, tuple) else (size, size)
+
+
+def _side(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"size {value!r} is not a number of px")
+    return value
+
+
+def _resample(value: Any) -> int:
+    if isinstance(value, bool) or value not in _FILTERS:
+        raise ValueError(f"resample {value!r} is not known, expected one of {_FILTERS}")
+    return int(value)
+
+
+def _three(values: Any) -> tuple[float, ...]:
+    three = tuple(float(value) for value in values)
+    if len(three) != 3 or not np.isfinite(three).all():
+        raise ValueError(f"{values} is not one number for each of three channels")
+    return three

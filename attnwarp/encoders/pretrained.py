@@ -1,0 +1,348 @@
+"""CLIP and DINOv2 from a folder of one's own, in the format of the transformers package. Nothing is ever fetched.
+
+What transformers does silently and would give figures that look fine is refused here: tensors that the file lacks
+(they are filled with random numbers), a tokenizer of another model (every text then reads its first token), a model of
+another kind.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.encoders._weights import device_of, full_float32, sha256_of
+from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
+from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
+from attnwarp.errors import InputError
+
+BATCH = 8
+"""Pictures that go through a network together: enough to keep it busy, few enough to fit beside ViT-L's weights."""
+
+_ASK = {
+    "clip": "openai/clip-vit-large-patch14-336 (the paper's) or openai/clip-vit-base-patch32 (small)",
+    "dino": "facebook/dinov2-with-registers-small (the paper's) or facebook/dinov2-small",
+}
+_FILES = {
+    "clip": "config.json, model.safetensors (or pytorch_model.bin), preprocessor_config.json, and tokenizer.json (or "
+    "vocab.json with merges.txt)",
+    "dino": "config.json, model.safetensors (or pytorch_model.bin) and preprocessor_config.json",
+}
+
+
+class _Pictures:
+    """What CLIP and DINOv2 share: pictures through preprocessing and network, batch by batch, in float32."""
+
+    def __init__(self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device) -> None:
+        self.about = about
+        self._preprocess = preprocessing
+        self._device = device
+
+    def _run(
+        self, images: Sequence[Image], network: Callable[[torch.Tensor], torch.Tensor]
+    ) -> list[npt.NDArray[np.float64]]:
+        """One result a picture. Only neighbours of equal size share a batch."""
+        if isinstance(images, np.ndarray) and images.ndim == 3:
+            raise TypeError(f"images: got one picture of shape {images.shape}, expected a list of pictures")
+        done: list[npt.NDArray[np.float64]] = []
+        for start in range(0, len(images), BATCH):
+            ready = [
+                self._preprocess(checked_image(images[i], f"images[{i}]"))
+                for i in range(start, min(start + BATCH, len(images)))
+            ]
+            for _, equal in groupby(ready, key=lambda picture: picture.shape):
+                with full_float32():
+                    out = network(torch.from_numpy(np.stack(list(equal))).to(self._device))
+                done.extend(out.double().cpu().numpy())
+        return done
+
+
+class Clip(_Pictures):
+    """CLIP; see :class:`attnwarp.encoders.TextImageEncoder`.
+
+    Embeddings are those behind the two projections, as the field compares them. Texts longer than the network takes
+    (77 tokens with the published ones) are cut, as the field does; ``cut`` says which.
+    """
+
+    def __init__(
+        self, model: Any, tokenizer: Any, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
+    ) -> None:
+        super().__init__(about, preprocessing, device)
+        self._model = model
+        self._tokenizer = tokenizer
+        self._length = int(model.config.text_config.max_position_embeddings)
+
+    def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N, D) float64, not normalised."""
+        rows = self._run(images, lambda x: _pooled(self._model.get_image_features(pixel_values=x)))
+        return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
+
+    def texts(self, texts: Sequence[str]) -> npt.NDArray[np.float64]:
+        """(N, D) float64, not normalised."""
+        rows: list[npt.NDArray[np.float64]] = []
+        for text in checked_texts(texts):
+            # One at a time: a few prompts, and no padding that a row would have to be independent of.
+            ids = self._ids(text)[0]
+            with full_float32():
+                out = _pooled(self._model.get_text_features(input_ids=torch.tensor([ids], device=self._device)))
+            rows.extend(out.double().cpu().numpy())
+        return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
+
+    def cut(self, text: str) -> int:
+        """How many tokens of a text are dropped because the network takes no more."""
+        return self._ids(text)[1]
+
+    @property
+    def _dim(self) -> int:
+        return int(self._model.config.projection_dim)
+
+    def _ids(self, text: str) -> tuple[list[int], int]:
+        ids = list(self._tokenizer.encode(text).ids)
+        over = max(0, len(ids) - self._length)
+        # The text is read off at the end token, so a cut one ends with it too.
+        return (ids[: self._length - 1] + ids[-1:] if over else ids), over
+
+
+class Dino(_Pictures):
+    """DINOv2, with registers or without; see :class:`attnwarp.encoders.TokenEncoder`.
+
+    A picture's embedding is the class token, and a patch's its own token, both behind the last normalisation.
+    """
+
+    def __init__(self, model: Any, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device) -> None:
+        super().__init__(about, preprocessing, device)
+        self._model = model
+        self._patch = int(model.config.patch_size)
+        self._special = 1 + int(getattr(model.config, "num_register_tokens", 0))
+
+    def images(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N, D) float64, not normalised."""
+        rows = self._run(images, lambda x: self._model(pixel_values=x).last_hidden_state[:, 0])
+        return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
+
+    def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
+        """(N, h, w, D) float64; 16 x 16 with the published preprocessing of 224 px.
+
+        Raises:
+            ValueError: also where the folder's preprocessing leaves pictures of different shapes different.
+        """
+        grids = self._run(images, self._grid)
+        if len({grid.shape for grid in grids}) > 1:
+            raise ValueError(
+                f"images: their grids have the sizes {sorted({grid.shape[:2] for grid in grids})}, expected one; this "
+                "encoder's preprocessing keeps a picture's shape, so give pictures of one shape"
+            )
+        if grids:
+            return np.stack(grids)
+        height, width = self._preprocess.shape or (0, 0)
+        return np.zeros((0, height // self._patch, width // self._patch, self._dim))
+
+    def _grid(self, x: torch.Tensor) -> torch.Tensor:
+        tokens = self._model(pixel_values=x).last_hidden_state[:, self._special :]
+        return tokens.reshape(len(x), x.shape[2] // self._patch, x.shape[3] // self._patch, self._dim)
+
+    @property
+    def _dim(self) -> int:
+        return int(self._model.config.hidden_size)
+
+
+def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
+    """CLIP from a folder in the transformers format.
+
+    Args:
+        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with its index),
+            preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
+        name: what the caller named it by.
+        device: "cpu" or "cuda".
+
+    Raises:
+        InputError: a file is missing or is not what it should be; the message says which, and how to get it.
+    """
+    where = device_of(device)
+    _config(folder, name, "clip", ("clip",))
+    preprocessing = read_preprocessing(folder)
+    tokenizer = _tokenizer(folder, name)
+    from transformers import CLIPModel
+
+    model, files = _load(CLIPModel, folder, name, "clip", where)
+    side = int(model.config.vision_config.image_size)
+    if preprocessing.shape != (side, side):
+        raise InputError(
+            f"{name}: the preprocessing in {folder} gives {preprocessing.shape or 'pictures of any size'}, the network "
+            f"in config.json takes ({side}, {side}); the two files are not of one model"
+        )
+    _fitting_tokenizer(tokenizer, model.config.text_config, folder, name)
+    about = EncoderInfo(
+        name, "clip", str(folder), sha256_of(files), str(preprocessing), side, int(model.config.projection_dim)
+    )
+    return Clip(model, tokenizer, about, preprocessing, where)
+
+
+def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
+    """DINOv2 from a folder in the transformers format, with registers or without.
+
+    Args:
+        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with its index) and
+            preprocessor_config.json.
+        name: what the caller named it by.
+        device: "cpu" or "cuda".
+
+    Raises:
+        InputError: a file is missing or is not what it should be; the message says which, and how to get it.
+    """
+    where = device_of(device)
+    config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))
+    preprocessing = read_preprocessing(folder)
+    from transformers import Dinov2Model, Dinov2WithRegistersModel
+
+    kind = Dinov2Model if config["model_type"] == "dinov2" else Dinov2WithRegistersModel
+    model, files = _load(kind, folder, name, "dino", where)
+    shape, patch = preprocessing.shape, int(model.config.patch_size)
+    if shape is not None and min(shape) < patch:
+        raise InputError(f"{name}: the preprocessing in {folder} gives {shape} px, smaller than one patch of {patch}")
+    size = shape[0] if shape is not None and shape[0] == shape[1] else None
+    about = EncoderInfo(
+        name, "dino", str(folder), sha256_of(files), str(preprocessing), size, int(model.config.hidden_size)
+    )
+    return Dino(model, about, preprocessing, where)
+
+
+def _config(folder: Path, name: str, kind: Kind, types: tuple[str, ...]) -> dict[str, Any]:
+    if not folder.is_dir():
+        raise InputError(f"{name}: there is no folder {folder}. {_how(kind, folder)}")
+    path = folder / "config.json"
+    if not path.is_file():
+        raise InputError(f"{name}: {folder} has no config.json. {_how(kind, folder)}")
+    config = read_json(path)
+    if config.get("model_type") not in types:
+        raise InputError(
+            f"{name}: {path} is of model_type {config.get('model_type')!r}, expected {' or '.join(map(repr, types))}. "
+            f"{_how(kind, folder)}"
+        )
+    return config
+
+
+def _how(kind: Kind, folder: Path) -> str:
+    return (
+        f"Place these files there: {_FILES[kind]}. They are published on the Hugging Face hub, for instance as "
+        f"{_ASK[kind]}: on a machine with a network, `hf download MODEL_ID --local-dir {folder}`; this program itself "
+        "fetches nothing"
+    )
+
+
+def _weight_files(folder: Path, name: str, kind: Kind) -> list[Path]:
+    for single in ("model.safetensors", "pytorch_model.bin"):
+        if (folder / single).is_file():
+            return [folder / single]
+        index = folder / f"{single}.index.json"
+        if index.is_file():
+            parts = sorted({folder / str(part) for part in read_json(index).get("weight_map", {}).values()})
+            missing = [part.name for part in parts if not part.is_file()]
+            if missing or not parts:
+                raise InputError(f"{name}: {index} names {', '.join(missing) or 'no files'}, not in {folder}")
+            return parts
+    raise InputError(f"{name}: {folder} has no model.safetensors and no pytorch_model.bin. {_how(kind, folder)}")
+
+
+def _load(model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device) -> tuple[Any, list[Path]]:
+    files = _weight_files(folder, name, kind)
+    try:
+        with _silent():
+            model, said = model_class.from_pretrained(
+                str(folder), local_files_only=True, output_loading_info=True, dtype=torch.float32,
+                use_safetensors=files[0].suffix == ".safetensors",
+            )  # fmt: skip
+    except InputError:
+        raise
+    except Exception as error:  # transformers raises many kinds for files that do not fit each other
+        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise InputError(f"{name}: the weights in {folder} cannot be loaded: {first}; fetch its files again") from None
+    absent = sorted(str(key) for key in said["missing_keys"])
+    if absent:
+        raise InputError(
+            f"{name}: {files[0]} lacks {len(absent)} tensors that config.json calls for, {absent[0]} first; the files "
+            f"are not of one model. {_how(kind, folder)}"
+        )
+    bad = next((key for key, value in model.state_dict().items() if not bool(torch.isfinite(value).all())), None)
+    if bad is not None:
+        raise InputError(f"{name}: {bad} in {files[0]} is NaN or infinite; fetch the file again")
+    return model.to(device).eval().requires_grad_(False), files
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Neither its progress bar nor its advice: what matters of it is checked here and raised."""
+    from transformers.utils import logging as chatter
+
+    level, bars = chatter.get_verbosity(), chatter.is_progress_bar_enabled()
+    chatter.set_verbosity(logging.CRITICAL)
+    chatter.disable_progress_bar()
+    try:
+        yield
+    finally:
+        chatter.set_verbosity(level)
+        if bars:
+            chatter.enable_progress_bar()
+
+
+def _tokenizer(folder: Path, name: str) -> Any:
+    """A ``tokenizers.Tokenizer`` that neither pads nor cuts."""
+    from tokenizers import Tokenizer
+
+    whole, vocabulary, merges = (folder / file for file in ("tokenizer.json", "vocab.json", "merges.txt"))
+    if whole.is_file():
+        try:
+            tokenizer = Tokenizer.from_str(whole.read_text(encoding="utf-8"))
+        except Exception as error:  # the Rust side raises a bare Exception
+            raise InputError(f"{name}: {whole}: not a tokenizer ({error}); fetch the file again") from None
+    elif vocabulary.is_file() and merges.is_file():
+        from transformers import CLIPTokenizer
+
+        lines = merges.read_text(encoding="utf-8").splitlines()
+        pairs = [tuple(line.split()) for line in lines if line.strip() and not line.startswith("#version")]
+        odd = next((pair for pair in pairs if len(pair) != 2), None)
+        if odd is not None:
+            raise InputError(f"{name}: {merges}: a line reads {' '.join(odd)!r}, expected two words; fetch it again")
+        try:
+            # By value and by these names: an older version's vocab_file= is ignored, and leaves two tokens.
+            built: Any = CLIPTokenizer
+            tokenizer = built(vocab=read_json(vocabulary), merges=pairs)._tokenizer
+        except InputError:
+            raise
+        except Exception as error:  # as above
+            raise InputError(f"{name}: {vocabulary} and {merges} do not fit each other ({error})") from None
+    else:
+        raise InputError(
+            f"{name}: {folder} has no tokenizer.json, nor vocab.json with merges.txt. {_how('clip', folder)}"
+        )
+    tokenizer.no_padding()
+    tokenizer.no_truncation()
+    return tokenizer
+
+
+def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> None:
+    """Refuse a tokenizer that is not this model's; the network would read the wrong token and say nothing."""
+    first, last = tokenizer.encode("a").ids[0], tokenizer.encode("a").ids[-1]
+    top = max(tokenizer.get_vocab().values())
+    # 2 is what old files say whatever the tokenizer; the network then takes the highest number, as the first ones did.
+    expected = top if config.eos_token_id == 2 else config.eos_token_id
+    if first == last or last != expected or top >= config.vocab_size:
+        raise InputError(
+            f"{name}: the tokenizer in {folder} has {top + 1} tokens and ends a text with {last}, the model in "
+            f"config.json knows {config.vocab_size} and expects {expected}; the files are not of one model"
+        )
+
+
+def _pooled(output: Any) -> torch.Tensor:
+    """Versions of transformers differ: an object with a pooled part, or that part itself."""
+    return output if isinstance(output, torch.Tensor) else output.pooler_output
+
+
+__all__ = ["Clip", "Dino", "load_clip", "load_dinov2"]

@@ -1,0 +1,78 @@
+"""Threads for kernels that release the GIL.
+
+Python's own threads, not numba's parallel loops: numba's "workqueue" layer aborts when two threads enter it at once,
+its OpenMP layer aborts after a fork, and both multiply the time it takes to compile. These may be called from any
+thread of any process, forked or not.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+_lock = threading.Lock()
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+
+def _forget() -> None:
+    # A forked child has the pool's bookkeeping but none of its threads.
+    global _lock
+    _lock = threading.Lock()
+    _pools.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
+
+
+_chosen: int | None = None
+
+
+def set_thread_count(threads: int | None) -> None:
+    """Use so many threads from now on, whatever torch is set to; None: torch's setting again.
+
+    A fit spends the rest of its time in tensor operations too small to gain from torch's threads, which then only
+    wait, and wait by spinning.
+    """
+    global _chosen
+    if threads is not None and threads < 1:
+        raise ValueError(f"threads: got {threads}, expected at least 1")
+    _chosen = threads
+
+
+def thread_count() -> int:
+    """Threads to use: those chosen, or else torch's own setting, ``torch.set_num_threads``."""
+    return _chosen or max(1, torch.get_num_threads())
+
+
+def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
+    """Call work(*job) for every job, on up to :func:`thread_count` threads; jobs must not write to the same place."""
+    threads = min(thread_count(), len(jobs))
+    if threads <= 1:
+        for job in jobs:
+            work(*job)
+        return
+    with _lock:
+        pool = _pools.setdefault(threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="attnwarp-render"))
+    pending = list(jobs)[::-1]
+
+    def drain() -> None:
+        while True:
+            try:
+                job = pending.pop()
+            except IndexError:
+                return
+            work(*job)
+
+    helpers = [pool.submit(drain) for _ in range(threads - 1)]
+    drain()
+    for helper in helpers:
+        helper.result()
+
+
+def ranges(length: int, size: int) -> list[tuple[int, int]]:
+    """(begin, end) of consecutive pieces of ``size``; independent of the number of threads."""
+    return [(begin, min(begin + size, length)) for begin in range(0, length, size)]

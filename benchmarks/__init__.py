@@ -1,0 +1,1 @@
+"""Benchmarks that a person can run; no part of the library."""

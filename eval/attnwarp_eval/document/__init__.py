@@ -1,0 +1,1 @@
+"""Documents: sections, tables, figures and pictures, written as Markdown and as one HTML file."""

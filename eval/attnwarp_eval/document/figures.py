@@ -1,0 +1,219 @@
+"""Figures of the report, as SVG whose bytes depend on the numbers alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.statistics.intervals import Interval, front
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from matplotlib.axes import Axes
+    from matplotlib.text import Annotation
+    from matplotlib.transforms import BboxBase
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
+"""Okabe and Ito's colours, which people with any kind of colour vision can tell apart."""
+
+MARKERS = "osD^vP*X"
+
+
+@contextmanager
+def drawing(
+    path: Path, columns: int = 1, height: float = 3.4, *, rows: int = 1, width: float | None = None
+) -> Iterator[list[Axes]]:
+    """A figure of ``rows`` x ``columns`` axes, row by row, saved on leaving without a date or random ids.
+
+    Args:
+        path: of the SVG.
+        height, width: of the whole figure, in inches; 5.4 a column if ``width`` is left out.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    style: dict[Any, Any] = {
+        "svg.hashsalt": "attnwarp",
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "grid.alpha": 0.25,
+        "legend.frameon": False,
+        "legend.fontsize": 8,
+    }
+    with matplotlib.rc_context(style):
+        figure, axes = plt.subplots(
+            rows, columns, figsize=(width or 5.4 * columns, height), squeeze=False, layout="constrained"
+        )
+        yield list(axes.flat)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, metadata={"Date": None, "Creator": None})
+        plt.close(figure)
+
+
+@dataclass
+class Line:
+    """One line of a chart: y (with an optional interval) over x."""
+
+    name: str
+    x: Sequence[float]
+    y: Sequence[Interval]
+
+
+def lines(
+    axes: Axes,
+    series: Sequence[Line],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    share: bool = False,
+    log: bool = False,
+    legend: bool = True,
+) -> None:
+    """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from 0 to 1."""
+    for i, line in enumerate(series):
+        mean = np.array([v.mean for v in line.y])
+        keep = np.isfinite(mean)
+        if not keep.any():
+            continue
+        where = np.asarray(line.x, dtype=float)[keep]
+        low = np.array([v.low if v.known else v.mean for v in line.y])[keep]
+        high = np.array([v.high if v.known else v.mean for v in line.y])[keep]
+        shift = (i - (len(series) - 1) / 2) * 0.8
+        bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
+        axes.errorbar(
+            where + shift, mean[keep], yerr=bars, color=PALETTE[i % len(PALETTE)], marker=MARKERS[i % len(MARKERS)],
+            markersize=4.5, linewidth=1.4, elinewidth=0.8, capsize=2, label=line.name,
+        )  # fmt: skip
+    axes.set(xlabel=x, ylabel=y)
+    axes.set_title(title, loc="left", fontsize=9.5)
+    if log:
+        axes.set_yscale("log")
+    if share:
+        axes.set_ylim(-0.03, 1.03)
+    if legend:
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+
+
+def heatmap(
+    axes: Axes,
+    values: npt.NDArray[np.float64],
+    *,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    framed: npt.NDArray[np.bool_],
+    title: str,
+) -> None:
+    """Shares as coloured cells with their numbers: blue toward 1, white at 0.5, red toward 0; undefined ones grey.
+
+    Args:
+        values: (R, C) in [0, 1], NaN where undefined.
+        rows, columns: R and C titles.
+        framed: (R, C) cells that get a frame.
+    """
+    import matplotlib as mpl
+    from matplotlib.patches import Rectangle
+
+    axes.grid(False)
+    colors = mpl.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
+    axes.pcolormesh(np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1)
+    for (i, j), value in np.ndenumerate(values):
+        shown = f"{value:.2f}" if np.isfinite(value) else "–"
+        dark = np.isfinite(value) and abs(value - 0.5) > 0.33
+        axes.text(j + 0.5, i + 0.5, shown, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+        if framed[i, j]:
+            axes.add_patch(Rectangle((j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"))
+    axes.set_xticks(np.arange(len(columns)) + 0.5, columns, rotation=30, ha="right")
+    axes.set_yticks(np.arange(len(rows)) + 0.5, rows)
+    axes.tick_params(length=0)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.invert_yaxis()
+    axes.set_title(title, loc="left", fontsize=9.5)
+
+
+def cost_front(
+    axes: Axes,
+    points: Mapping[str, tuple[Interval, Interval]],
+    *,
+    x: str,
+    y: str,
+    title: str,
+    log: bool = True,
+) -> list[str]:
+    """Error against seconds with intervals on both axes; the front as a staircase, dominated points in grey.
+
+    ``log``: whether the error's axis is logarithmic, as that of seconds always is.
+
+    Returns:
+        The names on the front, cheapest first.
+    """
+    names = list(points)
+    cost = [points[n][0].mean for n in names]
+    error = [points[n][1].mean for n in names]
+    kept = front(cost, error)
+    notes = []
+    for i, name in enumerate(names):
+        seconds, quality = points[name]
+        if not (np.isfinite(seconds.mean) and np.isfinite(quality.mean)):
+            continue
+        on = i in kept
+        colour = PALETTE[0] if on else "#999999"
+        # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above it.
+        axes.errorbar(
+            seconds.mean, quality.mean, color=colour, marker="o" if on else "x", markersize=5, linewidth=0,
+            elinewidth=0.8, capsize=2, xerr=_bars(seconds), yerr=_bars(quality),
+        )  # fmt: skip
+        notes.append(
+            axes.annotate(
+                name,
+                (seconds.mean, quality.mean),
+                textcoords="offset points",
+                xytext=(5, 5),
+                fontsize=7.5,
+                color=colour,
+            )
+        )
+    if kept:
+        axes.step(
+            [cost[i] for i in kept], [error[i] for i in kept], where="post", color=PALETTE[0], linewidth=1, alpha=0.6
+        )
+    axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log" if log else "linear")
+    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.margins(0.2)
+    _move_apart(axes, notes)
+    return [names[i] for i in kept]
+
+
+def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:
+    """Raise each note, from the lowest on, until it covers none of those below."""
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.draw_without_rendering()
+    points = 72 / figure.dpi
+    settled: list[BboxBase] = []
+    for note in sorted(notes, key=lambda note: note.get_window_extent().y0):
+        box = note.get_window_extent()
+        raised = 0.0
+        while covered := [other for other in settled if box.overlaps(other)]:
+            up = max(other.y1 for other in covered) - box.y0 + 1
+            box, raised = box.translated(0, up), raised + up
+        note.xyann = (5, 5 + raised * points)
+        settled.append(box)
+
+
+def _bars(value: Interval) -> list[list[float]] | None:
+    if not value.known:
+        return None
+    low = max(value.low, value.mean / 20)
+    return [[max(value.mean - low, 0.0)], [max(value.high - value.mean, 0.0)]]

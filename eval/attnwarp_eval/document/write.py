@@ -1,0 +1,72 @@
+"""A report as Markdown and as one self-contained HTML file."""
+
+from __future__ import annotations
+
+import base64
+import html
+import mimetypes
+import re
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from attnwarp_eval.document.model import Report
+
+_CLASSES = {
+    "seen": "holds",
+    "not seen": "fails",
+    "better": "better",
+    "worse": "worse",
+    "holds": "holds",
+    "does not hold": "fails",
+    "FAILED": "fails",
+}
+
+
+def inline(text: str) -> Markup:
+    """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) have been set."""
+    escaped = html.escape(text, quote=False)
+    escaped = re.sub(r"`(#[0-9a-f]{6})`", r'<span class="swatch" style="background:\1"></span>', escaped)
+    escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
+    return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped))
+
+
+def _css(cell: str) -> Markup:
+    if cell in _CLASSES:
+        return Markup(f' class="{_CLASSES[cell]}"')
+    return Markup(' class="wide"') if len(cell) > 40 else Markup("")
+
+
+def _embedder(root: Path):  # type: ignore[no-untyped-def]
+    def embed(path: str) -> str:
+        kind = mimetypes.guess_type(path)[0] or "application/octet-stream"
+        return f"data:{kind};base64,{base64.b64encode((root / path).read_bytes()).decode()}"
+
+    return embed
+
+
+def markdown(report: Report) -> str:
+    """The report as Markdown; pictures are links relative to the run's folder."""
+    environment = Environment(
+        loader=PackageLoader("attnwarp_eval.document", "."),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        autoescape=False,
+    )
+    text = environment.get_template("report.md.j2").render(report=report)
+    return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+
+
+def page(report: Report, root: Path) -> str:
+    """The report as one HTML file with every picture inside it."""
+    environment = Environment(
+        loader=PackageLoader("attnwarp_eval.document", "."),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        autoescape=True,
+    )
+    environment.filters.update(inline=inline, css=_css, embed=_embedder(root))
+    return environment.get_template("report.html.j2").render(report=report) + "\n"

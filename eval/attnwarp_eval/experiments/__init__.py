@@ -1,0 +1,1 @@
+"""Experiments about the instrument itself: what truth costs, what optical flow misses, how long the suite takes."""

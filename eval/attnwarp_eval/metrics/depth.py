@@ -1,0 +1,65 @@
+"""Is the depth right? Depth along the optical axis and normals against truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from attnwarp.warp.view import angle_between
+from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
+
+
+def depth_error(
+    depth: Any, true_depth: Any, *, normal: Any = None, true_normal: Any = None, edge: Any = None
+) -> dict[str, float]:
+    """Errors of a depth map, and of a normal map where both are given.
+
+    Args:
+        depth: (H, W) depth along the optical axis; NaN, infinite or not positive is undefined.
+        true_depth: (H, W), NaN where there is no surface.
+        normal, true_normal: (H, W, 3) world normals that face the camera, of any length.
+        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the band apart too.
+
+    Returns:
+        Figures of :data:`attnwarp_eval.metrics.registry.METRICS`. Means are over pixels with a surface and a depth; the delta
+        shares over all pixels with a surface: one without a depth is not within anything. NaN where there is nothing to
+        measure.
+    """
+    truth = floats(true_depth, ("H", "W"), "true_depth")
+    estimate = floats(depth, truth.shape, "depth")
+    band = None if edge is None else mask(edge, truth.shape, "edge")
+    if (normal is None) != (true_normal is None):
+        raise ValueError("normal, true_normal: got one of them, expected both or neither")
+    angle = None
+    if normal is not None:
+        ours = floats(normal, (*truth.shape, 3), "normal")
+        exact = floats(true_normal, (*truth.shape, 3), "true_normal")
+        angle = angle_between(torch.tensor(ours), torch.tensor(exact)).numpy()
+    surface = np.isfinite(truth)
+    defined = np.isfinite(estimate) & (np.nan_to_num(estimate) > 0)
+    figures: dict[str, float] = {}
+    for suffix, region in regions(band, truth.shape).items():
+        total = int((surface & region).sum())
+        among = surface & region & defined
+        z, exact_z = estimate[among], truth[among]
+        error, ratio = z - exact_z, z / exact_z
+        ratio = np.maximum(ratio, 1 / ratio)
+        figures |= {
+            f"depth.abs_rel{suffix}": mean(np.abs(error) / exact_z),
+            f"depth.rmse{suffix}": float(np.sqrt(mean(error**2))),
+            f"depth.bias{suffix}": mean(error),
+            f"depth.bias_relative{suffix}": mean(error / exact_z),
+            f"depth.bias_median{suffix}": quantile(error / exact_z, 0.5),
+            f"depth.delta_1_01{suffix}": share(int((ratio < 1.01).sum()), total),
+            f"depth.delta_1_25{suffix}": share(int((ratio < 1.25).sum()), total),
+            f"depth.coverage{suffix}": share(int(among.sum()), total),
+            f"depth.pixels{suffix}": total,
+            f"depth.phantom{suffix}": int((~surface & defined & region).sum()),
+        }
+        if angle is not None:
+            degrees = angle[surface & region & np.isfinite(angle)]
+            figures[f"depth.normal_mean{suffix}"] = mean(degrees)
+            figures[f"depth.normal_median{suffix}"] = quantile(degrees, 0.5)
+    return figures

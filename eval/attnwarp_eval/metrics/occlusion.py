@@ -1,0 +1,158 @@
+"""Does the mask know what the source could not see?
+
+Truth has three classes for a pixel that shows a surface: visible, hidden (occluded, turned away) and ambiguous, and
+those whose point falls outside the source image or behind its camera. Ambiguous pixels are counted and not scored.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from attnwarp import check
+from attnwarp_eval.metrics.arrays import mask, regions, share
+from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+
+COUNTS = (
+    "visible_accepted",
+    "visible_rejected",
+    "hidden_accepted",
+    "hidden_rejected",
+    "outside_accepted",
+    "outside_rejected",
+    "behind_accepted",
+    "behind_rejected",
+    "empty_accepted",
+    "ambiguous_accepted",
+    "ambiguous_rejected",
+)
+"""The counts :func:`confusion` gives. "outside" is surface whose point is not in the source image, points behind the
+camera included; "behind" those alone. "empty" is background."""
+
+Counts = dict[str, int]
+
+
+def confusion(accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None) -> Counts:
+    """What a mask did with each class of pixel.
+
+    Args:
+        accepted: (H, W) bool, the mask to judge.
+        label: (H, W) 0 none, 1 visible, 2 hidden, 3 ambiguous.
+        surface: (H, W) bool, the target pixel shows a surface at all.
+        behind: (H, W) bool, the surface's point lies behind the source camera.
+        among: (H, W) bool, the pixels to count; all of them if left out.
+
+    Returns:
+        One integer for each of :data:`COUNTS`.
+    """
+    truth = np.asarray(label)
+    check.shape(truth, ("H", "W"), "label")
+    if not np.isin(truth, (NONE, VISIBLE, HIDDEN, AMBIGUOUS)).all():
+        raise ValueError(f"label: got values {np.unique(truth).tolist()}, expected 0 to {AMBIGUOUS}")
+    kept = mask(accepted, truth.shape, "accepted")
+    has = mask(surface, truth.shape, "surface")
+    counted = np.ones(truth.shape, dtype=bool) if among is None else mask(among, truth.shape, "among")
+    back = np.zeros(truth.shape, dtype=bool) if behind is None else mask(behind, truth.shape, "behind")
+    outside = (truth == NONE) & has
+    classes = {
+        "visible": truth == VISIBLE,
+        "hidden": truth == HIDDEN,
+        "outside": outside,
+        "behind": outside & back,
+        "ambiguous": truth == AMBIGUOUS,
+    }
+    counts = {"empty_accepted": int(((truth == NONE) & ~has & kept & counted).sum())}
+    for name, member in classes.items():
+        counts[f"{name}_accepted"] = int((member & kept & counted).sum())
+        counts[f"{name}_rejected"] = int((member & ~kept & counted).sum())
+    return {name: counts[name] for name in COUNTS}
+
+
+def scores(counts: Mapping[str, int]) -> dict[str, float]:
+    """Precision, recall, F1 and both error rates from :func:`confusion`'s counts, summed over as many views as wished.
+
+    A mask that accepts nothing has no precision, and a view in which nothing is visible has no recall, no false
+    negative rate and no F1: NaN. Accepted background counts against precision and F1, and not in the false positive
+    rate, whose base is surface that the source does not show: a large sky would dilute it.
+    """
+    tp, fn = counts["visible_accepted"], counts["visible_rejected"]
+    unseen = counts["hidden_accepted"] + counts["outside_accepted"]
+    fp = unseen + counts["empty_accepted"]
+    tn = counts["hidden_rejected"] + counts["outside_rejected"]
+    return {
+        "occlusion.precision": share(tp, tp + fp),
+        "occlusion.recall": share(tp, tp + fn),
+        "occlusion.f1": share(2 * tp, 2 * tp + fp + fn) if tp + fn else float("nan"),
+        "occlusion.false_positive_rate": share(unseen, unseen + tn),
+        "occlusion.false_negative_rate": share(fn, tp + fn),
+        "occlusion.behind_share": share(counts["behind_accepted"], tp + fp),
+        "occlusion.hidden_share": share(counts["hidden_accepted"], tp + fp),
+    }
+
+
+def mask_error(accepted: Any, label: Any, surface: Any, behind: Any = None, edge: Any = None) -> dict[str, float]:
+    """Scores and counts of a mask; with ``edge`` also for the interior and the band around edges apart.
+
+    Args:
+        accepted, label, surface, behind: as in :func:`confusion`.
+        edge: (H, W) bool, the band around edges.
+    """
+    shape = np.asarray(label).shape
+    band = None if edge is None else mask(edge, shape, "edge")
+    figures: dict[str, float] = {}
+    for suffix, region in regions(band, shape).items():
+        counts = confusion(accepted, label, surface, behind, region)
+        figures |= {f"{name}{suffix}": value for name, value in scores(counts).items()}
+        figures |= {f"occlusion.{name}{suffix}": value for name, value in counts.items()}
+    return figures
+
+
+@dataclass(frozen=True)
+class YawBin:
+    """Views whose yaw lies in [low, high), the last bin with its upper end.
+
+    Attributes:
+        low, high: degrees.
+        views: how many views fell in.
+        counts: their counts, summed.
+        scores: of the sums, NaN where undefined.
+    """
+
+    low: float
+    high: float
+    views: int
+    counts: Counts
+    scores: dict[str, float]
+
+
+def by_yaw(
+    rows: Iterable[tuple[float, Mapping[str, int]]], edges: Sequence[float] = (0, 15, 30, 60, 90, 120, 150, 180)
+) -> list[YawBin]:
+    """Counts of views, summed in bins of yaw.
+
+    Args:
+        rows: yaw in degrees, of either sign and folded to [0, 180], and the counts of :func:`confusion`.
+        edges: ends of the bins, rising from 0 to 180.
+
+    Returns:
+        One entry for each bin, empty ones included: their scores are NaN.
+    """
+    ends = [float(edge) for edge in edges]
+    if len(ends) < 2 or ends[0] != 0 or ends[-1] != 180 or any(a >= b for a, b in itertools.pairwise(ends)):
+        raise ValueError(f"edges: got {list(edges)}, expected rising degrees from 0 to 180")
+    sums = [dict.fromkeys(COUNTS, 0) for _ in ends[1:]]
+    views = [0] * len(sums)
+    for yaw, counts in rows:
+        folded = abs((float(yaw) + 180) % 360 - 180)
+        index = min(int(np.searchsorted(ends, folded, side="right")) - 1, len(sums) - 1)
+        views[index] += 1
+        for name in COUNTS:
+            sums[index][name] += int(counts[name])
+    return [
+        YawBin(low, high, n, total, scores(total))
+        for low, high, n, total in zip(ends, ends[1:], views, sums, strict=False)
+    ]

@@ -1,0 +1,217 @@
+"""What every figure is: its unit, which way is better, and how closely two runs of it must agree.
+
+Nothing heavy is imported here, so that reports and comparisons can read it without the checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+Direction = Literal["higher", "lower", "zero", "none"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The specification of one figure.
+
+    Attributes:
+        name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
+            (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
+        unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "dE00" (CIEDE2000), "share" (of 1),
+            "ratio", "cosine" (of embeddings, -1 to 1), "pixels" or "views" (counts).
+        direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
+            describe.
+        atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
+        description: one line for a reader of a report.
+        version: raised when the figure's numbers change meaning.
+    """
+
+    name: str
+    unit: str
+    direction: Direction
+    atol: float
+    rtol: float
+    description: str
+    version: int = 1
+
+    @property
+    def is_count(self) -> bool:
+        """Whether it only describes how much was measured, and is no figure of quality."""
+        return self.unit in ("pixels", "views") and self.direction == "none"
+
+
+class Registry(dict[str, Metric]):
+    """Metrics by name, which also answers to a result's key, whatever region or size stands behind the name."""
+
+    def __missing__(self, key: str) -> Metric:
+        name = ".".join(key.split(".")[:2])
+        if name == key or name not in self:
+            raise KeyError(key)
+        return self[name]
+
+
+_DISAGREEMENT: tuple[tuple[str, str, Direction, float, float, str], ...] = (
+    ("mae_linear", "ratio", "lower", 1e-5, 1e-2, "mean absolute colour difference of two views in linear light"),
+    ("rmse_linear", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in linear light"),
+    ("rmse_srgb", "ratio", "lower", 1e-5, 1e-2, "RMS colour difference of two views in sRGB"),
+    ("delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 between two views"),
+    ("delta_e_p95", "dE00", "lower", 1e-2, 1e-2, "95th percentile of CIEDE2000 between two views"),
+    ("share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
+    ("pixels", "pixels", "none", 0, 0, "pixels compared"),
+)
+
+_SPECS = (
+    Metric(
+        "calibration.mitsuba_agrees", "share", "higher", 1e-3, 0, "pixels whose point Mitsuba finds as the ray caster"
+    ),
+    Metric("warp.epe_median", "px", "lower", 1e-4, 1e-3, "median endpoint error, visible pixels"),
+    Metric("warp.epe_p95", "px", "lower", 1e-3, 1e-2, "95th percentile of the endpoint error, visible pixels"),
+    Metric("warp.epe_mean", "px", "lower", 1e-3, 1e-2, "mean endpoint error, visible pixels"),
+    Metric("warp.epe_median_layer", "layer px", "lower", 1e-4, 1e-3, "median endpoint error on the feature grid"),
+    Metric("warp.epe_p95_layer", "layer px", "lower", 1e-3, 1e-2, "95th percentile of it on the feature grid"),
+    Metric("warp.below_half_px", "share", "higher", 1e-4, 0, "visible pixels warped to within 0.5 px"),
+    Metric("warp.below_1px", "share", "higher", 1e-4, 0, "visible pixels warped to within 1 px"),
+    Metric("warp.below_2px", "share", "higher", 1e-4, 0, "visible pixels warped to within 2 px"),
+    Metric("warp.coverage", "share", "higher", 1e-4, 0, "visible pixels that have a position"),
+    Metric("warp.visible", "pixels", "none", 0, 0, "pixels that the source truly shows"),
+    Metric("warp.feature_accepted", "ratio", "lower", 1e-4, 1e-3, "relative feature error, accepted visible pixels"),
+    Metric("warp.feature_visible", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all visible pixels"),
+    Metric("warp.feature_all_accepted", "ratio", "lower", 1e-4, 1e-3, "relative feature error, all accepted"),
+    Metric("warp.feature_pixels", "pixels", "none", 0, 0, "accepted visible feature pixels"),
+    Metric("occlusion.precision", "share", "higher", 1e-4, 0, "of what the mask accepts, truly visible"),
+    Metric("occlusion.recall", "share", "higher", 1e-4, 0, "of what is truly visible, accepted"),
+    Metric("occlusion.f1", "share", "higher", 1e-4, 0, "harmonic mean of precision and recall"),
+    Metric("occlusion.false_positive_rate", "share", "lower", 1e-4, 0, "of surface not visible, accepted"),
+    Metric("occlusion.false_negative_rate", "share", "lower", 1e-4, 0, "of what is truly visible, rejected"),
+    Metric("occlusion.behind_share", "share", "lower", 1e-4, 0, "of what the mask accepts, behind the source camera"),
+    Metric("occlusion.hidden_share", "share", "lower", 1e-4, 0, "of what the mask accepts, hidden from the source"),
+    Metric("occlusion.visible_accepted", "pixels", "none", 0, 0, "visible pixels accepted"),
+    Metric("occlusion.visible_rejected", "pixels", "none", 0, 0, "visible pixels rejected"),
+    Metric("occlusion.hidden_accepted", "pixels", "none", 0, 0, "hidden pixels accepted"),
+    Metric("occlusion.hidden_rejected", "pixels", "none", 0, 0, "hidden pixels rejected"),
+    Metric("occlusion.outside_accepted", "pixels", "none", 0, 0, "pixels accepted whose point is not in the source"),
+    Metric("occlusion.outside_rejected", "pixels", "none", 0, 0, "pixels rejected whose point is not in the source"),
+    Metric("occlusion.behind_accepted", "pixels", "none", 0, 0, "pixels behind the source camera accepted"),
+    Metric("occlusion.behind_rejected", "pixels", "none", 0, 0, "pixels behind the source camera rejected"),
+    Metric("occlusion.empty_accepted", "pixels", "none", 0, 0, "pixels without a surface accepted"),
+    Metric("occlusion.ambiguous_accepted", "pixels", "none", 0, 0, "ambiguous pixels accepted, not scored"),
+    Metric("occlusion.ambiguous_rejected", "pixels", "none", 0, 0, "ambiguous pixels rejected, not scored"),
+    Metric("fit.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of a view held out from the fit"),
+    Metric("fit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of a view held out from the fit"),
+    Metric("fit.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of a view held out from the fit (11 x 11, sigma 1.5)"),
+    Metric("depth.abs_rel", "ratio", "lower", 1e-5, 1e-2, "mean of |z - z*| / z*"),
+    Metric("depth.rmse", "scene", "lower", 1e-5, 1e-2, "root mean square of z - z*"),
+    Metric("depth.bias", "scene", "zero", 1e-5, 1e-2, "mean of z - z*; negative is toward the camera"),
+    Metric("depth.bias_relative", "ratio", "zero", 1e-5, 1e-2, "mean of (z - z*) / z*; negative is toward the camera"),
+    Metric("depth.bias_median", "ratio", "zero", 1e-5, 1e-2, "median of (z - z*) / z*; negative is toward the camera"),
+    Metric("depth.delta_1_01", "share", "higher", 1e-4, 0, "pixels with max(z / z*, z* / z) < 1.01"),
+    Metric("depth.delta_1_25", "share", "higher", 1e-4, 0, "pixels with max(z / z*, z* / z) < 1.25"),
+    Metric("depth.normal_mean", "deg", "lower", 1e-2, 1e-2, "mean angle to the true normal"),
+    Metric("depth.normal_median", "deg", "lower", 1e-2, 1e-2, "median angle to the true normal"),
+    Metric("depth.coverage", "share", "higher", 1e-4, 0, "pixels with a surface that have a depth"),
+    Metric("depth.pixels", "pixels", "none", 0, 0, "pixels with a surface"),
+    Metric("depth.phantom", "pixels", "none", 0, 0, "pixels with a depth and no surface"),
+    # Float32 networks on other processors agree to 1e-6; the rest of atol is for pictures that differ by rounding.
+    Metric("embedding.clip_similarity", "cosine", "higher", 1e-3, 0, "CLIP: render against the target prompt"),
+    Metric("embedding.clip_directional", "cosine", "higher", 2e-3, 0, "CLIP: change of the view against the prompt's"),
+    Metric("embedding.clip_image", "cosine", "higher", 1e-3, 0, "CLIP: render against the edited source view"),
+    Metric("embedding.dino_image", "cosine", "higher", 1e-3, 0, "DINO: render against the edited source view"),
+    Metric("embedding.undefined", "views", "lower", 0, 0, "views whose embedding or change has no direction"),
+    Metric("perceptual.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance of edited picture and render"),
+    # Image metrics, consistency and fidelity: attnwarp_eval.metrics, docs/metrics.md.
+    Metric("image.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of sRGB values"),
+    Metric("image.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR of sRGB values; infinite for equal pictures"),
+    Metric("image.mse_linear", "ratio", "lower", 1e-6, 1e-2, "mean squared error in linear light"),
+    Metric("image.psnr_linear", "dB", "higher", 1e-2, 1e-3, "PSNR in linear light; infinite for equal pictures"),
+    Metric("image.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM of sRGB values (11 x 11, sigma 1.5, whole windows)"),
+    Metric("image.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM of sRGB values, five scales, from 176 px"),
+    Metric("image.pixels", "pixels", "none", 0, 0, "pixels compared"),
+    Metric("edit.psnr_pooled", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: PSNR of the mean MSE over the views"),
+    Metric("edit.psnr_mean", "dB", "higher", 1e-2, 1e-3, "Edit PSNR: mean of the views' finite PSNRs"),
+    Metric("edit.psnr", "dB", "higher", 1e-2, 1e-3, "Edit PSNR of one view, whose name stands behind"),
+    Metric("edit.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error of one view, whose name stands behind"),
+    Metric("edit.views", "views", "none", 0, 0, "edited views that were compared"),
+    Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
+    Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
+    *(
+        Metric(f"consistency.{prefix}{name}", unit, direction, atol, rtol, f"{what}, {where}")
+        for prefix, where in (
+            ("", "at exact correspondences"),
+            ("flow_", "along optical flow"),
+            ("flow_same_", "along optical flow at the pixels of the exact figure"),
+        )
+        for name, unit, direction, atol, rtol, what in _DISAGREEMENT
+    ),
+    Metric("consistency.flow_gap_mae_linear", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_gap_rmse_srgb", "ratio", "zero", 1e-5, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_gap_delta_e", "dE00", "zero", 1e-3, 1e-2, "flow's figure minus the exact one"),
+    Metric("consistency.flow_ratio_delta_e", "ratio", "none", 1e-3, 1e-2, "flow's figure over the exact one"),
+    Metric("consistency.flow_epe_median", "px", "lower", 1e-2, 1e-2, "median endpoint error of the optical flow"),
+    Metric(
+        "consistency.flow_epe_p95", "px", "lower", 1e-1, 1e-2, "95th percentile of the optical flow's endpoint error"
+    ),
+    Metric("consistency.flow_below_1px", "share", "higher", 1e-3, 0, "visible pixels with flow to within 1 px"),
+    Metric(
+        "consistency.flow_epe_median_accepted",
+        "px",
+        "lower",
+        1e-2,
+        1e-2,
+        "median endpoint error where flow's check passes",
+    ),
+    Metric(
+        "consistency.flow_epe_p95_accepted",
+        "px",
+        "lower",
+        1e-1,
+        1e-2,
+        "95th percentile of it where flow's check passes",
+    ),
+    Metric("consistency.flow_recall", "share", "higher", 1e-3, 0, "of the visible pixels, flow's check passes"),
+    Metric(
+        "consistency.flow_false", "share", "lower", 1e-3, 0, "of what flow's check passes, not visible in the source"
+    ),
+    Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit"),
+    Metric("fidelity.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the truth of the edit"),
+    Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),
+    Metric("fidelity.ms_ssim", "ratio", "higher", 1e-4, 1e-3, "MS-SSIM against the truth of the edit"),
+    Metric("fidelity.distance", "ratio", "lower", 1e-4, 1e-2, "perceptual distance to the truth of the edit"),
+    Metric(
+        "fidelity.preserved_mse", "ratio", "lower", 1e-6, 1e-2, "MSE against the unedited picture, outside the object"
+    ),
+    Metric(
+        "fidelity.preserved_psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the unedited picture, outside the object"
+    ),
+    Metric(
+        "fidelity.preserved_ssim",
+        "ratio",
+        "higher",
+        1e-4,
+        1e-3,
+        "SSIM against the unedited picture, outside the object",
+    ),
+    Metric(
+        "fidelity.preserved_distance",
+        "ratio",
+        "lower",
+        1e-4,
+        1e-2,
+        "distance to the unedited picture, outside the object",
+    ),
+    Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
+)
+
+METRICS = Registry({metric.name: metric for metric in _SPECS})
+"""Every figure the checks give."""
+
+
+def metric(key: str) -> Metric:
+    """The specification behind a result's key. KeyError: no such metric."""
+    return METRICS[key]
+
+
+def at_size(figures: Mapping[str, float], size: int) -> dict[str, float]:
+    """The same figures, named for a feature size: ``warp.epe_median`` becomes ``warp.epe_median.64``."""
+    return {f"{name}.{size}": value for name, value in figures.items()}

@@ -1,0 +1,93 @@
+"""Is the warp right? Endpoint error of its positions, and error of the features that it carries."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
+
+
+def endpoint_error(xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, image_px: Any = 1.0) -> dict[str, float]:
+    """Distance between where a warp looks and where it should look.
+
+    Args:
+        xy: (H, W, 2) source positions of the warp, NaN where undefined.
+        true_xy: (H, W, 2) exact source positions on the same grid.
+        visible: (H, W) bool, pixels whose surface the source truly shows; only these are scored.
+        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the band apart too.
+        image_px: size of one unit of ``xy`` in image pixels, or (x, y) sizes: 8 on the 64 grid of a 512 image.
+
+    Returns:
+        Figures of :data:`attnwarp_eval.metrics.registry.METRICS` in image pixels, and ``_layer`` ones in the units of ``xy``. The
+        shares are of all visible pixels: one without a position is not within anything. Median, percentile and mean are
+        over those that have one, with ``coverage`` beside them. NaN where there is nothing to measure.
+    """
+    truth = floats(true_xy, ("H", "W", 2), "true_xy")
+    shape = truth.shape[:2]
+    estimate = floats(xy, truth.shape, "xy")
+    seen = mask(visible, shape, "visible")
+    band = None if edge is None else mask(edge, shape, "edge")
+    if not np.isfinite(truth[seen]).all():
+        raise ValueError("true_xy: not finite in a visible pixel; positions and labels do not belong together")
+    offset = estimate - truth
+    layer = np.hypot(offset[..., 0], offset[..., 1])
+    scaled = offset * np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
+    image = np.hypot(scaled[..., 0], scaled[..., 1])
+    defined = np.isfinite(layer)
+    figures: dict[str, float] = {}
+    for suffix, region in regions(band, shape).items():
+        total = int((seen & region).sum())
+        among = seen & region & defined
+        px, own = image[among], layer[among]
+        figures |= {
+            f"warp.epe_median{suffix}": quantile(px, 0.5),
+            f"warp.epe_p95{suffix}": quantile(px, 0.95),
+            f"warp.epe_mean{suffix}": mean(px),
+            f"warp.epe_median_layer{suffix}": quantile(own, 0.5),
+            f"warp.epe_p95_layer{suffix}": quantile(own, 0.95),
+            f"warp.below_half_px{suffix}": share(int((px < 0.5).sum()), total),
+            f"warp.below_1px{suffix}": share(int((px < 1).sum()), total),
+            f"warp.below_2px{suffix}": share(int((px < 2).sum()), total),
+            f"warp.coverage{suffix}": share(int(among.sum()), total),
+            f"warp.visible{suffix}": total,
+        }
+    return figures
+
+
+def feature_error(warped: Any, exact: Any, accepted: Any, visible: Any, edge: Any = None) -> dict[str, float]:
+    """Error of warped features where the exact answer is known: sqrt(sum (warped - exact)^2 / sum exact^2).
+
+    Args:
+        warped: (C, h, w) features as warped; what stands outside ``accepted`` counts in ``feature_visible`` alone.
+        exact: (C, h, w) the field at the target's own surface points
+            (:meth:`attnwarp_eval.truth.features.SolidField.on_grid`).
+        accepted: (h, w) bool, the warp's mask.
+        visible: (h, w) bool, pixels whose surface the source truly shows.
+        edge: (h, w) bool, the band around edges.
+
+    Returns:
+        ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible ones,
+        ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is injected. NaN where there is
+        nothing to measure.
+    """
+    truth = floats(exact, ("C", "H", "W"), "exact")
+    shape = truth.shape[1:]
+    estimate = floats(warped, truth.shape, "warped")
+    kept, seen = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
+    band = None if edge is None else mask(edge, shape, "edge")
+    surface = np.isfinite(truth).all(axis=0)
+    square = ((estimate - truth) ** 2).sum(axis=0)
+    power = (truth**2).sum(axis=0)
+    figures: dict[str, float] = {}
+    for suffix, region in regions(band, shape).items():
+        groups = {"accepted": kept & seen, "visible": seen, "all_accepted": kept & surface}
+        for name, group in groups.items():
+            among = group & region
+            total = float(power[among].sum())
+            figures[f"warp.feature_{name}{suffix}"] = (
+                float(np.sqrt(square[among].sum() / total)) if total > 0 else float("nan")
+            )
+        figures[f"warp.feature_pixels{suffix}"] = int((kept & seen & region).sum())
+    return figures

@@ -1,0 +1,148 @@
+"""Edits with truth: what an instruction does to a scene, so that the edited scene can be rendered from everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene.materials import TEXTURED
+from attnwarp_eval.scene.spec import AnswerSpec, EditSpec, ObjectChange, ObjectSpec, SceneSpec
+from attnwarp_eval.scene.textures import linear_rgb
+from attnwarp_eval.scene.transport import contradictions
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of linear sRGB (Rec. 709)."""
+
+WHITE = "#ffffff"
+
+
+def pick(edit: EditSpec, answer: str | None = None) -> AnswerSpec | None:
+    """The answer of that name; the first if left out; None for an edit with one result.
+
+    Raises:
+        ValueError: there is no such answer.
+    """
+    if answer is None:
+        return edit.answers[0] if edit.answers else None
+    for one in edit.answers:
+        if one.name == answer:
+            return one
+    known = ", ".join(one.name for one in edit.answers) or "none: its result is the only one"
+    raise ValueError(f"edit {edit.name!r}: no answer {answer!r}; it has {known}")
+
+
+def apply(spec: SceneSpec, edit: EditSpec, answer: AnswerSpec | None = None) -> SceneSpec:
+    """The scene that an edit means, without edits of its own.
+
+    Raises:
+        ValueError: it changes what is not there, or what it makes is no scene.
+    """
+    does = answer or edit
+    objects = list(spec.objects)
+    places = {item.name: k for k, item in enumerate(objects)}
+    for change in does.changes:
+        if change.object not in places:
+            raise ValueError(f"edit {edit.name!r}: there is no object {change.object!r}")
+        k = places[change.object]
+        objects[k] = changed(objects[k], change)
+    return spec.model_copy(
+        update={
+            "name": "-".join([spec.name, edit.name, *([answer.name] if answer else [])]),
+            "title": f"{spec.title}: {edit.instruction}",
+            "objects": tuple(objects),
+            "lights": spec.lights if does.lights is None else does.lights,
+            "edits": (),
+        }
+    )
+
+
+def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
+    """One object after a change.
+
+    Raises:
+        ValueError: ``recolor`` names a colour that the object does not have.
+    """
+    said = item.model_dump(mode="json", exclude_unset=True)
+    if change.recolor:
+        met: set[str] = set()
+        said = _recolored(said, change.recolor, met)
+        missing = sorted(set(change.recolor) - met)
+        if missing:
+            raise ValueError(f"recolor: {item.name!r} has no colour {missing[0]!r}; it has {', '.join(_colors(said))}")
+    if change.texture is not None:
+        said["texture"] = change.texture.model_dump(mode="json")
+    if change.paint is not None:
+        for part in said["shape"].get("parts", ()):
+            if part.get("color", WHITE) not in change.keep:
+                part["color"] = WHITE
+        if "texture" in said:
+            said["texture"] = _painted(said["texture"], change.paint)
+    if change.material is not None:
+        said["material"] = change.material.model_dump(mode="json")
+        if not isinstance(change.material, TEXTURED):
+            said.pop("texture", None)
+    return type(item).model_validate(said)
+
+
+def _recolored(said: Any, colors: dict[str, str], met: set[str]) -> Any:
+    if isinstance(said, dict):
+        return {key: _recolored(value, colors, met) for key, value in said.items()}
+    if isinstance(said, list):
+        return [_recolored(value, colors, met) for value in said]
+    if isinstance(said, str) and said in colors:
+        met.add(said)
+        return colors[said]
+    return said
+
+
+def _colors(said: Any) -> list[str]:
+    if isinstance(said, dict):
+        said = list(said.values())
+    if isinstance(said, list):
+        return sorted({color for value in said for color in _colors(value)})
+    return [said] if isinstance(said, str) and said.startswith("#") else []
+
+
+def _painted(texture: dict[str, Any], paint: str) -> dict[str, Any]:
+    """The texture in shades of one colour: each of its colours keeps its lightness relative to the lightest."""
+    colors = _colors(texture)
+    light = {color: float(LUMINANCE @ np.array(linear_rgb(color))) for color in colors}
+    brightest = max(light.values()) or 1.0
+    shades = {color: _hex(np.array(linear_rgb(paint)) * (light[color] or 1e-3) / brightest) for color in colors}
+    painted: dict[str, Any] = _recolored(texture, shades, set())
+    return painted
+
+
+def _hex(linear: npt.NDArray[np.float64]) -> str:
+    return "#" + "".join(f"{round(255 * float(c)):02x}" for c in to_srgb(np.clip(linear, 0, 1)))
+
+
+def problems(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
+    """What is wrong with a scene's edits: message, and where in the file it stands."""
+    seen: dict[str, int] = {}
+    for k, edit in enumerate(spec.edits):
+        if edit.name in seen:
+            yield (
+                f"edits[{k}].name: {edit.name!r} is also the name of edits[{seen[edit.name]}]; rename one",
+                ("edits", k),
+            )
+        seen[edit.name] = k
+        names = [answer.name for answer in edit.answers]
+        if len(set(names)) < len(names):
+            yield f"edits[{k}].answers: two of them have one name ({', '.join(names)}); rename one", ("edits", k)
+        for answer in edit.answers or (None,):
+            try:
+                result = apply(spec, edit, answer)
+            except ValidationError as error:
+                yield f"edits[{k}]: {error.errors(include_url=False)[0]['msg']}", ("edits", k)
+                continue
+            except ValueError as error:
+                yield f"edits[{k}]: {error}; objects are {', '.join(o.name for o in spec.objects)}", ("edits", k)
+                continue
+            for message, _ in contradictions(result):
+                yield f"edits[{k}]: makes a scene that contradicts itself: {message}", ("edits", k)

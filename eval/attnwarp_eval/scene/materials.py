@@ -1,0 +1,194 @@
+"""What a scene file may say about light beyond sun, sky and diffuse surfaces: materials, lamps, fog, lens, effects.
+
+All of it is a description; :mod:`attnwarp_eval.scene.transport` says what light transport it calls for.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field, field_validator, model_validator
+
+from attnwarp_eval.scene.textures import Color, Spec
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0)]
+
+# Materials -----------------------------------------------------------------------------------------------------------
+
+
+class DiffuseMaterial(Spec):
+    """Scatters light evenly; its colour is the object's texture. What an object is unless it says otherwise."""
+
+    type: Literal["diffuse"] = "diffuse"
+
+
+class MirrorMaterial(Spec):
+    """Reflects all light that meets it, times ``tint``."""
+
+    type: Literal["mirror"]
+    tint: Color = "#ffffff"
+
+
+class MetalMaterial(Spec):
+    """A conductor with measured indices of refraction; ``roughness`` 0 is polished, above that GGX."""
+
+    type: Literal["metal"]
+    metal: Literal["Ag", "Al", "Au", "Cr", "Cu", "W"] = "Al"
+    roughness: float = Field(0.0, ge=0, le=1)
+    tint: Color = "#ffffff"
+
+    @field_validator("roughness")
+    @classmethod
+    def _not_nearly_smooth(cls, value: float) -> float:
+        return _roughness(value)
+
+
+class PlasticMaterial(Spec):
+    """A diffuse base in the object's texture under a rough (GGX) dielectric coat.
+
+    A smooth coat would be diffuse and specular at once, and light through it could not be counted once: see
+    docs/effects.md.
+    """
+
+    type: Literal["plastic"]
+    ior: float = Field(1.49, gt=1, le=3)
+    roughness: float = Field(0.1, ge=0.01, le=1)
+
+
+class InteriorSpec(Spec):
+    """What fills a glass object: light is scattered and absorbed inside (subsurface scattering).
+
+    ``sigma_t`` is the extinction per scene unit, ``albedo`` times ``tint`` the share that is scattered, ``g`` the mean
+    cosine of the scattering angle (Henyey-Greenstein).
+    """
+
+    sigma_t: Positive
+    albedo: float = Field(0.9, ge=0, le=1)
+    tint: Color = "#ffffff"
+    g: float = Field(0.0, gt=-0.99, lt=0.99)
+
+
+class GlassMaterial(Spec):
+    """A dielectric. ``thin`` means a pane without thickness, which shifts nothing; ``roughness`` above 0 is frosted.
+
+    ``abbe`` tells how strongly real glass of this kind disperses. Dispersion is not simulated; it is named.
+    """
+
+    type: Literal["glass"]
+    ior: float = Field(1.5, gt=1, le=3)
+    roughness: float = Field(0.0, ge=0, le=1)
+    thin: bool = False
+    tint: Color = "#ffffff"
+    interior: InteriorSpec | None = None
+    abbe: Positive | None = None
+
+    @field_validator("roughness")
+    @classmethod
+    def _not_nearly_smooth(cls, value: float) -> float:
+        return _roughness(value)
+
+    @model_validator(mode="after")
+    def _a_pane_has_no_inside(self) -> GlassMaterial:
+        if self.thin and (self.roughness or self.interior):
+            raise ValueError("got thin glass with roughness or an interior, but a thin pane has neither; drop 'thin'")
+        return self
+
+
+def _roughness(value: float) -> float:
+    if 0 < value < 0.01:
+        raise ValueError(
+            f"got {value}, expected 0 (smooth) or at least 0.01: below that rendering only makes noise of it"
+        )
+    return value
+
+
+Material = Annotated[
+    DiffuseMaterial | MirrorMaterial | MetalMaterial | PlasticMaterial | GlassMaterial, Field(discriminator="type")
+]
+
+TEXTURED = (DiffuseMaterial, PlasticMaterial)
+"""Materials whose colour is the object's texture; the others have a ``tint``."""
+
+
+class EmissionSpec(Spec):
+    """Light that a surface sends out evenly, in radiance. Rectangles shine where they face, closed shapes outward."""
+
+    radiance: Positive
+    color: Color = "#ffffff"
+
+
+# Lights --------------------------------------------------------------------------------------------------------------
+
+
+class PointSpec(Spec):
+    """A lamp without size. ``intensity`` in power per solid angle: at distance d it gives intensity / d^2."""
+
+    type: Literal["point"]
+    position: Vector
+    intensity: Positive
+    color: Color = "#ffffff"
+
+
+class SpotSpec(Spec):
+    """A lamp without size that shines into a cone about ``target``, falling off from ``beam`` to ``cutoff`` degrees."""
+
+    type: Literal["spot"]
+    position: Vector
+    target: Vector
+    intensity: Positive
+    color: Color = "#ffffff"
+    cutoff: float = Field(25.0, gt=0, lt=90)
+    beam: float | None = Field(None, gt=0, lt=90)
+
+
+# Medium, lens, effects -----------------------------------------------------------------------------------------------
+
+
+class BoundsSpec(Spec):
+    """An upright box."""
+
+    center: Vector
+    size: tuple[Positive, Positive, Positive]
+
+
+class MediumSpec(InteriorSpec):
+    """Homogeneous fog in a ``box``; without one it fills the smallest box about all objects, lamps and cameras."""
+
+    box: BoundsSpec | None = None
+
+
+class LensSpec(Spec):
+    """A thin lens. ``aperture`` is its radius; sharp is what lies ``focus`` away along the optical axis.
+
+    Without ``focus`` that is the point the cameras look at.
+    """
+
+    aperture: Positive
+    focus: Positive | None = None
+
+
+Effect = Literal[
+    "geometry", "direct", "shadows", "interreflection", "glossy", "specular", "refraction", "medium", "subsurface",
+    "caustics", "environment", "depth_of_field", "textures", "motion", "polarisation", "dispersion",
+]  # fmt: skip
+"""Everything that light may do and a scene may call for, simulated or not."""
+
+EFFECTS: tuple[Effect, ...] = get_args(Effect)
+
+NOT_SIMULATED: tuple[Effect, ...] = ("motion", "polarisation", "dispersion")
+"""Effects that pictures never show; a scene that calls for one is told so."""
+
+
+class EffectsSpec(Spec):
+    """``pin``: what the scene is about, so it must be there and is simulated. ``forbid``: what it must not need."""
+
+    pin: tuple[Effect, ...] = ()
+    forbid: tuple[Effect, ...] = ()
+
+
+__all__ = [
+    "EFFECTS", "NOT_SIMULATED", "TEXTURED", "BoundsSpec", "DiffuseMaterial", "Effect", "EffectsSpec", "EmissionSpec",
+    "GlassMaterial", "InteriorSpec", "LensSpec", "Material", "MediumSpec", "MetalMaterial", "MirrorMaterial",
+    "PlasticMaterial", "PointSpec", "Positive", "SpotSpec", "Vector",
+]  # fmt: skip

@@ -1,0 +1,276 @@
+"""A scene: what its file says, as cameras, shapes and hashes."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.errors import InputError, suggest
+from attnwarp_eval.cache import content_key
+from attnwarp_eval.scene import shapes
+from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.edits import apply, pick
+from attnwarp_eval.scene.materials import Vector
+from attnwarp_eval.scene.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.spec import (
+    BoxSpec,
+    CamerasSpec,
+    EditSpec,
+    MeshSpec,
+    ObjectSpec,
+    RectangleSpec,
+    SceneSpec,
+    SphereSpec,
+    ViewSpec,
+)
+from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
+
+Array = npt.NDArray[np.float64]
+
+SCENE_PROTOCOL = 1
+"""Raised whenever the same file would mean another world (shapes, textures, lights); part of every content hash."""
+
+
+class SceneError(InputError):
+    """A scene file that cannot be used: names the file, the line where it can, what came, and the remedy."""
+
+    def __init__(self, message: str, path: Path | str | None = None, line: int | None = None) -> None:
+        self.path = path
+        self.line = line
+        place = "" if path is None else f"{path}:{line}: " if line else f"{path}: "
+        super().__init__(place + message)
+
+
+class Scene:
+    """A checked scene.
+
+    Attributes:
+        spec: what the file says.
+        path: the file, or None for one made in code; mesh files are relative to its folder.
+    """
+
+    def __init__(self, spec: SceneSpec, path: Path | None = None) -> None:
+        self.spec = spec
+        self.path = path
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, {len(self.spec.objects)} objects, 1 + {len(self.spec.cameras.targets)} cameras)"
+
+    @property
+    def name(self) -> str:
+        """Short name, also the file's."""
+        return self.spec.name
+
+    @property
+    def title(self) -> str:
+        """A line for people."""
+        return self.spec.title
+
+    @property
+    def description(self) -> str:
+        """What the scene is for."""
+        return self.spec.description
+
+    @property
+    def object_names(self) -> list[str]:
+        """Names of the objects; the index is the object id."""
+        return [item.name for item in self.spec.objects]
+
+    @property
+    def center(self) -> Array:
+        """(3,) float64 the point that the cameras look at."""
+        return np.array(self.spec.cameras.look_at)
+
+    @functools.cached_property
+    def cameras(self) -> list[Camera]:
+        """The source, then the targets."""
+        orbit = self.spec.cameras
+        return [orbit_camera(orbit, view, k) for k, view in enumerate([orbit.source, *orbit.targets])]
+
+    @property
+    def source(self) -> Camera:
+        """The source camera."""
+        return self.cameras[0]
+
+    @property
+    def targets(self) -> list[Camera]:
+        """The target cameras."""
+        return self.cameras[1:]
+
+    def camera(self, name: str) -> Camera:
+        """The camera of that name.
+
+        Raises:
+            SceneError: there is none.
+        """
+        for camera in self.cameras:
+            if camera.name == name:
+                return camera
+        raise SceneError(f"no camera {name!r}{suggest(name, [c.name for c in self.cameras])}", self.path)
+
+    @property
+    def edits(self) -> tuple[EditSpec, ...]:
+        """The edits whose results are known."""
+        return self.spec.edits
+
+    def edit(self, name: str) -> EditSpec:
+        """The edit of that name.
+
+        Raises:
+            SceneError: there is none.
+        """
+        for edit in self.edits:
+            if edit.name == name:
+                return edit
+        known = [edit.name for edit in self.edits]
+        raise SceneError(
+            f"no edit {name!r}{suggest(name, known)}; {self.name} has {', '.join(known) or 'none'}", self.path
+        )
+
+    def edited(self, name: str, answer: str | None = None) -> Scene:
+        """The scene after an edit: the same shapes and cameras, other surfaces or lights.
+
+        Args:
+            name: an edit of :attr:`edits`.
+            answer: which of an ambiguous edit's answers; its first if left out.
+
+        Raises:
+            SceneError: there is no such edit or answer.
+        """
+        edit = self.edit(name)
+        try:
+            return Scene(apply(self.spec, edit, pick(edit, answer)), self.path)
+        except ValueError as error:
+            raise SceneError(str(error), self.path) from error
+
+    def with_size(self, width: int, height: int) -> Scene:
+        """The same scene with images of ``width`` x ``height``; the vertical field of view stays."""
+        cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
+        return Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
+
+    def shapes(self) -> list[Shape]:
+        """Everything that has a surface, in world coordinates, each with its object's index as ``object_id``."""
+        return [shape for k, item in enumerate(self.spec.objects) for shape in self._build(item, k)]
+
+    def _build(self, item: ObjectSpec, object_id: int) -> Iterator[Shape]:
+        spec = item.shape
+        match spec:
+            case SphereSpec():
+                yield Sphere(np.array(spec.center), spec.radius, object_id)
+            case RectangleSpec():
+                n = np.array(spec.facing) / np.linalg.norm(spec.facing)
+                u = np.cross([0.0, 0.0, 1.0], n) if abs(n[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
+                u = u - n * (u @ n)
+                u /= np.linalg.norm(u)
+                v = np.cross(n, u)
+                yield Rectangle(np.array(spec.center), u * spec.size[0] / 2, v * spec.size[1] / 2, object_id)
+            case BoxSpec():
+                axes = _turn_z(spec.yaw) @ _turn_y(spec.pitch)
+                for k in range(spec.repeat.count if spec.repeat else 1):
+                    step = np.array(spec.repeat.step) * k if spec.repeat else np.zeros(3)
+                    yield Box(np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id)
+            case BodySpec():
+                yield _placed(spec.mesh(), _turn_z(spec.yaw), spec.scale, spec.position, object_id)
+            case MeshSpec():
+                path = self.mesh_path(spec)
+                try:
+                    mesh = shapes.read_mesh(path)
+                except ValueError as error:
+                    raise SceneError(str(error), self.path) from error
+                upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
+                yield _placed(mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id)
+            case TerrainSpec():
+                yield replace(spec.mesh(), object_id=object_id)
+            case ScatterSpec():
+                yield replace(spec.mesh(self._ground(spec)), object_id=object_id)
+
+    def _ground(self, spec: ScatterSpec) -> Callable[[Array], Array]:
+        """Height of what things are strewn on."""
+        for item in self.spec.objects:
+            if item.name == spec.on and isinstance(item.shape, TerrainSpec):
+                return item.shape.height_at
+            if item.name == spec.on and isinstance(item.shape, RectangleSpec):
+                level = item.shape.center[2]
+                return lambda xy: np.full(len(xy), level)
+        return lambda xy: np.full(len(xy), spec.center[2])
+
+    def mesh_path(self, spec: MeshSpec) -> Path:
+        """Where the mesh file of an object lies."""
+        base = self.path.parent if self.path else Path()
+        return base / Path(spec.file).expanduser()
+
+    @functools.cached_property
+    def world_hash(self) -> str:
+        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, fog, protocol versions."""
+        files = {
+            item.shape.file: hashlib.sha256(self.mesh_path(item.shape).read_bytes()).hexdigest()
+            for item in self.spec.objects
+            if isinstance(item.shape, MeshSpec)
+        }
+        said = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
+        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, said, files)
+
+    @functools.cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the protocol versions.
+
+        Edits are left out: they are other scenes, with hashes of their own.
+        """
+        return content_key("scene", self.world_hash, self.spec.model_dump(mode="json", exclude={"edits"}))
+
+
+def _turn_z(degrees: float) -> Array:
+    a = math.radians(degrees)
+    return np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1.0]])
+
+
+def _turn_y(degrees: float) -> Array:
+    a = math.radians(degrees)
+    return np.array([[math.cos(a), 0, math.sin(a)], [0, 1.0, 0], [-math.sin(a), 0, math.cos(a)]])
+
+
+def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int) -> Mesh:
+    moved = mesh.turned(R).moved(scale, position)
+    return Mesh(moved.vertices, moved.faces, moved.normals, moved.tint, object_id)
+
+
+def view_name(view: ViewSpec, index: int) -> str:
+    """The camera's name: its own, else 'source' for the first and 'yaw030' for the others."""
+    return view.name or ("source" if index == 0 else f"yaw{view.yaw:03g}".replace(".", "p").replace("-", "m"))
+
+
+def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
+    """The camera of a view: the source has index 0, the targets those after it."""
+    look_at = view.look_at or orbit.look_at
+    radius, yaw = view.radius or orbit.radius, math.radians(view.yaw)
+    position = (orbit.look_at[0] + radius * math.cos(yaw), orbit.look_at[1] + radius * math.sin(yaw), view.height)
+    return Camera.look_at(
+        position,
+        look_at,
+        width=orbit.size[0],
+        height=orbit.size[1],
+        fov_y=view.fov or orbit.fov,
+        name=view_name(view, index),
+    )
+
+
+def inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
+    """A test whether a point is inside the object. A body is asked by its distance, which needs no meshing."""
+    spec = item.shape
+    if isinstance(spec, BodySpec):
+        R, offset = _turn_z(spec.yaw), np.array(spec.position)
+        return lambda point: spec.contains((point - offset) @ R / spec.scale)
+    if isinstance(spec, TerrainSpec):
+        return spec.below
+    if isinstance(spec, ScatterSpec):
+        return lambda point: False  # blades and leaves have no inside, and stones are small
+    solids = list(scene._build(item, 0))
+    return lambda point: any(solid.contains(point) for solid in solids)

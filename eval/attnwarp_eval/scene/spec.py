@@ -1,0 +1,236 @@
+"""What may stand in a scene file: objects, lights, cameras, edits, as pydantic models.
+
+docs/scenes.md describes the format. Positions are in scene units (metres in the scenes that come with the package),
+angles in degrees, colours sRGB '#rrggbb', z up.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from attnwarp_eval.scene.bodies import BodySpec
+from attnwarp_eval.scene.materials import (
+    TEXTURED,
+    DiffuseMaterial,
+    EffectsSpec,
+    EmissionSpec,
+    LensSpec,
+    Material,
+    MediumSpec,
+    PointSpec,
+    Positive,
+    SpotSpec,
+    Vector,
+)
+from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
+from attnwarp_eval.scene.textures import LATER, Color, Direction, Plain, Spec, Texture
+
+
+class SphereSpec(Spec):
+    """A sphere, exact."""
+
+    type: Literal["sphere"]
+    center: Vector
+    radius: Positive
+
+
+class RectangleSpec(Spec):
+    """A flat rectangle, exact. ``size`` is width and height; a level one has its width along x."""
+
+    type: Literal["rectangle"]
+    center: Vector
+    size: tuple[Positive, Positive]
+    facing: Direction = (0.0, 0.0, 1.0)
+
+
+class Repeat(Spec):
+    """``count`` copies, each ``step`` further on."""
+
+    count: int = Field(ge=1, le=1000)
+    step: Vector
+
+
+class BoxSpec(Spec):
+    """A box of ``size`` (x, y, z), turned by ``yaw`` about the upright and tilted by ``pitch`` about its own y."""
+
+    type: Literal["box"]
+    center: Vector
+    size: tuple[Positive, Positive, Positive]
+    yaw: float = 0.0
+    pitch: float = 0.0
+    repeat: Repeat | None = None
+
+
+class MeshSpec(Spec):
+    """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright axis."""
+
+    type: Literal["mesh"]
+    file: str
+    position: Vector = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
+    scale: Positive = 1.0
+    up: Literal["y", "z"] = "z"
+
+
+ShapeSpec = Annotated[
+    SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec | TerrainSpec | ScatterSpec, Field(discriminator="type")
+]
+
+
+class ObjectSpec(Spec):
+    """One object: its index in the list is its object id.
+
+    ``texture`` colours diffuse and plastic things; mirrors, metal and glass have a ``tint``, and what shines is black.
+    """
+
+    name: str = Field(min_length=1)
+    shape: ShapeSpec
+    texture: Texture = Plain(type="plain", color="#ffffff", variation=0.0, grain=0.1)
+    material: Material = Field(DiffuseMaterial(), json_schema_extra=LATER)
+    emission: EmissionSpec | None = Field(None, json_schema_extra=LATER)
+    velocity: Vector | None = Field(None, json_schema_extra=LATER)
+
+    @model_validator(mode="after")
+    def _a_texture_where_it_shows(self) -> ObjectSpec:
+        shows = isinstance(self.material, TEXTURED) and self.emission is None
+        said = "texture" in self.model_fields_set
+        if shows and not said:
+            raise ValueError(f"got no texture, but {self.material.type} things need one; add 'texture: {{type: ...}}'")
+        if said and not isinstance(self.material, TEXTURED):
+            raise ValueError(f"got a texture, but {self.material.type} shows none; use the material's 'tint' instead")
+        if self.emission is not None and not isinstance(self.material, DiffuseMaterial):
+            raise ValueError(f"got emission and the material {self.material.type}; what shines has no other material")
+        return self
+
+
+class SunSpec(Spec):
+    """Parallel light. ``irradiance`` on a surface that faces it; a white one then shows irradiance / pi."""
+
+    type: Literal["sun"]
+    elevation: float = Field(gt=0, le=90)
+    azimuth: float
+    irradiance: float = Field(gt=0)
+    color: Color = "#ffffff"
+
+
+class SkySpec(Spec):
+    """Light from all around, and what a camera sees where it hits nothing: a ramp from ``horizon`` to ``zenith``."""
+
+    type: Literal["sky"]
+    horizon: Color
+    zenith: Color
+    radiance: float = Field(1.0, gt=0)
+
+
+LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discriminator="type")]
+
+
+class ViewSpec(Spec):
+    """One camera on the orbit; what it leaves out comes from ``cameras``."""
+
+    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")  # it becomes part of file names
+    yaw: float
+    height: float
+    radius: Positive | None = None
+    fov: float | None = Field(None, gt=0, lt=180)
+    look_at: Vector | None = None
+
+
+class CamerasSpec(Spec):
+    """An orbit about the upright through ``look_at``: horizontal ``radius``, vertical ``fov``, one source, targets."""
+
+    look_at: Vector
+    radius: Positive
+    fov: float = Field(45.0, gt=0, lt=180)
+    size: tuple[int, int] = (512, 512)
+    source: ViewSpec
+    targets: tuple[ViewSpec, ...] = Field(min_length=1)
+    lens: LensSpec | None = Field(None, json_schema_extra=LATER)
+
+
+class AppearanceSpec(Spec):
+    """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
+
+    ``bounces: unlimited`` follows light until it is gone; every surface and every scattering counts as a bounce.
+    """
+
+    bounces: Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"] = 1
+    spp: int = Field(default=16, ge=1, le=65536)
+
+
+class ObjectChange(Spec):
+    """What an edit does to one object. Its shape stays.
+
+    ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its colours shades of
+    one, but for those of its parts that ``keep`` lists.
+    """
+
+    object: str
+    texture: Texture | None = None
+    material: Material | None = None
+    recolor: dict[Color, Color] = Field(default_factory=dict)
+    paint: Color | None = None
+    keep: tuple[Color, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_way_of_colouring(self) -> ObjectChange:
+        said = [name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)]
+        if not said:
+            raise ValueError("got a change that changes nothing; add a texture, a material, recolor or paint")
+        if self.paint and (self.recolor or self.texture):
+            raise ValueError("got paint beside recolor or texture; keep one of them")
+        return self
+
+
+class AnswerSpec(Spec):
+    """One right answer to an ambiguous instruction."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    target: str
+    changes: tuple[ObjectChange, ...] = ()
+    lights: tuple[LightSpec, ...] | None = None
+
+
+class EditSpec(Spec):
+    """An edit whose result is known: what is asked for, the prompts, and what it does to the scene.
+
+    An ambiguous instruction has several ``answers``, each as right as the others.
+    """
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    instruction: str
+    source: str
+    target: str
+    changes: tuple[ObjectChange, ...] = ()
+    lights: tuple[LightSpec, ...] | None = None
+    answers: tuple[AnswerSpec, ...] = ()
+
+    @model_validator(mode="after")
+    def _does_something(self) -> EditSpec:
+        own = bool(self.changes) or self.lights is not None
+        if own == bool(self.answers):
+            raise ValueError("got an edit with both or neither of its own changes (or lights) and answers; keep one")
+        return self
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether more than one result is right."""
+        return bool(self.answers)
+
+
+class SceneSpec(Spec):
+    """A whole file."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$")
+    title: str
+    description: str = ""
+    units: str = "metres"
+    objects: tuple[ObjectSpec, ...] = Field(min_length=1)
+    lights: tuple[LightSpec, ...]
+    cameras: CamerasSpec
+    appearance: AppearanceSpec = Field(default_factory=AppearanceSpec)
+    medium: MediumSpec | None = Field(None, json_schema_extra=LATER)
+    effects: EffectsSpec = Field(EffectsSpec(), json_schema_extra=LATER)
+    edits: tuple[EditSpec, ...] = ()

@@ -1,0 +1,150 @@
+"""Which light transport the words of a scene file call for, and where they contradict each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from attnwarp_eval.scene.materials import (
+    NOT_SIMULATED,
+    TEXTURED,
+    DiffuseMaterial,
+    Effect,
+    GlassMaterial,
+    Material,
+    MetalMaterial,
+    MirrorMaterial,
+    PlasticMaterial,
+)
+from attnwarp_eval.scene.spec import SceneSpec, SkySpec
+
+VERTEX_COLORED = ("body", "mesh", "terrain", "scatter")
+"""Shapes whose colours lie in the vertices of their mesh."""
+
+
+def called_for(spec: SceneSpec) -> dict[Effect, str]:
+    """The effects that the words of a scene file call for, each with the words.
+
+    It reads the file alone, without rendering or loading anything; :mod:`attnwarp_eval.effects.detect` looks closer.
+    """
+    found: dict[Effect, str] = {"geometry": f"{len(spec.objects)} objects"}
+
+    def note(effect: Effect, evidence: str) -> None:
+        found.setdefault(effect, evidence)
+
+    lamps = [f"lights[{k}] is a {light.type}" for k, light in enumerate(spec.lights)]
+    lamps += [f"object {item.name!r} shines" for item in spec.objects if item.emission]
+    if lamps:
+        note("direct", lamps[0])
+        note("shadows", lamps[0])
+    small = [f"lights[{k}] is a {light.type}" for k, light in enumerate(spec.lights) if light.type != "sky"]
+    small += [f"object {item.name!r} shines" for item in spec.objects if item.emission]
+    bent: list[str] = []
+    polarising = False
+    for item in spec.objects:
+        if item.velocity is not None and any(item.velocity):
+            note("motion", f"object {item.name!r} has a velocity")
+        if item.emission:
+            continue
+        material, name = item.material, f"object {item.name!r} is {item.material.type}"
+        if isinstance(material, TEXTURED) and (item.texture.type != "plain" or item.texture.variation):
+            note("textures", f"object {item.name!r} has the texture {item.texture.type}")
+        if isinstance(material, DiffuseMaterial):
+            continue
+        rough = getattr(material, "roughness", 0.0)
+        note("glossy" if rough else "specular", f"{name}, roughness {rough:g}")
+        if not rough:
+            bent.append(name)
+            # A mirror here is ideal: it reflects both polarisations alike, so that only metal and glass tell them apart.
+            polarising |= not isinstance(material, MirrorMaterial)
+        if isinstance(material, GlassMaterial):
+            note("refraction", name)
+            if material.interior:
+                note("subsurface", f"{name} with an interior of sigma_t {material.interior.sigma_t:g}")
+            if material.abbe is not None:
+                note("dispersion", f"{name} of Abbe number {material.abbe:g}")
+    if bent and small:
+        note("caustics", f"{bent[0]}, and {small[0]}")
+    if "refraction" in found or (len(bent) > 1 and polarising):
+        note(
+            "polarisation", f"light meets specular surfaces more than once: {bent[0] if bent else found['refraction']}"
+        )
+    for k, light in enumerate(spec.lights):
+        if isinstance(light, SkySpec):
+            note("environment", f"lights[{k}] is a sky")
+    if spec.medium:
+        note("medium", f"medium of sigma_t {spec.medium.sigma_t:g}")
+    if spec.cameras.lens:
+        note("depth_of_field", f"cameras.lens has an aperture of {spec.cameras.lens.aperture:g}")
+    if spec.appearance.bounces != 1:
+        note("interreflection", f"appearance.bounces is {spec.appearance.bounces}")
+    return found
+
+
+_REMEDIES: dict[Effect, str] = {
+    "direct": "take away all lights",
+    "shadows": "take away all lights",
+    "interreflection": "say appearance.bounces: 1",
+    "glossy": "make the object diffuse",
+    "specular": "make the object diffuse",
+    "refraction": "make the object diffuse",
+    "medium": "take away 'medium'",
+    "subsurface": "take away the material's 'interior'",
+    "caustics": "take away the small light or the smooth object",
+    "environment": "take away the sky",
+    "depth_of_field": "take away cameras.lens",
+    "textures": "use plain textures without variation",
+    "motion": "take away the object's velocity",
+    "polarisation": "leave at most one specular surface",
+    "dispersion": "take away the material's 'abbe'",
+}
+
+
+def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
+    """What a scene file says that cannot all be true: message, and where in the file it stands."""
+    found = called_for(spec)
+    pinned, forbidden = spec.effects.pin, spec.effects.forbid
+    for k, effect in enumerate(forbidden):
+        where = ("effects", "forbid", k)
+        if effect == "geometry":
+            yield "effects.forbid: every picture needs the geometry; take it off the list", where
+        elif effect in pinned:
+            yield f"effects.forbid: {effect!r} is pinned as well; keep one of the two", where
+        elif effect in found:
+            yield (
+                f"effects.forbid: {effect!r} is forbidden, but the scene calls for it ({found[effect]}); "
+                f"{_REMEDIES[effect]}, or take {effect!r} off the list", where,
+            )  # fmt: skip
+    for k, effect in enumerate(pinned):
+        if effect in NOT_SIMULATED:
+            yield (f"effects.pin: {effect!r} is not simulated, so it cannot be pinned; take it off the list",
+                   ("effects", "pin", k))  # fmt: skip
+        elif effect not in found:
+            yield (
+                f"effects.pin: {effect!r} is pinned, but nothing here causes it; docs/effects.md says what does",
+                ("effects", "pin", k),
+            )
+    bounces = spec.appearance.bounces
+    for k, item in enumerate(spec.objects):
+        if isinstance(item.material, PlasticMaterial) and item.shape.type in VERTEX_COLORED:
+            # Mitsuba's roughplastic asks its texture for a mean, which colours of vertices have none of.
+            yield (
+                f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic can be a sphere, a box or a "
+                "rectangle; say diffuse or metal, or another shape", ("objects", k, "material"),
+            )  # fmt: skip
+        needed, why = _bounces_needed(item.material)
+        if not item.emission and bounces != "unlimited" and bounces < needed:
+            yield (
+                f"appearance.bounces: got {bounces}, but object {item.name!r} is {item.material.type}: {why}; "
+                f"say at least {needed}, or unlimited", ("objects", k, "material"),
+            )  # fmt: skip
+
+
+def _bounces_needed(material: Material) -> tuple[int, str]:
+    match material:
+        case GlassMaterial(thin=False):
+            return 3, "light passes in, out and then meets what lies behind"
+        case GlassMaterial():
+            return 2, "light passes through and then meets what lies behind"
+        case MirrorMaterial() | MetalMaterial(roughness=0.0):
+            return 2, "what it shows is a bounce further on"
+    return 1, ""

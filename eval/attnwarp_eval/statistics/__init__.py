@@ -1,0 +1,1 @@
+"""Statistics: intervals, paired differences, corrections for several tests."""

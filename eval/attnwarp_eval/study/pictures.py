@@ -1,0 +1,157 @@
+"""Pictures of one cell and view: what a person looks at beside the numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.warp.correspondence import sample
+from attnwarp.warp.view import Surface, WarpedView
+from attnwarp_eval.truth import Hits, TwoView
+from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+
+if TYPE_CHECKING:
+    from attnwarp_eval.world import World
+
+Image = npt.NDArray[np.float32]
+
+WIDTH = 256
+"""Pictures are reduced to this width: enough to see where a mask errs, and a report that can be mailed."""
+
+CLASSES: dict[str, tuple[str, str]] = {
+    "visible, accepted": ("#2ca25f", "right"),
+    "not visible, rejected": ("#4a4a4a", "right"),
+    "hidden, accepted": ("#e31a1c", "wrong"),
+    "outside the source image, accepted": ("#ff7f00", "wrong"),
+    "behind the source camera, accepted": ("#e7298a", "wrong"),
+    "visible, rejected": ("#1f78b4", "lost"),
+    "ambiguous, not scored": ("#d9d06b", "either"),
+}
+"""Colours of a mask against truth, and what each class means."""
+
+EPE_RANGE = (1e-2, 10.0)
+"""Pixels from the dark to the bright end of an endpoint error map, on a logarithmic scale."""
+
+DEPTH_RANGE = 0.02
+"""Relative depth error at the ends of the blue-white-red map: blue is too near, red too far."""
+
+
+def of(at: World, name: str, *, truth: TwoView, spp: int | None = None, view: WarpedView | None = None,
+       surface: Surface | None = None) -> dict[str, bytes]:  # fmt: skip
+    """JPEG files by what they show.
+
+    Args:
+        at: the scene.
+        name: the target view.
+        truth: of the pair, at image size.
+        spp: samples a pixel of the truth images.
+        view: the warp to show, or
+        surface: the depth to show.
+    """
+    found: dict[str, Image] = {}
+    if view is not None and spp is not None:
+        source, target = at.image(at.source.name, spp), at.image(name, spp)
+        found = {
+            "source": source,
+            "target": target,
+            "warped": warped(source, view),
+            "mask": mask_against_truth(view.mask.numpy(), truth, target),
+            "endpoint-error": endpoint_map(view.correspondence.xy.numpy(), truth),
+        }
+    if surface is not None:
+        found["depth-error"] = depth_map(np.asarray(surface.depth, dtype=np.float64), truth.hits)
+    return {what: jpeg(image) for what, image in found.items()}
+
+
+def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
+    """JPEG files of a view held out from a fit: its truth, what the splats show there, and their depth's error."""
+    depth = np.asarray(fitted.depth, dtype=np.float64)
+    found: dict[str, Image] = {
+        "target": (image / 255).astype(np.float32),
+        "render": np.asarray(fitted.image, dtype=np.float32),
+        "depth-error": depth_map(depth, hits),
+    }
+    return {what: jpeg(picture) for what, picture in found.items()}
+
+
+def jpeg(image: Image) -> bytes:
+    """An sRGB image in [0, 1], reduced to :data:`WIDTH`, as JPEG without chroma subsampling.
+
+    These pictures are for people; every number is taken from the arrays. As PNG a report of them has three times the
+    size.
+    """
+    import cv2
+
+    pixels: npt.NDArray[Any] = np.clip(np.rint(np.asarray(image) * 255), 0, 255).astype(np.uint8)
+    if pixels.shape[1] > WIDTH:
+        height = round(pixels.shape[0] * WIDTH / pixels.shape[1])
+        pixels = cv2.resize(pixels, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    how = [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    done, data = cv2.imencode(".jpg", pixels[..., ::-1], how)
+    if not done:
+        raise RuntimeError(f"JPEG encoding failed for an image of shape {pixels.shape}")
+    return data.tobytes()
+
+
+def rgb(color: str) -> npt.NDArray[np.float32]:
+    """(3,) of a '#rrggbb' colour."""
+    return np.array([int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)], dtype=np.float32)
+
+
+def checkered(shape: tuple[int, int], step: int = 16) -> Image:
+    """(H, W, 3) light grey squares: "nothing is here"."""
+    y, x = np.indices(shape) // step
+    return np.repeat((0.78 + 0.1 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.float32)
+
+
+def warped(source: Image, view: WarpedView) -> Image:
+    """The source image as the warp carries it to the target; squares where the mask rejects."""
+    image, _ = sample(torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1))), view.correspondence)
+    height, width = view.mask.shape
+    return np.where(view.mask.numpy()[..., None], image.permute(1, 2, 0).numpy(), checkered((height, width)))
+
+
+def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Image) -> Image:
+    """The mask in the colours of :data:`CLASSES` over the darkened target."""
+    label, surface = truth.label, truth.hits.valid
+    outside = (label == NONE) & surface
+    classes: dict[str, Any] = {
+        "visible, accepted": (label == VISIBLE) & mask,
+        "not visible, rejected": ((label == HIDDEN) | outside) & ~mask,
+        "hidden, accepted": (label == HIDDEN) & mask,
+        "outside the source image, accepted": outside & ~truth.behind & mask,
+        "behind the source camera, accepted": outside & truth.behind & mask,
+        "visible, rejected": (label == VISIBLE) & ~mask,
+        "ambiguous, not scored": label == AMBIGUOUS,
+    }
+    grey = target.mean(axis=2, keepdims=True).repeat(3, axis=2)
+    image = 0.35 * grey
+    for name, where in classes.items():
+        image = np.where(where[..., None], 0.35 * grey + 0.65 * rgb(CLASSES[name][0]), image)
+    return np.asarray(image, dtype=np.float32)
+
+
+def endpoint_map(xy: npt.NDArray[np.float64], truth: TwoView) -> Image:
+    """Endpoint error of truly visible pixels on a logarithmic scale; grey elsewhere, red where there is no position."""
+    import matplotlib
+
+    error = np.linalg.norm(xy - truth.xy, axis=-1)
+    low, high = np.log10(EPE_RANGE)
+    scaled = (np.log10(np.maximum(np.nan_to_num(error), 1e-12)) - low) / (high - low)
+    image = matplotlib.colormaps["viridis"](np.clip(scaled, 0, 1))[..., :3]
+    image = np.where(np.isfinite(error)[..., None], image, rgb("#b2182b"))
+    return np.where(truth.visible[..., None], image, 0.85).astype(np.float32)
+
+
+def depth_map(depth: npt.NDArray[np.float64], truth: Hits) -> Image:
+    """Signed relative depth error: blue too near, red too far, grey no surface, black no depth."""
+    import matplotlib
+
+    with np.errstate(invalid="ignore"):
+        error = (depth - truth.depth) / truth.depth
+    image = matplotlib.colormaps["RdBu_r"](np.clip(0.5 + 0.5 * np.nan_to_num(error) / DEPTH_RANGE, 0, 1))[..., :3]
+    image = np.where(np.isfinite(error)[..., None], image, 0.0)
+    return np.where(truth.valid[..., None], image, 0.7).astype(np.float32)

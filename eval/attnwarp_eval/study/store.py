@@ -1,0 +1,198 @@
+"""A run's folder. The truth is one JSON file a cell, written to a temporary file, flushed to disk, then renamed."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from attnwarp.errors import InputError
+from attnwarp_eval.files import digest
+
+FORMAT = 1
+"""Version of the layout of a cell's file; a reader refuses others."""
+
+
+class StoreError(InputError):
+    """A run's folder that cannot be used; the message says which and what to do."""
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write so that ``path`` either keeps its old content or has all of ``data``, even after a power cut."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+@dataclass
+class Problems:
+    """What :meth:`Store.verify` found."""
+
+    missing: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
+    unexpected: list[str] = field(default_factory=list)
+    checked: int = 0
+
+    @property
+    def ok(self) -> bool:
+        """Whether every expected cell is there and whole."""
+        return not (self.missing or self.failed or self.damaged)
+
+
+class Store:
+    """The folder of one run: ``study.json``, ``cells/``, ``failed/``, ``pictures/``."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        self.cells = self.root / "cells"
+        self.failed = self.root / "failed"
+        self.pictures = self.root / "pictures"
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the folder against a second run that would write to it."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        with (self.root / ".lock").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise StoreError(
+                    f"{self.root}: another run is writing to this folder; wait for it, or name another with --out"
+                ) from None
+            yield
+
+    def write_study(self, study: dict[str, Any]) -> None:
+        """Keep the resolved study and its expected cells. Cells of a former study in this folder stay."""
+        self.write_json(self.root / "study.json", study)
+
+    def read_study(self) -> dict[str, Any]:
+        """The resolved study.
+
+        Raises:
+            StoreError: the folder is not a run.
+        """
+        path = self.root / "study.json"
+        if not path.is_file():
+            raise StoreError(
+                f"{self.root}: not a run's folder (no study.json); "
+                f"make one with: attnwarp-eval run quick --out {self.root}"
+            )
+        try:
+            study: dict[str, Any] = json.loads(path.read_text())
+            if "cells" in study:
+                return study
+        except (ValueError, AttributeError):
+            pass
+        raise StoreError(f"{path}: damaged; run the study again with --out {self.root}, which writes it anew")
+
+    @staticmethod
+    def write_json(path: Path, value: Any) -> None:
+        """Atomic, readable JSON."""
+        write_atomic(path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+
+    def path(self, cell_id: str) -> Path:
+        """Where the record of a cell lies."""
+        return self.cells / f"{cell_id}.json"
+
+    def done(self) -> set[str]:
+        """Ids of the cells whose records are there (a file is only ever there whole)."""
+        return {p.stem for p in self.cells.glob("*.json")} if self.cells.is_dir() else set()
+
+    def write(self, record: dict[str, Any]) -> None:
+        """Keep a finished cell; ``record`` has at least ``id`` and ``spec``. A former failure of it is forgotten."""
+        sealed = {**record, "format": FORMAT}
+        sealed["sha256"] = digest(sealed)
+        self.write_json(self.path(record["id"]), sealed)
+        (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
+
+    def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
+        """Keep why a cell failed; it is tried again by the next run."""
+        self.write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
+
+    def failures(self) -> list[dict[str, Any]]:
+        """Failures of cells that have no record."""
+        done = self.done()
+        paths = sorted(self.failed.glob("*.json")) if self.failed.is_dir() else []
+        found = []
+        for path in paths:
+            if path.stem not in done:
+                with contextlib.suppress(ValueError):
+                    found.append(json.loads(path.read_text()))
+        return found
+
+    def read(self, cell_id: str) -> dict[str, Any]:
+        """The record of a finished cell.
+
+        Raises:
+            StoreError: the file is missing, damaged, or of another layout.
+        """
+        path = self.path(cell_id)
+        try:
+            record: dict[str, Any] = json.loads(path.read_text())
+        except FileNotFoundError:
+            raise StoreError(f"{path}: no such cell") from None
+        except ValueError as error:
+            raise StoreError(f"{path}: not JSON ({error}); delete it and run again") from None
+        problem = self._problem(cell_id, record)
+        if problem:
+            raise StoreError(f"{path}: {problem}; delete it and run again")
+        return record
+
+    def _problem(self, cell_id: str, record: dict[str, Any]) -> str | None:
+        if record.get("format") != FORMAT:
+            return f"format {record.get('format')!r}, expected {FORMAT}"
+        if digest(record.get("spec")) != cell_id:
+            return "the hash of its spec is not its id"
+        body = {k: v for k, v in record.items() if k != "sha256"}
+        if digest(body) != record.get("sha256"):
+            return "its checksum does not fit its content"
+        return None
+
+    def verify(self) -> Problems:
+        """Recompute every hash and compare with the list of expected cells."""
+        expected = {c["id"]: c["title"] for c in self.read_study()["cells"]}
+        problems = Problems()
+        done = self.done()
+        failed = {f["id"]: f for f in self.failures()}
+        for cell_id, title in expected.items():
+            if cell_id in done:
+                problems.checked += 1
+                try:
+                    record = self.read(cell_id)
+                except StoreError as error:
+                    problems.damaged.append(str(error))
+                    continue
+                problems.damaged += self._damaged_pictures(record)
+            elif cell_id in failed:
+                problems.failed.append(f"{title}: {failed[cell_id].get('error', 'failed')}")
+            else:
+                problems.missing.append(title)
+        problems.unexpected = sorted(done - set(expected))
+        return problems
+
+    def _damaged_pictures(self, record: dict[str, Any]) -> list[str]:
+        bad = []
+        for picture in record.get("pictures", []):
+            path = self.root / picture["path"]
+            if not path.is_file():
+                bad.append(f"{path}: missing; delete {self.path(record['id'])} and run again")
+            elif hashlib.sha256(path.read_bytes()).hexdigest() != picture["sha256"]:
+                bad.append(f"{path}: changed since it was written; delete {self.path(record['id'])} and run again")
+        return bad

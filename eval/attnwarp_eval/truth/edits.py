@@ -1,0 +1,75 @@
+"""Where the edits of a scene show: objects and pixels, and in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.scene.edits import pick
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.spec import ObjectChange
+from attnwarp_eval.truth import Hits
+
+
+def touched(scene: Scene, name: str, answer: str | None = None) -> list[int]:
+    """Object ids whose surfaces an edit changes; other things change by their light alone."""
+    edit = scene.edit(name)
+    does = pick(edit, answer) or edit
+    return [scene.object_names.index(change.object) for change in does.changes]
+
+
+def edit_mask(scene: Scene, name: str, hits: Hits, answer: str | None = None) -> npt.NDArray[np.bool_]:
+    """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the light.
+
+    Args:
+        hits: of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
+    """
+    edit = scene.edit(name)
+    if (pick(edit, answer) or edit).lights is not None:
+        return np.ones(hits.object_id.shape, dtype=bool)
+    return np.isin(hits.object_id, touched(scene, name, answer))
+
+
+def describe(scene: Scene) -> str:
+    """A scene's edits in words."""
+    if not scene.edits:
+        return f"{scene.name} names no edits"
+    lines = [f"{scene.name}: {scene.title}"]
+    for edit in scene.edits:
+        lines += ["", f"{edit.name}: {edit.instruction}", f"  from  {edit.source}", f"  to    {edit.target}"]
+        for does in edit.answers or (edit,):
+            what = [f"{change.object} ({', '.join(_kinds(change))})" for change in does.changes]
+            if does.lights is not None:
+                what.append("the light")
+            label = f"answer {does.name}" if edit.ambiguous else "changes"
+            lines.append(f"  {label}: {', '.join(what)}")
+    return "\n".join(lines)
+
+
+def _kinds(change: ObjectChange) -> Iterator[str]:
+    for name in ("texture", "material", "recolor", "paint"):
+        if getattr(change, name):
+            yield name
+
+
+def to_dict(scene: Scene) -> dict[str, Any]:
+    """A scene's edits as JSON can hold them, with the content hash of each result."""
+    return {
+        "scene": scene.name,
+        "content": scene.content_hash,
+        "edits": [
+            {
+                "name": edit.name, "instruction": edit.instruction, "source": edit.source, "target": edit.target,
+                "ambiguous": edit.ambiguous,
+                "results": [
+                    {"answer": one.name if one else None, "target": one.target if one else edit.target,
+                     "content": scene.edited(edit.name, one.name if one else None).content_hash}
+                    for one in edit.answers or (None,)
+                ],
+            }
+            for edit in scene.edits
+        ],
+    }  # fmt: skip

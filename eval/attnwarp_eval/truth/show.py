@@ -1,0 +1,108 @@
+"""Scenes for a person: what one contains, in words, and what its cameras see, in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth.plan import plan
+
+Image = npt.NDArray[Any]
+
+
+def describe(scene: Scene) -> str:
+    """A scene in words: objects, lights, cameras, and how its pictures are planned."""
+    spec = scene.spec
+    lines = [
+        f"{scene.name}: {scene.title}",
+        spec.description,
+        f"file {scene.path}",
+        f"content {scene.content_hash}",
+        "",
+    ]
+    lines.append(f"objects ({len(spec.objects)})")
+    for index, item in enumerate(spec.objects):
+        lines.append(f"  {index:2} {item.name:16} {item.shape.type:10} {item.texture.type}")
+    lines.append(f"lights: {', '.join(light.type for light in spec.lights)}")
+    lines.append(
+        f"cameras ({1 + len(scene.targets)}), {scene.source.width} x {scene.source.height} px, units {spec.units}"
+    )
+    for camera in scene.cameras:
+        x, y, z = camera.position
+        lines.append(f"  {camera.name:12} at ({x:.2f}, {y:.2f}, {z:.2f})")
+    lines.append("pictures are made by")
+    planned = plan(scene)
+    for step in planned.passes:
+        shining = ", ".join([spec.lights[k].type for k in step.lights] + ["lamps"] * step.lamps)
+        lines.append(f"  {step.integrator}, {step.spp} samples a pixel, light from {shining}")
+    lines += [f"  because {reason}" for reason in planned.reasons]
+    return "\n".join(lines)
+
+
+def render_views(
+    scene: Scene, out: Path, *, views: list[str] | None = None, spp: int | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Iterator[Path]:  # fmt: skip
+    """Write each view's picture, depth and normals as PNG, and one sheet of them all.
+
+    Args:
+        scene: at the image size wanted.
+        out: folder, made if it is missing.
+        views: names of cameras; all of them if left out.
+        spp: samples a pixel; the scene's own number if left out.
+        progress: told the name of the view at work.
+
+    Yields:
+        The files, as they are written; the sheet, ``sheet.png``, last.
+    """
+    from attnwarp_eval.colors import to_srgb
+    from attnwarp_eval.truth import Geometry, appearance
+
+    cameras = scene.cameras if views is None else [scene.camera(name) for name in views]
+    geometry = Geometry(scene)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for camera in cameras:
+        if progress:
+            progress(camera.name)
+        image = to_srgb(appearance(scene, camera, spp=spp))
+        hits = geometry.trace(camera)
+        pictures = {"image": image, "depth": depth_picture(hits.depth), "normal": normal_picture(hits.normal, camera)}
+        for what, picture in pictures.items():
+            yield _write(out / f"{camera.name}-{what}.png", picture)
+        rows.append(np.concatenate(list(pictures.values()), axis=1))
+    yield _write(out / "sheet.png", np.concatenate(rows))
+
+
+def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
+    """Depth in colour, near bright, on a scale of 1 / z between the view's own extremes; grey where undefined."""
+    import matplotlib
+
+    near = 1 / depth
+    defined = np.isfinite(near)
+    if not defined.any():
+        return np.full((*depth.shape, 3), 0.5)
+    low, high = near[defined].min(), near[defined].max()
+    scaled = (np.nan_to_num(near) - low) / max(high - low, 1e-12 * high)
+    return np.where(defined[..., None], matplotlib.colormaps["magma"](scaled)[..., :3], 0.5)
+
+
+def normal_picture(normal: npt.NDArray[np.float64], camera: Camera) -> Image:
+    """Normals in the camera's axes (x right, y up, z toward the camera) as red, green, blue; grey where undefined."""
+    local = normal @ camera.rotation.T * np.array([1, -1, -1])
+    return np.where(np.isfinite(local), 0.5 + 0.5 * np.nan_to_num(local), 0.5)
+
+
+def _write(path: Path, image: Image) -> Path:
+    import cv2
+
+    pixels = np.clip(np.rint(np.asarray(image) * 255), 0, 255).astype(np.uint8)
+    if not cv2.imwrite(str(path), pixels[..., ::-1]):
+        raise OSError(f"{path}: could not be written")
+    return path

@@ -1,0 +1,1 @@
+"""The metrics on a person's own images."""

@@ -1,0 +1,490 @@
+"""A person's own pictures: found and paired by name, read, and measured as the paper's table has it.
+
+The figures themselves are pure functions in :mod:`attnwarp_eval.metrics`; files are touched here alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.encoders import EncoderInfo, Kind, load_encoder
+from attnwarp.errors import InputError
+from attnwarp_eval import metrics
+
+Picture = npt.NDArray[np.float32]
+Embedding = npt.NDArray[np.float64]
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+DEFAULTS: dict[Kind, str] = {"clip": "clip-small", "dino": "dino-small", "perceptual": "perceptual-small"}
+"""The encoders that are taken where none is named."""
+
+OFF = "none"
+"""Named in place of an encoder: its figures are left out."""
+
+BATCH = 4
+"""Views that are held in memory together."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a person has. Every part may be missing; so then are the figures that need it.
+
+    Attributes:
+        renders: folder of renders of the edited scene.
+        edited: folder of the edited pictures that the scene was fitted on, named as the renders.
+        originals: folder of pictures of the scene before the edit, named as the renders.
+        source_edit: the one edited picture that the others follow.
+        prompt: what the edited scene should show.
+        source_prompt: what the scene showed before.
+        masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual distance, black
+            does not.
+        background: sRGB in [0, 1] behind transparent pixels.
+    """
+
+    renders: Path | None = None
+    edited: Path | None = None
+    originals: Path | None = None
+    source_edit: Path | None = None
+    prompt: str | None = None
+    source_prompt: str | None = None
+    masks: Path | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure.
+
+    Attributes:
+        key: its name in :data:`attnwarp_eval.metrics.registry.METRICS`.
+        title: as a table says it.
+        value: over all views; NaN where no view has one.
+        views: view -> value; NaN where undefined, +inf for the PSNR of two equal pictures.
+        encoder: kind of the encoder behind it, if any.
+    """
+
+    key: str
+    title: str
+    value: float
+    views: Mapping[str, float]
+    encoder: Kind | None = None
+
+    @property
+    def undefined(self) -> list[str]:
+        """Views without a value."""
+        return [name for name, value in self.views.items() if np.isnan(value)]
+
+    @property
+    def identical(self) -> list[str]:
+        """Views whose value is infinite: two equal pictures."""
+        return [name for name, value in self.views.items() if np.isinf(value)]
+
+
+@dataclass
+class Measured:
+    """Everything that was measured on a person's pictures, and everything that was not.
+
+    Attributes:
+        inputs: what it was measured on.
+        rows: the figures.
+        missing: title of a figure that was not computed -> why.
+        encoders: kind -> which one.
+        unpaired: sentence for each group of pictures that found no partner.
+        notes: what a reader has to know of the values.
+    """
+
+    inputs: Inputs
+    rows: list[Row] = field(default_factory=list)
+    missing: dict[str, str] = field(default_factory=dict)
+    encoders: dict[Kind, EncoderInfo] = field(default_factory=dict)
+    unpaired: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def any_value(self) -> bool:
+        """Whether any figure has a value."""
+        return any(not np.isnan(row.value) for row in self.rows)
+
+
+@dataclass(frozen=True)
+class _Figure:
+    key: str
+    title: str
+    needs: tuple[str, ...]  # fields of Inputs
+    encoder: Kind | None = None
+
+
+_EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
+    _Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
+    _Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
+    _Figure(
+        "embedding.clip_directional", "CLIP directional similarity",
+        ("renders", "originals", "prompt", "source_prompt"), "clip",
+    ),
+    _Figure("embedding.dino_image", "DINO single-image similarity", ("renders", "source_edit"), "dino"),
+    _Figure("embedding.clip_image", "CLIP single-image similarity", ("renders", "source_edit"), "clip"),
+    _Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
+)  # fmt: skip
+
+_MASKED = (_EDIT, _PERCEPTUAL)
+"""Figures that masks act on; the others are of whole pictures."""
+
+Progress = Callable[[int, int, str], None]
+"""Called with views done, views in all, and the view at work."""
+
+
+def measure(
+    inputs: Inputs, encoders: Mapping[Kind, str | None] | None = None, *, device: str = "cpu",
+    progress: Progress = lambda done, total, view: None,
+) -> Measured:  # fmt: skip
+    """Measure a person's pictures: every figure of the paper's table that they allow.
+
+    Args:
+        inputs: the pictures and prompts.
+        encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its figures out. A kind
+            that is not named, or named None, takes the bundled one, and its figures are left out where there is none.
+        device: "cpu" or "cuda", for real encoders.
+        progress: told of each view.
+
+    Raises:
+        InputError: nothing can be computed (the message says why, figure by figure), a picture that cannot be read, a
+            pair of different sizes, two files of one name.
+    """
+    done = Measured(inputs)
+    for name in ("prompt", "source_prompt"):
+        text = getattr(inputs, name)
+        if text is not None and not text.strip():
+            raise InputError(f"{_option(name)}: is empty, expected a description of what the pictures show")
+    folders = {
+        name: pictures_in(getattr(inputs, name), _option(name))
+        for name in ("renders", "edited", "originals", "masks")
+        if getattr(inputs, name) is not None
+    }
+    wanted = _possible(inputs, folders, encoders or {}, done)
+    loaded = _load(wanted, encoders or {}, device, done)
+    wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
+    if not wanted:
+        raise InputError(
+            "nothing can be computed: " + "; ".join(f"{title}: {why}" for title, why in done.missing.items())
+        )
+    views = {figure: _views(figure, folders) for figure in wanted}
+    _check_sizes(folders, views)
+    _compare_names(folders, views, done)
+    source = None
+    if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
+        source = read_picture(inputs.source_edit, inputs.background)  # before the long part
+    kept = _gather(inputs, folders, views, loaded, progress)
+    _rows(inputs, source, views, loaded, kept, done)
+    return done
+
+
+def pictures_in(folder: Path, option: str) -> dict[str, Path]:
+    """The picture files of a folder by their names without suffix, in the order that a person would put them.
+
+    Raises:
+        InputError: no such folder, no picture in it, or two files that differ in their suffix alone.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{option}: {folder} is no folder; name the folder that holds the pictures")
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir(), key=lambda p: natural(p.name)):
+        if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
+            continue
+        if path.stem in found:
+            raise InputError(
+                f"{option}: {found[path.stem]} and {path.name} have one name; pictures are paired by their names without "
+                "the suffix, so remove or rename one"
+            )
+        found[path.stem] = path
+    if not found:
+        raise InputError(f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}")
+    return found
+
+
+def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> Picture:
+    """(H, W, 3) float32 sRGB in [0, 1].
+
+    8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent pixels are laid
+    over ``background``. Pixels are taken as they lie in the file: a tag that asks for a turned picture is not followed,
+    since renders have none.
+
+    Raises:
+        InputError: not a picture, one that breaks off, or one of other than 8 or 16 bits.
+    """
+    from attnwarp.fit.views import read_image
+    from attnwarp.io import FileFormatError
+
+    _header(path, whole=True)
+    try:
+        image = read_image(path)
+    except FileFormatError as error:
+        raise InputError(str(error)) from None
+    values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    if image.shape[2] == 3:
+        return values
+    alpha = values[..., 3:]
+    return np.clip(values[..., :3] * alpha + (1 - alpha) * np.asarray(background, np.float32), 0, 1)
+
+
+def inside(picture: Picture) -> npt.NDArray[np.bool_]:
+    """(H, W) bool of a mask's picture: where the mean of the channels is above a half."""
+    return np.asarray(picture.mean(axis=2) > 0.5)
+
+
+def _header(path: Path, *, whole: bool = False) -> tuple[int, int] | None:
+    """(width, height) of a picture; None where Pillow does not know the format. ``whole`` decodes it too.
+
+    OpenCV, which reads 16 bits and so reads the pixels, fills what is missing of a JPEG with grey and says nothing.
+    """
+    import warnings
+
+    from PIL import Image, UnidentifiedImageError
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; check the path")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a large picture, an odd tag: not for a person to mend
+            with Image.open(path) as image:
+                if whole:
+                    image.load()
+                return image.size
+    except UnidentifiedImageError:
+        return None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path}: the picture is damaged ({error}); write it again") from None
+
+
+def _possible(
+    inputs: Inputs, folders: Mapping[str, Mapping[str, Path]], encoders: Mapping[Kind, str | None], done: Measured
+) -> list[_Figure]:
+    """The figures that the inputs allow; the others' reasons go to ``done``."""
+    wanted = []
+    for figure in FIGURES:
+        absent = [_option(name) for name in figure.needs if getattr(inputs, name) is None]
+        if absent:
+            done.missing[figure.title] = f"needs {' and '.join(absent)}"
+        elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
+            done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
+        elif not _views(figure, folders):
+            used = " and ".join(f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders))
+            done.missing[figure.title] = f"no name stands in all of {used}"
+        else:
+            wanted.append(figure)
+    return wanted
+
+
+def _load(
+    wanted: Sequence[_Figure], encoders: Mapping[Kind, str | None], device: str, done: Measured
+) -> dict[Kind, Any]:
+    loaded: dict[Kind, Any] = {}
+    for kind in dict.fromkeys(figure.encoder for figure in wanted if figure.encoder is not None):
+        named = encoders.get(kind)
+        try:
+            loaded[kind] = load_encoder(named or DEFAULTS[kind], kind, device=device)
+        except InputError as error:
+            if named is not None:
+                raise InputError(f"--{kind}: {error}") from None
+            for figure in wanted:
+                if figure.encoder == kind:
+                    done.missing[figure.title] = f"needs --{kind}: {error}"
+            continue
+        done.encoders[kind] = loaded[kind].about
+        if loaded[kind].about.source == "bundled":
+            done.notes.append(
+                f"{loaded[kind].about.name} is small and was trained on random rendered scenes: its figures rank "
+                f"results among themselves and do not compare with published ones. --{kind} names a real encoder"
+            )
+    return loaded
+
+
+def _views(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+    first, *others = _groups(figure, folders)
+    return [name for name in folders[first] if all(name in folders[other] for other in others)]
+
+
+def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[str]:
+    """The folders that a figure is computed from."""
+    used = [name for name in figure.needs if name in folders]
+    return [*used, "masks"] if figure in _MASKED and "masks" in folders else used
+
+
+def _compare_names(
+    folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]], done: Measured
+) -> None:
+    """Say what found no partner."""
+    shown = list(folders["renders"])
+    used = {name for figure in views for name in figure.needs} | (
+        {"masks"} if any(figure in views for figure in _MASKED) else set()
+    )
+    for other in (name for name in ("edited", "originals", "masks") if name in folders and name in used):
+        there = folders[other]
+        # A scene is usually fitted on some of its views: renders without an edited picture are no mistake.
+        for where, names in (
+            (f"of {_option('renders')} without one in {_option(other)}", [n for n in shown if n not in there]),
+            (f"of {_option(other)} without one in {_option('renders')}", [n for n in there if n not in shown]),
+        ):
+            if names:
+                done.unpaired.append(f"{len(names)} {where}: {_some(names, 8)}")
+
+
+def _check_sizes(folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]) -> None:
+    """Before anything is computed: every pair has one size."""
+    for figure, names in views.items():
+        for other in _groups(figure, folders):
+            for name in names if other != "renders" else ():
+                one, two = folders["renders"][name], folders[other][name]
+                a, b = _header(one), _header(two)
+                if a is not None and b is not None:
+                    _same_size(one, a, two, b)
+
+
+def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> None:
+    if a != b:
+        raise InputError(
+            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size; resize one of the "
+            "two folders"
+        )
+
+
+@dataclass
+class _Gathered:
+    """What is kept of the pictures once they are out of memory."""
+
+    errors: dict[str, tuple[float, float]] = field(default_factory=dict)  # MSE and PSNR
+    distances: dict[str, float] = field(default_factory=dict)
+    clip: dict[str, Embedding] = field(default_factory=dict)
+    dino: dict[str, Embedding] = field(default_factory=dict)
+    before: dict[str, Embedding] = field(default_factory=dict)  # CLIP, of the originals
+
+
+def _gather(
+    inputs: Inputs, folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]],
+    loaded: Mapping[Kind, Any], progress: Progress,
+) -> _Gathered:  # fmt: skip
+    """Read every picture once and keep what the figures need of it."""
+    kept = _Gathered()
+    members = {figure: set(views.get(figure, ())) for figure in FIGURES}
+
+    def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
+        return {name: read_picture(folders[group][name], inputs.background) for name in names}
+
+    def partners(group: str, names: Iterable[str], renders: Mapping[str, Picture]) -> dict[str, Picture]:
+        pictures = read(group, names)
+        for name, picture in pictures.items():  # again, for formats whose header alone is not known
+            sizes = [(array.shape[1], array.shape[0]) for array in (renders[name], picture)]
+            _same_size(folders["renders"][name], sizes[0], folders[group][name], sizes[1])
+        return pictures
+
+    def encode(kind: Kind, pictures: Mapping[str, Picture], to: dict[str, Embedding]) -> None:
+        if kind in loaded and pictures:
+            to.update(zip(pictures, loaded[kind].images(list(pictures.values())), strict=True))
+
+    def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
+        return float(loaded["perceptual"].distance([a], [b])[0])
+
+    needed = [name for name in folders["renders"] if any(name in names for names in members.values())]
+    for start in range(0, len(needed), BATCH):
+        batch = needed[start : start + BATCH]
+        progress(start, len(needed), batch[0])
+        renders = read("renders", batch)
+        encode("clip", renders, kept.clip)
+        encode("dino", renders, kept.dino)
+        changed = [name for name in batch if name in members[_DIRECTION]]
+        encode("clip", partners("originals", changed, renders), kept.before)
+        paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
+        masked = paired if "masks" in folders else []
+        masks = {name: inside(picture) for name, picture in partners("masks", masked, renders).items()}
+        for name, picture in partners("edited", paired, renders).items():
+            if name in members[_EDIT]:
+                mask = {name: masks[name]} if masks else None
+                one = metrics.edit_psnr({name: picture}, {name: renders[name]}, mask)
+                kept.errors[name] = (one.mse[0], one.psnr[0])
+            if name in members[_PERCEPTUAL]:
+                try:
+                    kept.distances[name] = metrics.perceptual(picture, renders[name], distance, masks.get(name))
+                except ValueError as error:
+                    raise InputError(f"{folders['edited'][name]}: {error}") from None
+    progress(len(needed), len(needed), "")
+    return kept
+
+
+def _rows(
+    inputs: Inputs, source: Picture | None, views: Mapping[_Figure, Sequence[str]], loaded: Mapping[Kind, Any],
+    kept: _Gathered, done: Measured,
+) -> None:  # fmt: skip
+    """The figures of what was gathered, in the order of the paper's table."""
+    texts = {name: _text(loaded["clip"], getattr(inputs, name), _option(name), done) for name in _texts_needed(views)}
+    for figure, names in views.items():
+        if figure is _EDIT:
+            _edit_rows(kept.errors, done)
+            continue
+        if figure is _PERCEPTUAL:
+            defined = [value for value in kept.distances.values() if not np.isnan(value)]
+            value = float(np.mean(defined)) if defined else float("nan")
+            done.rows.append(Row(figure.key, figure.title, value, kept.distances, figure.encoder))
+            continue
+        if figure is _CLIP:
+            found = metrics.clip_similarity(_stack(kept.clip, names), texts["prompt"])
+        elif figure is _DIRECTION:
+            before, after = _stack(kept.before, names), _stack(kept.clip, names)
+            found = metrics.directional_similarity(before, after, texts["source_prompt"], texts["prompt"])
+        else:
+            kind: Kind = "dino" if figure is _DINO else "clip"
+            assert source is not None  # the figure needs it, see _possible
+            edit = loaded[kind].images([source])
+            found = metrics.image_similarity(edit, _stack(kept.dino if figure is _DINO else kept.clip, names))
+        values = dict(zip(names, map(float, found.values), strict=True))
+        done.rows.append(Row(figure.key, figure.title, found.mean, values, figure.encoder))
+
+
+def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> None:
+    found = metrics.EditPsnr(tuple(errors), tuple(m for m, _ in errors.values()), tuple(p for _, p in errors.values()))
+    values = dict(zip(found.views, found.psnr, strict=True))
+    done.rows.append(Row("edit.psnr_mean", "Edit PSNR, mean of the views", found.mean_finite, values))
+    done.rows.append(Row("edit.psnr_pooled", "Edit PSNR, pooled", found.pooled, values))
+    if found.identical:
+        done.notes.append(
+            f"{found.identical} edited pictures equal their renders: their PSNR is infinite and not in the mean of the "
+            "views; in the pooled figure they count as no error"
+        )
+    if found.undefined:
+        done.notes.append(f"{found.undefined} masks are black all over: nothing of those views counts")
+
+
+def _texts_needed(views: Iterable[_Figure]) -> list[str]:
+    return [n for n in ("prompt", "source_prompt") if any(f.encoder == "clip" and n in f.needs for f in views)]
+
+
+def _text(clip: Any, text: str, option: str, done: Measured) -> Embedding:
+    cut = clip.cut(text) if hasattr(clip, "cut") else 0
+    if cut:
+        done.notes.append(f"{option} is longer than the encoder takes: its last {cut} tokens were not read")
+    return np.asarray(clip.texts([text])[0])
+
+
+def _stack(rows: Mapping[str, Embedding], names: Sequence[str]) -> Embedding:
+    return np.stack([rows[name] for name in names])
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """So that view2 comes before view10."""
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", name) if p]
+
+
+def _some(names: Iterable[str], count: int = 3) -> str:
+    listed = list(names)
+    return ", ".join(listed[:count]) + (f" and {len(listed) - count} more" if len(listed) > count else "")
+
+
+def _option(name: str) -> str:
+    """The command line's word for a field of Inputs."""
+    return "--mask" if name == "masks" else "--" + name.replace("_", "-")

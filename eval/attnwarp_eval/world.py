@@ -1,0 +1,119 @@
+"""A scene's truth and its splats, made once and shared by the cells that a process computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth import Geometry, TwoView, appearance, edge_band, two_view
+from attnwarp_eval.truth.features import SolidField
+
+if TYPE_CHECKING:
+    from attnwarp import Gaussians
+    from attnwarp_eval.study.parts import Splats
+
+
+SPLATS_PROTOCOL = 1
+"""Raised whenever the same spec would give other splats: those on disk are then made anew."""
+
+Features = npt.NDArray[np.float64]
+
+
+class World:
+    """Everything about a scene that is the same for all variants.
+
+    Args:
+        scene: as it was loaded.
+        size: of the images, in pixels; the study's.
+
+    Attributes:
+        content_hash: of the scene's file, which a cell's spec names.
+        source: the source camera.
+        targets: the target cameras by name.
+        yaw: degrees from the source, folded to [0, 180], by the target's name.
+    """
+
+    def __init__(self, scene: Scene, size: int) -> None:
+        self.content_hash = scene.content_hash
+        self.scene = scene = scene.with_size(size, size)
+        self.geometry = Geometry(scene)
+        self.source = scene.source
+        self.targets = {camera.name: camera for camera in scene.targets}
+        self.yaw = {
+            camera.name: abs((view.yaw - scene.spec.cameras.source.yaw + 180) % 360 - 180)
+            for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
+        }
+        # Cells of a scene ask for the same pairs again and again; a world lives as long as its scene is at work.
+        self.pair: Callable[[str, int], TwoView] = cache(self._pair)
+        self.features: Callable[[str, int, int, int], Features] = cache(self._features)
+        self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
+        self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
+
+    def add(self, camera: Camera) -> None:
+        """Make a further camera known by its name, as the scene's own are."""
+        to_here, to_source = (c.position[:2] - self.scene.center[:2] for c in (camera, self.source))
+        cosine = to_here @ to_source / (np.linalg.norm(to_here) * np.linalg.norm(to_source))
+        self.targets[camera.name] = camera
+        self.yaw[camera.name] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+    def camera(self, name: str) -> Camera:
+        """The source ("source") or a target by its name."""
+        return self.source if name == self.source.name else self.targets[name]
+
+    def _pair(self, target: str, size: int) -> TwoView:
+        """What is exactly known about the source and a target, on a grid of ``size`` x ``size``."""
+        return two_view(self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size))
+
+    def _edge(self, name: str) -> npt.NDArray[np.bool_]:
+        """(H, W) the band around the depth and object edges of a view."""
+        return edge_band(self.geometry, self.camera(name))
+
+    def _image(self, name: str, spp: int) -> npt.NDArray[np.float32]:
+        """(H, W, 3) sRGB truth of a view in [0, 1]."""
+        return to_srgb(appearance(self.scene, self.camera(name), spp=spp, seed=0))
+
+    def _features(self, name: str, size: int, channels: int, seed: int) -> Features:
+        """(C, h, w) the feature field on a view's grid; 0 on the source's background, NaN on a target's."""
+        points = self.geometry.trace(self.camera(name).resize(size, size)).point
+        background = 0.0 if name == self.source.name else np.nan
+        return self._field(channels, seed).on_grid(points, background=background)
+
+    def _field(self, channels: int, seed: int) -> SolidField:
+        """The feature field, as wide as what the cameras look at."""
+        distance = float(np.linalg.norm(self.source.position - self.scene.center))
+        seen = 2 * distance * float(np.tan(np.arctan(self.source.height / 2 / self.source.K[1, 1])))
+        return SolidField(self.scene.center, seen, channels=channels, seed=seed)
+
+
+@lru_cache(maxsize=1)
+def world(scene: str, size: int) -> World:
+    """The world of a scene (a name or a path) at an image size; the last one is kept."""
+    return World(load_scene(scene), size)
+
+
+@lru_cache(maxsize=8)
+def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
+    """Gaussians on a scene's surfaces; the last few are kept, and all of them in the cache on disk."""
+    from attnwarp import Gaussians
+    from attnwarp_eval.splats.surface import surface_splats
+
+    at = world(scene, size)
+    key = content_key("surface splats", SPLATS_PROTOCOL, at.content_hash, seed, spec.model_dump())
+    stored = read_arrays("splats", key)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    if stored is None:
+        made = surface_splats(at.scene, seed=seed, geometry=at.geometry, **spec.model_dump())
+        write_arrays("splats", key, {**{name: getattr(made, name).numpy() for name in names}, "origin": made.origin})
+        return made
+    means, quats, scales, opacities, sh = (torch.from_numpy(stored[name]) for name in names)
+    return Gaussians(spec.kind, means, quats, scales, opacities, sh, origin=stored["origin"])

@@ -1,0 +1,317 @@
+"""CLIP and DINOv2 from folders as transformers writes them, held against transformers itself."""
+
+import json
+import shutil
+import socket
+
+import numpy as np
+import pytest
+import tiny_models
+import torch
+
+from attnwarp.encoders import ImageEncoder, TextImageEncoder, TokenEncoder, load_encoder
+from attnwarp.encoders.preprocess import read_preprocessing
+from attnwarp.errors import InputError
+
+TEXTS = ["a photo of a bear", "A  Bear, in\tthe forest!", "ünïcode 熊 42", ""]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_network():
+    """Nothing may ask for anything, not even for a name."""
+
+    def refuse(*arguments, **more):
+        raise AssertionError(f"asked the network for {arguments}")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket, "getaddrinfo", refuse)
+        patch.setattr(socket.socket, "connect", refuse)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def clip_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clip")
+    return folder, *tiny_models.save_clip(folder)
+
+
+@pytest.fixture(scope="module")
+def clip(clip_folder):
+    return load_encoder(f"clip:{clip_folder[0]}", "clip")
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["dinov2", "registers"])
+def dino(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("dino")
+    model, _ = tiny_models.save_dino(folder, registers=request.param)
+    return load_encoder(f"dinov2:{folder}", "dino"), model, folder
+
+
+def pictures(count=11, seed=0):
+    """Of several shapes, and more than go through the network at a time."""
+    random = np.random.default_rng(seed)
+    return [random.integers(0, 256, (40 + 3 * (i % 4), 50, 3), dtype=np.uint8) for i in range(count)]
+
+
+def floating(images):
+    return [(image / 255).astype(np.float32) for image in images]
+
+
+def cosine(a, b):
+    return (a * b).sum(-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+
+
+def through(model_call, folder, images):
+    """The network on what our preprocessing gives, one picture at a time: no batches, no float64 in between."""
+    prepare = read_preprocessing(folder)
+    with torch.no_grad():
+        return np.stack([model_call(torch.from_numpy(prepare(x))[None])[0].numpy() for x in floating(images)])
+
+
+def test_clip_s_pictures_are_transformers_own_but_for_its_rounding_to_8_bits(clip, clip_folder):
+    _, model, processor, _ = clip_folder
+    images = pictures()
+    with torch.no_grad():
+        expected = model.get_image_features(**processor(images, return_tensors="pt")).pooler_output.numpy()
+    got = clip.images(floating(images))
+    assert got.shape == (11, 24) and got.dtype == np.float64
+    assert cosine(got, expected).min() > 1 - 2e-5  # noise, all of whose pixels were rounded twice
+    # The pictures differ by far more than that, or the line above would say nothing.
+    assert cosine(got[:1], got[1:]).max() < 1 - 1e-3
+
+
+def test_clip_s_pictures_are_exactly_the_network_s(clip, clip_folder):
+    folder, model, *_ = clip_folder
+    expected = through(lambda x: model.get_image_features(pixel_values=x).pooler_output, folder, pictures())
+    np.testing.assert_allclose(clip.images(floating(pictures())), expected, rtol=0, atol=2e-5)  # float32, lengths of 2
+
+
+def test_clip_s_texts_are_transformers_own(clip, clip_folder):
+    _, model, _, tokenizer = clip_folder
+    with torch.no_grad():
+        # Padded in one batch, as users call it: what stands behind the end of a text must not matter.
+        inputs = tokenizer(TEXTS, padding=True, truncation=True, max_length=24, return_tensors="pt")
+        expected = model.get_text_features(**inputs).pooler_output.numpy()
+    got = clip.texts(TEXTS)
+    assert got.shape == (4, 24) and got.dtype == np.float64
+    np.testing.assert_allclose(got, expected, rtol=0, atol=2e-5)
+
+
+def test_vocabulary_and_merges_do_as_well_as_one_file(clip, clip_folder, tmp_path):
+    vocab, merges = tiny_models.tokens()
+    shutil.copytree(clip_folder[0], tmp_path / "old")
+    (tmp_path / "old" / "tokenizer.json").unlink()
+    (tmp_path / "old" / "vocab.json").write_text(json.dumps(vocab), encoding="utf-8")
+    (tmp_path / "old" / "merges.txt").write_text(
+        "#version: 0.2\n" + "\n".join(" ".join(pair) for pair in merges) + "\n", encoding="utf-8"
+    )
+    assert np.array_equal(load_encoder(f"clip:{tmp_path / 'old'}").texts(TEXTS), clip.texts(TEXTS))
+
+
+def test_a_long_text_is_cut_and_still_ends_where_it_is_read(clip, clip_folder):
+    _, model, _, tokenizer = clip_folder
+    long = "bear " * 40
+    with torch.no_grad():
+        inputs = tokenizer([long], truncation=True, max_length=24, return_tensors="pt")
+        expected = model.get_text_features(**inputs).pooler_output.numpy()
+    np.testing.assert_allclose(clip.texts([long]), expected, rtol=0, atol=2e-5)
+    assert clip.cut(long) == 42 - 24 and clip.cut("bear") == 0
+
+
+def test_dino_gives_the_class_token_and_the_patches_in_their_places(dino):
+    encoder, model, folder = dino
+    registers = getattr(model.config, "num_register_tokens", 0)
+    expected = through(lambda x: model(pixel_values=x).last_hidden_state, folder, pictures())
+    got, grid = encoder.images(floating(pictures())), encoder.tokens(floating(pictures()))
+    assert got.shape == (11, 32) and grid.shape == (11, 3, 3, 32) and grid.dtype == np.float64
+    np.testing.assert_allclose(got, expected[:, 0], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(grid.reshape(11, 9, 32), expected[:, 1 + registers :], rtol=0, atol=2e-5)
+    assert cosine(got[:1], got[1:]).max() < 1 - 1e-4
+
+
+def test_a_patch_of_the_grid_answers_to_its_own_place(dino):
+    encoder, *_ = dino
+    plain = np.full((48, 48, 3), 0.5, np.float32)
+    marked = plain.copy()
+    marked[3:10, 33:40] = 1  # after the crop to 42: patch row 0, column 2
+    change = np.linalg.norm(encoder.tokens([marked])[0] - encoder.tokens([plain])[0], axis=-1)
+    assert np.unravel_index(change.argmax(), change.shape) == (0, 2)
+
+
+def test_dino_of_transformers_own_processor_agrees(dino):
+    from transformers.models.bit.image_processing_pil_bit import BitImageProcessorPil
+
+    encoder, model, folder = dino
+    images = [64 + image // 2 for image in pictures()]  # no overshoot, see test_preprocess.py
+    with torch.no_grad():
+        inputs = BitImageProcessorPil.from_pretrained(folder)(images, return_tensors="pt")
+        expected = model(**inputs).pooler_output.numpy()
+    got = encoder.images(floating(images))
+    # Random layers this strong amplify that rounding; two pictures lie a hundred times further apart.
+    assert cosine(got, expected).min() > 1 - 1e-3
+    assert cosine(got[:1], got[1:]).max() < 1 - 5e-2
+
+
+def test_a_picture_s_embedding_does_not_depend_on_its_company(clip, dino):
+    for encoder in (clip, dino[0]):
+        together = encoder.images(floating(pictures()))
+        alone = np.concatenate([encoder.images([image]) for image in floating(pictures())])
+        np.testing.assert_allclose(together, alone, rtol=0, atol=2e-5)
+
+
+def test_empty_lists_give_no_rows(clip, dino):
+    assert clip.images([]).shape == (0, 24) and clip.texts([]).shape == (0, 24)
+    assert dino[0].images([]).shape == (0, 32) and dino[0].tokens([]).shape == (0, 3, 3, 32)
+
+
+def test_half_and_double_precision_pictures_are_welcome(clip):
+    image = floating(pictures(1))[0]
+    expected = clip.images([image])
+    assert np.array_equal(clip.images([image.astype(np.float64)]), expected)
+    assert cosine(clip.images([image.astype(np.float16)]), expected) > 1 - 1e-5
+
+
+def test_half_precision_weights_compute_in_float32(clip_folder, clip, tmp_path):
+    folder, model, *_ = clip_folder
+    shutil.copytree(folder, tmp_path / "half")
+    import copy
+
+    copy.deepcopy(model).half().save_pretrained(tmp_path / "half")
+    half = load_encoder(f"clip:{tmp_path / 'half'}")
+    got, expected = half.images(floating(pictures(2))), clip.images(floating(pictures(2)))
+    assert cosine(got, expected).min() > 1 - 1e-5
+    assert not np.array_equal(got.astype(np.float16), got)  # the results are not halves
+
+
+def test_what_they_say_of_themselves(clip, clip_folder, dino):
+    import hashlib
+
+    about = clip.about
+    assert (about.name, about.kind, about.size, about.dim) == (f"clip:{clip_folder[0]}", "clip", 32, 24)
+    weights = (clip_folder[0] / "model.safetensors").read_bytes()
+    assert about.weights_sha256 == hashlib.sha256(weights).hexdigest() and about.source == str(clip_folder[0])
+    assert "shorter edge to 32 px (bicubic" in about.preprocessing
+    assert json.loads(json.dumps(about.to_dict()))["dim"] == 24
+    assert (dino[0].about.kind, dino[0].about.size, dino[0].about.dim) == ("dino", 42, 32)
+    assert (
+        isinstance(clip, TextImageEncoder) and isinstance(dino[0], ImageEncoder) and isinstance(dino[0], TokenEncoder)
+    )
+
+
+def test_weights_in_parts_and_in_the_old_format_are_found(clip_folder, clip, tmp_path):
+    folder, model, *_ = clip_folder
+    parts, old = tmp_path / "parts", tmp_path / "old"
+    for place in (parts, old):
+        shutil.copytree(folder, place)
+        (place / "model.safetensors").unlink()
+    model.save_pretrained(parts, max_shard_size="100KB")
+    assert not (parts / "model.safetensors").exists() and len(list(parts.glob("model-*.safetensors"))) > 1
+    torch.save(model.state_dict(), old / "pytorch_model.bin")
+    expected = clip.images(floating(pictures(2)))
+    for place in (parts, old):
+        assert np.array_equal(load_encoder(f"clip:{place}").images(floating(pictures(2))), expected)
+    next(parts.glob("model-*.safetensors")).unlink()
+    with pytest.raises(InputError, match=r"index\.json names model-0000.*\.safetensors, not in"):
+        load_encoder(f"clip:{parts}")
+
+
+@pytest.mark.parametrize(
+    "change, complaint",
+    [
+        (lambda f: shutil.rmtree(f), "there is no folder .*Place these files there: config.json, model.safetensors"),
+        (lambda f: (f / "config.json").unlink(), "has no config.json.*openai/clip-vit-large-patch14-336"),
+        (lambda f: (f / "config.json").write_text("{"), r"config\.json: not JSON"),
+        (lambda f: edit(f / "config.json", model_type="dinov2"), "model_type 'dinov2', expected 'clip'"),
+        (lambda f: (f / "model.safetensors").unlink(), "no model.safetensors and no pytorch_model.bin.*hf download"),
+        (lambda f: (f / "model.safetensors").write_bytes(b"x" * 99), "cannot be loaded: .*fetch its files again"),
+        (lambda f: (f / "preprocessor_config.json").unlink(), "no preprocessor_config.json"),
+        (lambda f: (f / "tokenizer.json").unlink(), "has no tokenizer.json, nor vocab.json with merges.txt"),
+        (lambda f: (f / "tokenizer.json").write_text("{}"), "not a tokenizer"),
+        (lambda f: edit(f / "preprocessor_config.json", crop_size=40), r"gives \(40, 40\), the network .* \(32, 32\)"),
+    ],
+)
+def test_a_folder_that_will_not_do_is_refused_with_the_remedy(clip_folder, tmp_path, change, complaint):
+    folder = tmp_path / "clip"
+    shutil.copytree(clip_folder[0], folder)
+    change(folder)
+    with pytest.raises(InputError, match=complaint) as caught:
+        load_encoder(f"clip:{folder}")
+    assert str(folder) in str(caught.value) and "://" not in str(caught.value)
+
+
+def edit(path, **changes):
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_missing_tensors_are_not_filled_with_noise(clip_folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(clip_folder[0], tmp_path / "clip")
+    path = tmp_path / "clip" / "model.safetensors"
+    state = load_file(path)
+    del state["text_projection.weight"]
+    save_file(state, path, metadata={"format": "pt"})
+    with pytest.raises(InputError, match=r"lacks 1 tensors that config.json calls for, text_projection\.weight first"):
+        load_encoder(f"clip:{tmp_path / 'clip'}")
+
+
+def test_weights_that_are_not_numbers_are_refused(clip_folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(clip_folder[0], tmp_path / "clip")
+    path = tmp_path / "clip" / "model.safetensors"
+    state = load_file(path)
+    state["visual_projection.weight"][3, 4] = float("nan")
+    save_file(state, path, metadata={"format": "pt"})
+    with pytest.raises(InputError, match=r"visual_projection\.weight in .* is NaN or infinite"):
+        load_encoder(f"clip:{tmp_path / 'clip'}")
+
+
+def test_another_model_s_tokenizer_is_refused(clip_folder, tmp_path):
+    # transformers would read every text at its first token, which is the same for all of them.
+    shutil.copytree(clip_folder[0], tmp_path / "clip")
+    vocab, merges = tiny_models.tokens()
+    fewer = {t: i for i, t in enumerate(t for t in vocab if t != "bear</w>")}
+    tiny_models.CLIPTokenizer(vocab=fewer, merges=merges[:2]).save_pretrained(tmp_path / "clip")
+    with pytest.raises(
+        InputError, match="has 516 tokens and ends a text with 515, the model .* knows 517 and expects 516"
+    ):
+        load_encoder(f"clip:{tmp_path / 'clip'}")
+
+
+@pytest.mark.parametrize(
+    "bad, complaint",
+    [
+        (np.zeros((4, 4, 4), np.float32), r"images\[1\]: got shape \(4, 4, 4\), expected \(H, W, 3\)"),
+        (np.zeros((4, 4, 3), np.uint8), r"images\[1\]: got uint8, expected floating"),
+        (np.full((4, 4, 3), 1.5, np.float32), r"images\[1\]: got values in \[1.5, 1.5\], expected \[0, 1\]"),
+        (np.full((4, 4, 3), np.nan, np.float32), r"images\[1\]: 48 values are NaN or infinite"),
+        (np.full((4, 4, 3), 1e300), r"images\[1\]: got values in \[1e\+300"),
+        (np.zeros((0, 4, 3), np.float32), "at least one pixel"),
+    ],
+)
+def test_a_bad_picture_is_named(clip, bad, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        clip.images([np.zeros((8, 8, 3), np.float32), bad])
+
+
+def test_one_picture_or_text_instead_of_a_list_is_refused(clip, dino):
+    with pytest.raises(TypeError, match="got one picture"):
+        clip.images(np.zeros((8, 8, 3)))
+    with pytest.raises(TypeError, match="got one string 'bear'"):
+        clip.texts("bear")
+    with pytest.raises(TypeError, match=r"texts\[0\]: got int"):
+        clip.texts([3])
+
+
+def test_a_device_that_is_not_there_is_named(clip_folder):
+    with pytest.raises(InputError, match="device 'tpu-ish': unknown, expected cpu or cuda"):
+        load_encoder(f"clip:{clip_folder[0]}", device="tpu-ish")

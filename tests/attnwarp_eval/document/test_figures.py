@@ -1,0 +1,31 @@
+"""Figures as they are drawn: boxes of text in pixels, by matplotlib's own measure."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from attnwarp_eval.document import figures
+from attnwarp_eval.statistics.intervals import Interval
+
+
+def around(value: float) -> Interval:
+    return Interval(value, 0.9 * value, 1.1 * value, scenes=3, views=9, undefined=0, detectable=0.1, p=0.01)
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
+    random = np.random.default_rng(0)
+    points = {f"variant {k}": tuple(around(v) for v in (1 + 0.02 * random.random(2))) for k in range(8)}
+    points["alone"] = (around(10.0), around(10.0))
+    with figures.drawing(tmp_path / "front.svg") as (axes,):
+        figures.cost_front(axes, points, x="seconds", y="error", title="front", log=log)
+        axes.figure.draw_without_rendering()
+        notes = axes.texts
+        assert sorted(note.get_text() for note in notes) == sorted(points)
+        for one, other in itertools.combinations(notes, 2):
+            assert not one.get_window_extent().overlaps(other.get_window_extent())
+        assert next(note for note in notes if note.get_text() == "alone").xyann == (5, 5)
+    assert "variant 3" in (tmp_path / "front.svg").read_text()

@@ -1,0 +1,301 @@
+"""The proof of a plan: its statistics against closed forms, scipy and planted truths; its ladder on real pictures."""
+
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_scenes import FLOOR, GLASS, LAMP, MIRROR, POINT, SCENES, SKY, SUN, WALL, ball, make
+from scipy import stats
+
+from attnwarp_eval.effects import proof
+from attnwarp_eval.scene.transport import called_for
+from attnwarp_eval.truth.mitsuba import render_plan
+from attnwarp_eval.truth.plan import DROPPABLE, Lens, everything_on, plan, without
+
+SHAPE = (12, 16, 16, 3)
+
+
+def noise(rng, kind="normal", size=0.1):
+    # Pictures of mean 1: pixels with normal noise, or skewed like few samples of a bright light (skewness 2).
+    return 1 + size * (rng.standard_normal(SHAPE) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE) - 1)
+
+
+def test_welch_agrees_with_scipy_where_spreads_and_numbers_differ():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(1, 0.5, (11, 40)), rng.normal(1.1, 2.0, (17, 40))
+    ours, theirs = proof.welch(a, b), stats.ttest_ind(b, a, equal_var=False)
+    assert np.allclose(ours.p, theirs.pvalue, rtol=1e-9) and np.allclose(ours.freedom, theirs.df, rtol=1e-9)
+    assert np.allclose(ours.difference / ours.error, theirs.statistic, rtol=1e-9)
+
+
+def test_values_without_noise_are_compared_exactly_up_to_rounding():
+    a = np.ones((10, 3))
+    b = np.ones((10, 3)) * [1.0, 1 + 1e-7, 1.01]
+    assert proof.welch(a, b).p.tolist() == [1.0, 1.0, 0.0]
+
+
+def test_too_few_samples_are_refused():
+    with pytest.raises(ValueError, match="got 1 and 5 samples, expected at least 2"):
+        proof.welch(np.ones((1, 2)), np.ones((5, 2)))
+    with pytest.raises(ValueError, match="seeds: got 9, expected at least 10"):
+        proof.prove(SCENES["diffuse"](), seeds=9)
+
+
+def test_sidak_makes_independent_tests_refuse_together_at_the_level():
+    for tests in (1, 3, 1024):
+        assert math.isclose(1 - (1 - proof.sidak(0.05, tests)) ** tests, 0.05, rel_tol=1e-9)
+
+
+def test_blocks_are_means_over_squares_and_over_what_is_left_at_the_border():
+    data = np.random.default_rng(1).random((2, 13, 20, 3))
+    got = proof.blocks(data)
+    assert got.shape == (2, 2, 3, 3)
+    for i, j in np.ndindex(2, 3):
+        assert np.allclose(got[:, i, j], data[:, 8 * i : 8 * i + 8, 8 * j : 8 * j + 8].mean((1, 2)))
+
+
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+def test_over_200_true_nulls_it_refuses_at_its_stated_rate(kind):
+    rng = np.random.default_rng(2)
+    refused = 0
+    for _ in range(200):
+        refused += any(level.differs for level in proof.levels(noise(rng, kind), noise(rng, kind), alpha=0.05))
+    # 200 trials at 5 %: 99.9 % of binomial counts are at most 21. Blocks are made of the pixels, so that the three
+    # levels refuse together more often than independent ones and the whole a little less: at least 2.
+    assert 2 <= refused <= 21
+
+
+def test_unequal_noise_on_the_two_sides_does_not_raise_the_rate():
+    rng = np.random.default_rng(3)
+    refused = 0
+    for _ in range(200):
+        quiet = 1 + 0.01 * rng.standard_normal(SHAPE)
+        refused += any(level.differs for level in proof.levels(quiet, noise(rng), alpha=0.05))
+    assert refused <= 21  # as above
+
+
+def test_a_difference_of_two_percent_is_found_every_time_and_never_certified():
+    rng = np.random.default_rng(4)
+    for _ in range(200):
+        a, b = noise(rng), 1.02 * noise(rng)
+        picture = proof.levels(a, b)[-1]
+        # The difference's standard error is 0.1 / sqrt(12 * 768) * sqrt 2 = 0.15 %: 2 % is fourteen of them.
+        assert picture.differs and not proof.equivalence(a, b).equal
+
+
+def test_a_difference_in_one_block_only_is_found_where_the_whole_picture_hides_it():
+    rng = np.random.default_rng(5)
+    found = 0
+    for _ in range(20):
+        a, b = noise(rng), noise(rng)
+        b[:, :8, :8] += 0.03
+        levels = {level.name: level.differs for level in proof.levels(a, b)}
+        found += levels["block"]
+    assert found == 20
+
+
+def test_equivalence_certifies_the_equal_and_hardly_ever_what_lies_on_its_margin():
+    rng = np.random.default_rng(6)
+    equal = [proof.equivalence(noise(rng), noise(rng)).equal for _ in range(200)]
+    edge = [proof.equivalence(1.01 * noise(rng), noise(rng)).equal for _ in range(200)]
+    # 2.33 is the normal quantile; with 22 degrees of freedom 1.5 % lie beyond it. Binomial, 99.9 %: at most 9.
+    assert sum(equal) > 195 and sum(edge) <= 9
+
+
+def test_noise_too_great_for_the_margin_is_not_certified_though_nothing_differs():
+    rng = np.random.default_rng(7)
+    a, b = (1 + 3 * rng.standard_normal(SHAPE) for _ in range(2))
+    assert not proof.equivalence(a, b).equal and not any(level.differs for level in proof.levels(a, b))
+
+
+def test_the_stated_smallest_difference_is_found_four_times_in_five():
+    rng = np.random.default_rng(8)
+    stated = np.mean([proof.levels(noise(rng), noise(rng))[-1].detectable for _ in range(50)])
+    found = [proof.levels(noise(rng), noise(rng) + stated)[-1].differs for _ in range(200)]
+    # 80 % of 200; 99.9 % of binomial counts lie within 140 and 178.
+    assert 140 <= sum(found) <= 178
+
+
+def synthetic(trial, kind="normal", brighter=1.0):
+    """What a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls with the samples."""
+
+    def pictures(side, spp, first, count):
+        out = []
+        for k in range(count):
+            rng = np.random.default_rng((trial, side, first + k, spp))
+            grain = rng.standard_normal(SHAPE[1:]) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE[1:]) - 1
+            out.append((brighter if side else 1.0) * (1 + 0.3 / math.sqrt(spp) * grain))
+        return np.stack(out)
+
+    return pictures
+
+
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+@pytest.mark.parametrize(("alpha", "range_"), [(0.01, (0, 8)), (0.05, (1, 21)), (0.2, (14, 59))])
+def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, alpha, range_):
+    found = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
+    # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same pixels refuse together, so
+    # that the whole keeps a little below its rate. At 20 %, two rungs at the full rate each would refuse about 70.
+    assert range_[0] <= found.count("refused") <= range_[1]
+    assert found.count("certified") == 200 - found.count("refused")
+
+
+@pytest.mark.parametrize("kind", ["normal", "skewed"])
+def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
+    found = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
+    assert {one.verdict for one in found} == {"refused"}
+    assert all(any(rung.passed is False for rung in one.rungs) for one in found)
+
+
+def test_the_paired_test_agrees_with_scipy():
+    rng = np.random.default_rng(9)
+    a, b = rng.random((24, 4, 4, 3)), rng.random((24, 4, 4, 3)) + 0.02
+    ours, theirs = proof.paired(a, b), stats.ttest_rel(b.mean((1, 2, 3)), a.mean((1, 2, 3)))
+    assert math.isclose(ours.p, theirs.pvalue, rel_tol=1e-9)
+
+
+# On real pictures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["diffuse", "refraction", "medium", "depth_of_field"])
+def test_the_plan_of_a_scene_is_certified(name):
+    # A budget for a busy machine; a quiet one needs a few seconds of it.
+    found = proof.prove(SCENES[name](), seconds=180)
+    assert found.of_simulated == "certified", list(found.lines())
+    # Glass polarises light, which no picture here shows.
+    assert found.verdict == ("can't tell" if name == "refraction" else "certified")
+    assert found.rungs[0].name == "structure" and found.detectable
+
+
+@pytest.mark.parametrize("effect", DROPPABLE)
+def test_dropping_an_effect_from_a_scene_that_needs_it_is_refused_by_the_statistics_alone(effect):
+    scene = SCENES[effect]()
+    found = proof.prove(scene, without(scene, plan(scene), effect), seconds=8, structure=False)
+    assert found.verdict == "refused", list(found.lines())
+
+
+REASONS = {
+    "interreflection": "interreflection needs 5 edges",
+    "specular": "specular, interreflection needs 5 edges",
+    "refraction": "refraction, specular, interreflection needs 9 edges",
+    "medium": "a medium needs volpath",
+    "subsurface": "a medium needs volpath",
+    "caustics": r"the caustic of lights\[0\], a point, needs paths from the light",
+    "environment": r"lights\[1\], a sky, shines in no pass",
+    "depth_of_field": "depth of field needs a lens",
+}
+
+
+@pytest.mark.parametrize("effect", DROPPABLE)
+def test_dropping_what_the_graphs_show_is_refused_before_anything_is_rendered(effect):
+    scene = SCENES[effect]()
+    found = proof.prove(scene, without(scene, plan(scene), effect))
+    assert found.verdict == "refused" and [rung.name for rung in found.rungs] == ["structure"]
+    assert re.search(REASONS[effect], found.rungs[0].words), found.rungs[0].words
+
+
+GLOBE = {
+    "name": "globe",
+    "shape": {"type": "sphere", "center": [0, 0, 3], "radius": 0.05},
+    "emission": {"radiance": 90.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("scene", "change", "words"),
+    [
+        (lambda: make([FLOOR, ball(), LAMP], [SUN]), lambda p: p[:1], "object 'lamp', a lamp, shines in no pass"),
+        (lambda: make([FLOOR, ball()], [SUN, POINT]), lambda p: p[1:], r"lights\[0\], a sun, shines in no pass"),
+        (lambda: make([FLOOR, ball()], [SKY], "unlimited"), lambda p: [replace(p[0], max_depth=9)], "needs no end"),
+        (lambda: make([FLOOR, ball(MIRROR)], [SKY], 6), lambda p: [replace(p[0], max_depth=6)], "specular.* needs 7 edges"),
+        (lambda: make([FLOOR, ball()], [SKY], 2), lambda p: [replace(p[0], integrator="direct")], "direct have 2 edges"),
+        (SCENES["caustics"], lambda p: p[1:], "shines in no pass"),
+        (SCENES["caustics"], lambda p: p[:2], "taken away and no paths from the light put it back"),
+        (lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8), lambda p: p[1:], "shines in no pass where .* is smooth"),
+        (lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8), lambda p: [replace(p[0], first="any")], "caustic of object 'globe'"),
+        (SCENES["medium"], lambda p: [*p, replace(p[0], integrator="path")], "volpath, in every pass"),
+    ],
+)  # fmt: skip
+def test_a_plan_with_something_missing_is_refused_by_its_structure_with_the_reason(scene, change, words):
+    made = scene()
+    good = plan(made)
+    assert not list(proof._lacks(made, good, caustic="caustics" in called_for(made.spec)))
+    bad = replace(good, passes=tuple(change(list(good.passes))))
+    found = list(proof._lacks(made, bad, caustic="caustics" in called_for(made.spec)))
+    assert re.search(words, "; ".join(found)), found
+
+
+@pytest.mark.parametrize("name", list(SCENES))
+def test_no_plan_of_ours_lacks_anything_nor_does_everything_on(name):
+    scene = SCENES[name]()
+    for made in (plan(scene), everything_on(scene), everything_on(scene, capped=False)):
+        assert not list(proof._lacks(scene, made, caustic="caustics" in called_for(scene.spec)))
+
+
+def test_another_lens_than_the_scenes_is_refused():
+    scene = SCENES["depth_of_field"]()
+    wrong = replace(plan(scene), lens=Lens(0.3, 3.0))
+    assert "the lens is another" in next(proof._lacks(scene, wrong, caustic=False))
+    bare = SCENES["diffuse"]()
+    assert "says no lens" in next(proof._lacks(bare, replace(plan(bare), lens=Lens(0.3, 3.0)), caustic=False))
+
+
+def test_glass_alone_is_planned_with_paths_through_it_and_anything_else_alone_with_one_bounce():
+    assert plan(make([ball(GLASS)], [SKY], 8)).integrator == "path"
+    assert plan(make([ball(MIRROR)], [SKY], 8)).integrator == "direct"
+
+
+def test_a_light_two_percent_too_bright_is_refused():
+    right = make([FLOOR, WALL, ball()], [SUN, SKY])
+    wrong = make([FLOOR, WALL, ball()], [SUN | {"irradiance": 2.04}, SKY | {"radiance": 0.51}])
+    pictures = [
+        np.stack([render_plan(scene, scene.source, plan(scene, 16), seed + k) for k in range(12)])
+        for scene, seed in ((right, 0), (wrong, 100))
+    ]
+    assert proof.levels(*pictures)[-1].differs
+    assert not proof.equivalence(*pictures).equal
+
+
+def test_too_little_time_ends_in_cannot_tell_and_says_what_could_have_been_seen():
+    scene = SCENES["caustics"]()
+    found = proof.prove(scene, seconds=0.1)
+    assert found.verdict == "can't tell", list(found.lines())
+    assert found.rungs[-1].name == "equivalence" and found.rungs[-1].passed is None
+    assert found.detectable["picture"] > 0.01
+    assert any("smallest difference" in line for line in found.lines())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["refraction", "diffuse"])
+def test_over_200_true_nulls_of_real_pictures_it_refuses_at_its_stated_rate(name):
+    scene = SCENES[name]().with_size(16, 16)
+    made = plan(scene, 16)  # the fewest samples and the seeds that the proof itself takes when it has time
+    refused = 0
+    for trial in range(200):
+        a, b = (
+            np.stack([render_plan(scene, scene.source, made, first + 12 * trial + i) for i in range(12)])
+            for first in (10_000, 20_000)
+        )
+        refused += any(level.differs for level in proof.levels(a, b, alpha=0.05))
+    assert refused <= 21  # binomial, 99.9 %
+
+
+@pytest.mark.slow
+def test_the_caustic_of_a_point_light_is_certified_but_for_what_is_not_simulated_when_there_is_time():
+    found = proof.prove(SCENES["caustics"](), seconds=240)
+    assert (found.verdict, found.of_simulated) == ("can't tell", "certified"), list(found.lines())
+
+
+def test_everything_on_is_never_volpathmis():
+    for make_scene in SCENES.values():
+        assert {step.integrator for step in everything_on(make_scene()).passes} <= {"volpath", "ptracer"}
+
+
+def test_an_effect_that_is_not_in_a_plan_cannot_be_left_out_of_it():
+    scene = make([FLOOR, ball()], [SUN])
+    with pytest.raises(ValueError, match="'environment' is not in this plan"):
+        without(scene, plan(scene), "environment")
+    with pytest.raises(ValueError, match="expected one that a plan can leave out"):
+        without(scene, plan(scene), "textures")

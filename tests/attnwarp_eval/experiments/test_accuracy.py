@@ -1,0 +1,126 @@
+"""What the truth's own error and time are measured with, held to errors that are known."""
+
+import json
+
+import numpy as np
+import pytest
+from effect_scenes import FLOOR, SKY, SUN, ball, make
+from typer.testing import CliRunner
+
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.experiments import accuracy, suite
+from attnwarp_eval.scene.file import load_scene
+
+
+def test_the_brute_force_finds_hits_known_in_closed_form():
+    # A unit right triangle at z = 2 before one at z = 3: rays through the lower left half hit the nearer.
+    near = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2]])
+    far = np.array([[-9.0, -9, 3], [9, -9, 3], [0, 18, 3]])
+    origins = np.array([[0.2, 0.2, 0], [0.8, 0.8, 0], [0.2, 0.2, 0], [0.2, 0.2, 2.5], [50, 50, 0]])
+    directions = np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, 0.5], [0, 0, 1], [0, 0, 1]])
+    endless = np.full(5, np.inf)
+    t = accuracy.every_triangle(origins, directions, np.stack([far, near]), endless)
+    assert t.tolist() == [2.0, 3.0, 4.0, 0.5, np.inf]
+    t = accuracy.every_triangle(origins, directions, np.stack([far, near]), np.array([2.0, 3.5, 9, 0.1, 1]))
+    assert t.tolist() == [3.0, 3.0, 4.0, np.inf, np.inf] or t.tolist() == [np.inf, 3.0, 4.0, np.inf, np.inf]
+
+
+def test_all_works_run_in_every_round_and_the_first_one_twice():
+    calls = []
+    works = [lambda turn, k=k: calls.append((k, turn)) or k for k in range(3)]
+    before = []
+    results, seconds = accuracy.in_turn(works, 4, before=before.append)
+    assert [len(r) for r in results] == [len(s) for s in seconds] == [4] * 4
+    assert results == [[0] * 4, [1] * 4, [2] * 4, [0] * 4]
+    # A first round is not kept, and the first work's second run has other noise.
+    assert sorted(calls) == sorted([(k, t) for k in range(3) for t in range(5)] + [(0, t + 10_000) for t in range(5)])
+    assert before == [k for k, _ in calls]
+    orders = {tuple(k for k, _ in calls[i : i + 4]) for i in range(0, 20, 4)}
+    assert len(orders) > 1
+
+
+def test_the_error_of_a_picture_falls_with_the_square_root_of_its_samples():
+    # Light paths through fog are independent, so four times the samples halve the error; "everything on" sees the same.
+    scene = make([FLOOR, ball()], [SUN, SKY], 4, medium={"sigma_t": 0.2, "albedo": 0.9, "g": 0.0})
+    panel = accuracy.pictures(scene, size=16, samples=(4, 16), rounds=5, reference=(12, 256))
+    error = {c.name: c.error for c in panel.contestants}
+    assert panel.contestants[0].name == "plan, 4 spp" and set(error) >= {"plan, 16 spp", "everything on, 16 spp"}
+    assert error["plan, 4 spp"][0] / error["plan, 16 spp"][0] == pytest.approx(2, rel=0.2)
+    for name, (value, low, high) in error.items():
+        assert 0 < low <= value <= high, name
+    for c in panel.contestants:
+        assert abs(c.more["bias"]) < 5 * c.more["bias_error"] + 0.01, c.name
+        assert len(c.seconds) == len(panel.again) == 5
+    same_noise = panel.at_equal_error(0)
+    assert (same_noise.low, same_noise.ratio, same_noise.high) == (1, 1, 1)
+
+
+def test_refinement_takes_the_error_of_float32_away_and_the_worlds_offset_does_not_matter_then():
+    panel = accuracy.depth(load_scene("far"), size=64, rays=60, rounds=3)
+    refined, recentred, raw = panel.contestants
+    assert refined.error[0] < 1e-13 and refined.more["wrong"] == 0
+    # float32 has 6e-8; at coordinates of 2e6 its steps are 0.125 m.
+    assert 1e-9 < recentred.error[0] < 1e-5 and recentred.more["wrong"] == 0
+    assert raw.more["wrong"] > 0.5
+
+
+def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent():
+    panel = accuracy.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
+    rays, nearest, bilinear = panel.contestants
+    # Clopper & Pearson: none of 150 excludes a share above 1 - 0.025^(1 / 150).
+    assert rays.error == pytest.approx((0, 0, 1 - 0.025 ** (1 / 150))) and rays.more["unanswered"] == 0
+    assert nearest.error[0] == nearest.more["wrong"] > 0.02 and nearest.more["unanswered"] == 0
+    assert bilinear.more["unanswered"] > 0.2
+    assert bilinear.error[0] == pytest.approx(bilinear.more["wrong"] + bilinear.more["unanswered"])
+
+
+def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
+    camera = load_scene("spheres").with_size(64, 64).source
+    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(camera.K).T
+    depth = 4 / (1 + 0.2 * rays[..., 0])  # the plane z + 0.2 x = 4
+    local = rays[20:40, 20:40].reshape(-1, 3) * depth[20:40, 20:40].reshape(-1, 1)
+    for bilinear in (False, True):
+        for stretch, expected in ((1.0, 1.0), (0.97, 1.0), (1.05, 0.0)):
+            points = (stretch * local) @ camera.rotation + camera.position
+            answer = accuracy._seen_in_map(depth, camera, points, bilinear)
+            assert (answer == expected).all()
+
+
+def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio(tmp_path):
+    def panel(scene):
+        slow = accuracy.Contestant("slow", (0.5, 0.4, 0.6), (2.0, 2.2, 2.4), {"median": 0.1, "p99": 0.2, "wrong": 0.0})
+        fast = accuracy.Contestant("fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": 0.25})
+        return accuracy.Panel("depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4))
+
+    accuracy.write([panel("one")], tmp_path)
+    accuracy.write([panel("two")], tmp_path)
+    text = (tmp_path / "accuracy.md").read_text()
+    assert "**one**" in text and "**two**" in text and "0.500 [0.500, 0.500]" in text and "25.00 %" in text
+    assert "| again |" in text and (tmp_path / "depth.svg").is_file()
+    assert [p["scene"] for p in json.loads((tmp_path / "accuracy.json").read_text())["panels"]] == ["one", "two"]
+    (tmp_path / "accuracy.json").write_text("[]")
+    result = CliRunner().invoke(app, ["scenes", "accuracy", "nowhere", "--out", str(tmp_path)])
+    assert result.exit_code == 2 and "nowhere" in result.output
+
+
+def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(monkeypatch, tmp_path):
+    import os
+
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "mine"))
+    told = []
+    (first,) = suite.measure(["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=told.append)
+    assert os.environ["ATTNWARP_CACHE"] == str(tmp_path / "mine")
+    assert first.views == 2 and set(first.wall) == set(suite.STAGES) and all(v > 0 for v in first.wall.values())
+    assert told == [
+        "spheres: meshes",
+        "spheres: geometry of 2 views",
+        "spheres: picture 1 of 2",
+        "spheres: picture 2 of 2",
+    ]
+    # Only the first, unmeasured picture is in the person's own cache.
+    assert len(list((tmp_path / "mine" / "appearance").glob("*.npz"))) == 1
+    columns, rows = suite.columns_and_rows([first, first])
+    assert rows[-1][0] == "all" and rows[-1][1] == "4" and len(rows[0]) == len(columns)
+    total = suite.to_dict([first, first])["total"]["wall"]["geometry"]
+    assert total == pytest.approx(2 * first.wall["geometry"])

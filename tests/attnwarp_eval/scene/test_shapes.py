@@ -1,0 +1,210 @@
+import json
+import multiprocessing
+import struct
+import warnings
+
+import numpy as np
+import pytest
+
+from attnwarp_eval import cache
+from attnwarp_eval.scene.shapes import (
+    Box,
+    Capsule,
+    Ellipsoid,
+    Mesh,
+    MeshNotice,
+    Sphere,
+    body_distance,
+    mesh_body,
+    read_mesh,
+)
+
+BALL = [Ellipsoid((0.3, -0.2, 1.0), (0.5, 0.5, 0.5))]
+
+
+def edges_of(mesh):
+    pairs = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+
+
+def test_a_meshed_ball_is_a_sphere():
+    mesh = mesh_body(BALL, 0.0, 32)
+    outward = mesh.vertices - [0.3, -0.2, 1.0]
+    # Newton steps put the vertices on the surface; marching cubes alone leaves 1e-3.
+    assert np.abs(np.linalg.norm(outward, axis=1) - 0.5).max() < 1e-6
+    assert np.abs(mesh.normals - outward / 0.5).max() < 1e-5
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    # Divergence theorem: the volume comes out positive only if the faces look outward.
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)
+
+
+def test_a_blended_body_is_closed_and_carries_its_parts_colours():
+    parts = [
+        Ellipsoid((0, 0, 0.5), (0.4, 0.3, 0.5), 20.0, color=(1.0, 0.5, 0.2)),
+        Capsule((0.2, 0, 0.5), (0.9, 0, 0.8), (0.2, 0.1), color=(0.1, 0.2, 0.9)),
+        Ellipsoid((0.0, 0, 1.02), (0.08, 0.08, 0.08), 0.0, color=(0.0, 0.0, 0.0), blend=False),
+    ]
+    mesh = mesh_body(parts, 0.1, 48)
+    _, count = edges_of(mesh)
+    # Every edge belongs to two triangles, but for the few beside slivers without area that were dropped;
+    # they leave no hole, so that the areas of the triangles, as vectors, still sum to nothing.
+    assert (count == 2).mean() > 0.995
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    assert np.abs(area.sum(0)).max() < 1e-9 * np.linalg.norm(area, axis=1).sum()
+    tip = mesh.vertices[:, 0] > 0.9
+    assert tip.any() and np.abs(mesh.tint[tip] - [0.1, 0.2, 0.9]).max() < 0.02
+    top = mesh.vertices[:, 2] > 1.08
+    assert top.any() and np.abs(mesh.tint[top]).max() < 1e-12
+
+
+def test_the_distance_of_a_capsule_is_exact_and_the_smooth_union_lies_below_the_sharp_one():
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    rod = Capsule((0, 0, 0), (0, 0, 1), (0.2, 0.2))
+    gap = np.hypot(np.hypot(points[:, 0], points[:, 1]), points[:, 2] - np.clip(points[:, 2], 0, 1))
+    assert np.abs(body_distance([rod], 0.1, points) - (gap - 0.2)).max() < 1e-12
+    ball = Ellipsoid((0.3, 0, 0.5), (0.4, 0.4, 0.4))
+    sharp = np.minimum(body_distance([rod], 0, points), body_distance([ball], 0, points))
+    assert np.array_equal(body_distance([rod, ball], 0.0, points), sharp)
+    soft = body_distance([rod, ball], 0.2, points)
+    assert (soft <= sharp + 1e-15).all() and (sharp - soft).max() <= 0.2 / 4 + 1e-12
+
+
+def test_mirrored_copies_and_positions_are_inside_what_contains_them():
+    box = Box(
+        np.array([1.0, 2, 3]), np.array([0.5, 1, 0.25]), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    )
+    for shape in (box, box.mesh(), Sphere(box.center, 0.2)):
+        assert shape.contains(box.center) and not shape.contains(box.center + np.array([0, 0, 2.0]))
+    assert box.contains(box.center + 0.99 * box.axes[:, 1]) and not box.contains(box.center + 1.01 * box.axes[:, 1])
+    low, high = box.bounds()
+    assert np.allclose(box.mesh().vertices.min(0), low) and np.allclose(box.mesh().vertices.max(0), high)
+
+
+def test_a_mesh_with_a_hole_and_doubled_faces_still_knows_its_inside():
+    mesh = mesh_body(BALL, 0.0, 24)
+    holed = Mesh(mesh.vertices, np.concatenate([mesh.faces[: -len(mesh.faces) // 8], mesh.faces[:40]]))
+    assert holed.contains(np.array([0.3, -0.2, 1.0])) and not holed.contains(np.array([0.3, -0.2, 1.6]))
+
+
+def test_degenerate_triangles_are_dropped_with_a_notice_that_counts_them():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 1, 3], [1, 1, 2]])
+    with pytest.warns(MeshNotice, match=r"scan: dropped 2 of 3 triangles without area \(first: face 1\)"):
+        assert Mesh(vertices, faces).cleaned("scan").faces.tolist() == [[0, 1, 2]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Mesh(vertices * 1e-6, faces[:1]).cleaned("a small triangle is not a degenerate one")
+    with pytest.raises(ValueError, match="no triangle with an area"):
+        Mesh(vertices, faces[1:]).cleaned("scan")
+    with pytest.raises(ValueError, match="a face names vertex 4, but there are 4"):
+        Mesh(vertices, np.array([[0, 1, 4]])).cleaned("scan")
+    with pytest.raises(ValueError, match="vertex 2 is not finite"):
+        Mesh(np.where(np.arange(4)[:, None] == 2, np.nan, vertices), faces[:1]).cleaned("scan")
+
+
+def glb(vertices, faces, **node):
+    """The bytes of a minimal glTF 2.0 binary file; the one that Open3D writes lacks its BIN chunk."""
+    points, index = vertices.astype("<f4"), faces.astype("<u2")
+    blob = points.tobytes() + index.tobytes()
+    document = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": len(blob)}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": points.nbytes},
+            {"buffer": 0, "byteOffset": points.nbytes, "byteLength": index.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3",
+             "min": points.min(0).tolist(), "max": points.max(0).tolist()},
+            {"bufferView": 1, "componentType": 5123, "count": index.size, "type": "SCALAR"},
+        ],
+    }  # fmt: skip
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    blob += b"\0" * (-len(blob) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob))
+    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+
+
+def write_mesh(path, vertices, faces):
+    if path.suffix == ".glb":
+        path.write_bytes(glb(vertices, faces))
+    elif path.suffix == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+        path.write_text("\n".join(lines) + "\n")
+    else:
+        head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
+        head += [f"property double {axis}" for axis in "xyz"]
+        head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+        lines = [f"{x} {y} {z}" for x, y, z in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        path.write_text("\n".join(head + lines) + "\n")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_a_mesh_file_comes_back_as_it_was_written(tmp_path, suffix):
+    cube = Box(np.array([0.5, 0.25, -1]), np.array([1, 2, 3.0])).mesh()
+    path = tmp_path / f"cube{suffix}"
+    write_mesh(path, cube.vertices, cube.faces)
+    back = read_mesh(path)
+    # Readers may split or merge vertices, so corners are compared triangle by triangle; glb stores float32.
+    assert np.allclose(back.vertices[back.faces], cube.vertices[cube.faces], rtol=0, atol=1e-6)
+
+
+def test_the_placement_of_a_node_in_a_glb_file_is_applied(tmp_path):
+    cube = Box(np.zeros(3), np.ones(3)).mesh()
+    (tmp_path / "cube.glb").write_bytes(glb(cube.vertices, cube.faces, translation=[10, 0, 0], scale=[2, 2, 2]))
+    assert np.allclose(read_mesh(tmp_path / "cube.glb").bounds(), [[8, -2, -2], [12, 2, 2]])
+
+
+def test_a_file_that_is_no_mesh_is_refused_with_the_remedy(tmp_path):
+    write_mesh(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((0, 3), int))
+    with pytest.raises(ValueError, match="holds no triangles"):
+        read_mesh(tmp_path / "points.ply")
+    with pytest.raises(ValueError, match=r"mesh format '.step' is not read; use one of .ply, .obj"):
+        read_mesh(tmp_path / "part.step")
+
+
+def test_a_body_is_meshed_once_and_read_back_bit_for_bit(monkeypatch, tmp_path):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    first = mesh_body(BALL, 0.0, 16)
+    assert len(list((tmp_path / "meshes").iterdir())) == 1
+    monkeypatch.setattr("attnwarp_eval.scene.shapes._march", lambda *_: pytest.fail("meshed again"))
+    second = mesh_body(BALL, 0.0, 16)
+    assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
+
+
+def test_a_damaged_or_unwritable_cache_costs_time_and_nothing_else(monkeypatch, tmp_path):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    first = mesh_body(BALL, 0.0, 16)
+    (file,) = (tmp_path / "meshes").iterdir()
+    file.write_bytes(file.read_bytes()[:100])
+    assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "a file"))
+    assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
+
+
+def write_again_and_again(folder, value):
+    import os
+
+    os.environ["ATTNWARP_CACHE"] = str(folder)
+    for _ in range(60):
+        cache.write_arrays("k", "same", {"x": np.full(20_000, value)})
+
+
+def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypatch, tmp_path):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=write_again_and_again, args=(tmp_path, float(k))) for k in (1, 2)]
+    for writer in writers:
+        writer.start()
+    seen = 0
+    while any(writer.is_alive() for writer in writers):
+        if (tmp_path / "k" / "same.npz").exists():
+            stored = cache.read_arrays("k", "same")
+            assert stored is not None and len(np.unique(stored["x"])) == 1
+            seen += 1
+    assert [writer.exitcode for writer in writers] == [0, 0] and seen > 0
+    assert [p.name for p in (tmp_path / "k").iterdir()] == ["same.npz"]

@@ -1,0 +1,155 @@
+"""Oracles: Student's t in closed form, simulation with a known truth, brute force over all subsets."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from attnwarp_eval.statistics.intervals import (
+    agreement,
+    benjamini_hochberg,
+    front,
+    interval,
+    paired,
+    time_ratio,
+    verdict,
+)
+
+
+def test_mean_is_over_scenes_so_a_scene_with_many_views_does_not_outvote_the_others():
+    result = interval({"many": [1.0] * 90, "few": [3.0] * 2})
+    assert result.mean == pytest.approx(2.0)
+    assert (result.scenes, result.views) == (2, 92)
+
+
+def test_the_interval_is_students_t_over_the_means_of_the_scenes():
+    means = np.array([1.0, 2.0, 4.0, 7.0])
+    result = interval({f"s{i}": [m - 0.5, m + 0.5] for i, m in enumerate(means)})
+    low, high = stats.t.interval(0.95, len(means) - 1, means.mean(), stats.sem(means))
+    assert (result.low, result.high) == pytest.approx((low, high))
+    assert result.p == pytest.approx(stats.ttest_1samp(means, 0.0).pvalue)
+
+
+@pytest.mark.parametrize("scenes", [3, 6])
+@pytest.mark.parametrize(("between", "within"), [(1.0, 0.5), (0.3, 1.0)])
+def test_intervals_cover_the_true_mean_at_their_stated_rate(scenes, between, within):
+    rng = np.random.default_rng(7)
+    trials, covered = 1000, 0
+    for _ in range(trials):
+        effects = rng.normal(0.0, between, scenes)
+        result = interval({f"s{i}": e + rng.normal(0.0, within, 7) for i, e in enumerate(effects)})
+        covered += result.low <= 0.0 <= result.high
+    # Binomial(1000, 0.95) has a standard deviation of 0.7 %; four of them.
+    assert covered / trials == pytest.approx(0.95, abs=0.028)
+
+
+def test_the_detectable_difference_is_found_at_its_stated_power():
+    rng = np.random.default_rng(11)
+    scenes, trials, sigma = 6, 2000, 1.0
+    # The power of the two-sided t test at the difference that its true standard error makes detectable.
+    factor = stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1)
+    truth = factor * sigma / np.sqrt(scenes)
+    found = sum(
+        interval({i: [v] for i, v in enumerate(rng.normal(truth, sigma, scenes))}).p < 0.05 for _ in range(trials)
+    )
+    assert found / trials == pytest.approx(0.8, abs=0.06)
+
+
+def test_undefined_values_are_counted_and_never_averaged_in():
+    result = interval({"a": [1.0, np.nan], "b": [np.nan, np.nan], "c": [3.0, 3.0]})
+    assert result.mean == pytest.approx(2.0)
+    assert (result.scenes, result.views, result.undefined) == (2, 3, 3)
+
+
+def test_nothing_defined_is_nan_and_not_zero():
+    result = interval({"a": [np.nan]})
+    assert np.isnan(result.mean)
+    assert not result.known
+    assert result.undefined == 1
+
+
+def test_one_scene_has_a_mean_but_no_interval():
+    result = interval({"a": [1.0, 2.0, 3.0]})
+    assert result.mean == pytest.approx(2.0)
+    assert not result.known
+    assert verdict(result, "higher") == "can't tell"
+
+
+def test_a_paired_difference_cancels_what_the_views_share():
+    rng = np.random.default_rng(0)
+    a = {f"s{i}": {f"v{j}": 100 * rng.normal() for j in range(6)} for i in range(4)}
+    b = {s: {v: x + 0.1 for v, x in views.items()} for s, views in a.items()}
+    difference = paired(a, b)
+    assert difference.low == pytest.approx(0.1, abs=1e-9)
+    assert verdict(difference, "higher") == "better"
+    assert verdict(difference, "lower") == "worse"
+    assert verdict(difference, "higher", atol=0.2) == "can't tell"
+
+
+def test_a_view_that_only_one_side_has_counts_as_undefined():
+    difference = paired({"s": {"v": 1.0, "w": 2.0}, "t": {"v": 0.0}}, {"s": {"v": 2.0}, "t": {"v": 1.0}})
+    assert difference.mean == pytest.approx(1.0)
+    assert difference.undefined == 1
+
+
+def test_the_front_is_the_brute_force_set_of_undominated_points():
+    rng = np.random.default_rng(3)
+    cost, error = rng.integers(0, 12, 40).astype(float), rng.integers(0, 12, 40).astype(float)
+    points = list(zip(cost, error, strict=True))
+    dominated = {
+        i
+        for i, j in itertools.permutations(range(40), 2)
+        if points[j][0] <= points[i][0] and points[j][1] <= points[i][1] and points[j] != points[i]
+    }
+    expected = {points[i] for i in range(40) if i not in dominated}
+    kept = front(cost, error)
+    assert {points[i] for i in kept} == expected
+    assert [points[i] for i in kept] == sorted(expected)
+
+
+def test_a_nan_neither_enters_the_front_nor_evicts_a_good_point():
+    assert front([1.0, 0.5, 2.0], [1.0, np.nan, 0.5]) == [0, 2]
+    assert front([np.nan, 1.0], [0.0, 1.0]) == [1]
+    assert front([], []) == []
+
+
+def test_adjusted_p_values_are_scipys_and_nan_does_not_count():
+    p = [0.01, 0.04, 0.03, 0.5, 0.001]
+    assert benjamini_hochberg(p) == pytest.approx(stats.false_discovery_control(p))
+    with_nan = benjamini_hochberg([0.01, np.nan, *p[1:]])
+    assert np.isnan(with_nan[1])
+    assert [with_nan[0], *with_nan[2:]] == pytest.approx(stats.false_discovery_control(p))
+
+
+def test_an_adjusted_p_value_silences_a_verdict():
+    clear = interval({f"s{i}": [1.0 + 0.01 * i] for i in range(4)})
+    assert verdict(clear, "higher", adjusted_p=0.04) == "better"
+    assert verdict(clear, "higher", adjusted_p=0.06) == "can't tell"
+
+
+def test_agreement_counts_the_views_that_show_the_sign():
+    a = {"s": {"v": 1.0, "w": 2.0, "x": np.nan}, "t": {"v": 0.0}}
+    b = {"s": {"v": 2.0, "w": 1.0, "x": 1.0}, "t": {"v": 3.0, "y": 1.0}}
+    assert agreement(a, b, +1) == (2, 3)
+    assert agreement(a, b, -1) == (1, 3)
+
+
+def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
+    rng = np.random.default_rng(5)
+    # The machine slows down eightfold while the rounds go on; the true ratio is 1.25 throughout.
+    drift = np.geomspace(1, 8, 60)
+    a = 1.25 * drift * rng.lognormal(0, 0.03, 60)
+    b = drift * rng.lognormal(0, 0.03, 60)
+    found = time_ratio([a, a], [b, b])
+    assert found.low < 1.25 < found.high
+    assert found.high / found.low < 1.05
+    same = time_ratio([b], [b])
+    assert (same.ratio, same.low, same.high) == (1, 1, 1)
+
+
+def test_rounds_that_do_not_belong_together_are_refused():
+    with pytest.raises(ValueError, match="same number of rounds"):
+        time_ratio([[1.0, 2.0]], [[1.0]])
+    with pytest.raises(ValueError, match="positive"):
+        time_ratio([[1.0, 0.0]], [[1.0, 1.0]])

@@ -1,0 +1,272 @@
+"""The run as a user meets it: the command line in processes of its own, on a small study of real cells.
+
+Oracles: the file system (which cells were there before), byte equality of reports, exit codes.
+"""
+
+import functools
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from attnwarp_eval.study.store import Store
+
+SMALL = {
+    "name": "small",
+    "size": 64,
+    "scenes": ["spheres"],
+    "views": ["yaw030", "yaw150"],
+    "feature_sizes": [64, 16],
+    "spp": 1,
+    "splats": {"count": 2000},
+    "variants": {
+        "corrected": {"preset": "corrected"},
+        "bounds only": {
+            "set": {"in_front": False, "opaque": None, "depth_agreement": False, "normal_test": "none"},
+        },
+        "released": {"preset": "released"},
+    },
+    "probes": {
+        "depth": ["corrected", "released"],
+        "warp": ["corrected", "bounds only", "released"],
+        "timing": ["corrected", "released"],
+    },
+    "timing_rounds": 3,
+    "ablations": [{"title": "Presets", "baseline": "corrected", "variants": ["bounds only", "released"]}],
+    "yaw": {"variants": ["corrected", "bounds only"]},
+    "fronts": [{"title": "Cost", "metric": "warp.epe_median.16", "variants": ["corrected", "released"]}],
+    "pictures": {"variants": ["corrected"], "views": ["yaw030"]},
+}
+CELLS = 7
+
+# A commit made while the tests run would change the revision that reports name.
+WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    (folder / "study.yaml").write_text(yaml.safe_dump(SMALL))
+    return folder
+
+
+def command(*arguments):
+    return [sys.executable, "-m", "attnwarp_eval.cli.main", *map(str, arguments)]
+
+
+def call(folder, *arguments):
+    return subprocess.run(command(*arguments), cwd=folder, env=WITHOUT_GIT, capture_output=True, text=True, timeout=600)
+
+
+def without_timings(run, folder):
+    done = call(folder, "report", run, "--no-timings")
+    assert done.returncode == 0, done.stderr
+    return {name: (run / name).read_bytes() for name in ("report.md", "report.html", "results.jsonl")}
+
+
+@pytest.fixture(scope="module")
+def finished(folder):
+    """A run that was never disturbed."""
+    done = call(folder, "run", "study.yaml", "--out", "undisturbed")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("\n[") == CELLS
+    return folder / "undisturbed"
+
+
+def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finished, folder):
+    assert call(folder, "verify", "undisturbed").returncode == 0
+    page = (finished / "report.html").read_text()
+    assert "data:image/jpeg;base64," in page
+    assert "data:image/svg+xml;base64," in page
+    assert "<td>again</td>" in page
+    assert "http" not in page.replace("http://www.w3.org", "")
+    lines = [json.loads(line) for line in (finished / "results.jsonl").read_text().splitlines()]
+    assert all(line["seconds"]["method"] > 0 and line["counters"] for line in lines)
+    assert {line["probe"] for line in lines} == {"calibration", "depth", "warp"}
+
+
+def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, folder):
+    run = folder / "damaged"
+    shutil.copytree(finished, run)
+    victim = next(p for p in (run / "cells").iterdir() if '"depth"' in p.read_text())
+    victim.write_bytes(victim.read_bytes()[:100])
+    assert call(folder, "verify", run).returncode == 3
+    assert call(folder, "report", run).returncode == 0
+    assert "not JSON" in (run / "report.md").read_text()
+    mended = call(folder, "run", "study.yaml", "--out", run)
+    assert mended.returncode == 0, mended.stderr
+    assert f"{CELLS - 1} already done" in mended.stderr
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
+    # On a busy machine the run may be over before the signal is sent: then once more.
+    for attempt in range(5):
+        run = folder / f"interrupted{attempt}"
+        arguments = command("run", "study.yaml", "--out", run)
+        # A background job of a shell ignores the signal, and so would what it starts.
+        listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        process = subprocess.Popen(
+            arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.PIPE, text=True, preexec_fn=listening
+        )
+        deadline = time.monotonic() + 300
+        while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=60)[1]
+        if process.returncode != 0:
+            break
+    assert process.returncode == 130
+    assert "the same command goes on from here" in said
+    assert "Traceback" not in said
+
+
+def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, folder):
+    run = folder / "uncalibrated"
+    shutil.copytree(finished, run)
+    store = Store(run)
+    record = next(r for r in map(store.read, store.done()) if r["spec"]["probe"] == "calibration")
+    record["views"][0]["metrics"]["warp.epe_median"] = 0.5
+    store.write({k: v for k, v in record.items() if k != "sha256"})
+    done = call(folder, "run", "study.yaml", "--out", run)
+    assert done.returncode == 3
+    assert "not calibrated" in done.stderr
+    assert "FAILED" in (run / "report.md").read_text()
+
+
+def test_the_instrument_is_calibrated_in_every_run(finished):
+    (cell,) = (
+        json.loads(p.read_text()) for p in (finished / "cells").iterdir() if '"probe": "calibration"' in p.read_text()
+    )
+    for view in cell["views"]:
+        median, own = view["metrics"]["warp.epe_median"], view["metrics"]["occlusion.f1.exact"]
+        # A view in which the source shows nothing has neither; here yaw 30 has both.
+        assert median is None or median < 1e-3
+        assert own is None or own == 1
+    assert cell["views"][0]["metrics"]["occlusion.f1.exact"] == 1
+
+
+def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder):
+    run = folder / "killed"
+    process = subprocess.Popen(
+        command("run", "study.yaml", "--out", run), cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 300
+    while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").glob("*.json")}
+    assert 2 <= len(before) < CELLS
+    partial = call(folder, "verify", run)
+    assert partial.returncode == 3
+    assert "missing" in partial.stdout
+    again = call(folder, "run", "study.yaml", "--out", run)
+    assert again.returncode == 0, again.stderr
+    assert f"{len(before)} already done" in again.stderr
+    assert {name: (run / "cells" / name).stat().st_mtime_ns for name in before} == before
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_two_workers_give_the_same_numbers_as_one_process(finished, folder):
+    run = folder / "parallel"
+    done = call(folder, "run", "study.yaml", "--out", run, "--jobs", "2")
+    assert done.returncode == 0, done.stderr
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
+    run = folder / "failing"
+    run.mkdir()
+    # A file where the pictures' folder should be: the three cells that keep pictures fail, as on a full disk.
+    (run / "pictures").write_text("in the way")
+    done = call(folder, "run", "study.yaml", "--out", run)
+    assert done.returncode == 3
+    assert "failed cells" in done.stderr
+    assert len(list((run / "cells").iterdir())) == CELLS - 3
+    assert len(list((run / "failed").iterdir())) == 3
+    assert "Failed cells" in (run / "report.md").read_text()
+    assert call(folder, "verify", run).returncode == 3
+    stopped = call(folder, "run", "study.yaml", "--out", run, "--fail-fast")
+    assert stopped.returncode == 3
+    (run / "pictures").unlink()
+    mended = call(folder, "run", "study.yaml", "--out", run)
+    assert mended.returncode == 0, mended.stderr
+    assert "4 already done" in mended.stderr
+    assert call(folder, "verify", run).returncode == 0
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, folder):
+    run = folder / "bereft"
+    arguments = command("run", "study.yaml", "--out", run, "--jobs", "2")
+    process = subprocess.Popen(arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 300
+    while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    workers = [pid for pid in children(process.pid) if "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()]
+    assert workers
+    os.kill(workers[0], signal.SIGKILL)
+    assert process.wait(300) == 0
+    assert without_timings(run, folder) == without_timings(finished, folder)
+
+
+def children(pid):
+    """Processes below ``pid``, nearest first."""
+    found = [int(c) for t in pathlib.Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text().split()]
+    return found + [grandchild for child in found for grandchild in children(child)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("run", "quik"), "did you mean 'quick'"),
+        (("run", "study.yaml", "--scenes", "sphere"), "did you mean 'spheres'"),
+        (("run", "study.yaml", "--jobs", "0"), "jobs"),
+        (("run", "study.yaml", "--out", "study.yaml"), "study.yaml: File exists"),
+        (("verify", "nowhere"), "attnwarp-eval run"),
+        (("report", "nowhere"), "attnwarp-eval run"),
+        (("scenes", "show", "nothing.yaml"), "no such scene file"),
+    ],
+)
+def test_bad_input_gets_a_clear_line_and_exit_code_2(folder, arguments, message):
+    done = call(folder, *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_help_imports_nothing_heavy():
+    listed = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "attnwarp_eval.cli.main", "--help"], capture_output=True, text=True
+    )
+    assert listed.returncode == 0
+    loaded = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in listed.stderr.splitlines() if "|" in line}
+    assert "typer" in loaded
+    assert not loaded & {"torch", "numpy", "open3d", "mitsuba", "numba", "scipy", "matplotlib", "pyvista", "cv2"}
+
+
+def test_one_broken_scene_does_not_hide_the_others(tmp_path):
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "aaa.yaml").write_text("nam: x\n")
+    done = call(tmp_path, "scenes", "list")
+    assert done.returncode == 2
+    assert "bear " in done.stdout
+    assert "aaa.yaml" in done.stderr
+
+
+def test_a_view_whose_name_would_leave_the_folder_is_refused(tmp_path):
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    text = shipped.read_text().replace("{yaw: 10, height: 1.9}", "{name: ../../evil, yaw: 10, height: 1.9}")
+    (tmp_path / "evil.yaml").write_text(text)
+    done = call(tmp_path, "scenes", "render", "evil.yaml", "--out", "out")
+    assert done.returncode == 2
+    assert "../../evil" in done.stderr
+    assert not (tmp_path / "out").exists()

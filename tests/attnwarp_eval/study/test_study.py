@@ -1,0 +1,122 @@
+"""Oracles: what the YAML says, counted and named by hand."""
+
+import pytest
+import yaml
+
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study import StudyError, load_study
+from attnwarp_eval.study.probes import sensitivity
+from attnwarp_eval.study.study import shipped_studies
+
+SMALL = {
+    "name": "small",
+    "size": 64,
+    "scenes": ["spheres"],
+    "views": ["yaw030", "yaw090"],
+    "feature_sizes": [64, 16],
+    "spp": 1,
+    "splats": {"count": 500},
+    "variants": {
+        "corrected": {"preset": "corrected"},
+        "again": {"preset": "corrected", "set": {"in_front": True}},
+        "slipped": {"preset": "corrected", "set": {"pixel_centers": "integer"}},
+    },
+    "probes": {"depth": ["corrected", "again", "slipped"], "warp": ["corrected", "again", "slipped"]},
+}
+
+
+def write(folder, **changes):
+    path = folder / "study.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, **changes}))
+    return str(path)
+
+
+def cells(study):
+    return study.cells({name: load_scene(name) for name in study.scenes})
+
+
+@pytest.mark.parametrize("name", list(shipped_studies()))
+def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch):
+    # Which weights an encoder has is part of a cell's id; that they are there is tested where they are.
+    monkeypatch.setattr(sensitivity, "identity", lambda name, kind: {"weights_sha256": name})
+    study = load_study(name)
+    assert study.title
+    assert len({c.id for c in cells(study)}) == len(cells(study)) > 0
+
+
+def test_variants_of_the_same_content_share_a_cell_and_keep_both_names(tmp_path):
+    found = cells(load_study(write(tmp_path)))
+    # Pixel centres play no part in a depth map, so all three variants are one cell there and two in the warp.
+    assert [(c.probe, c.labels) for c in found] == [
+        ("calibration", ("calibration",)),
+        ("depth", ("corrected", "again", "slipped")),
+        ("warp", ("corrected", "again")),
+        ("warp", ("slipped",)),
+    ]
+
+
+def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
+    ids = {c.labels[0]: c.id for c in cells(load_study(write(tmp_path))) if c.probe == "warp"}
+    renamed = {"x": SMALL["variants"]["corrected"], "y": SMALL["variants"]["slipped"]}
+    again = cells(load_study(write(tmp_path, variants=renamed, probes={"warp": ["x", "y"]})))
+    assert {c.id for c in again if c.probe == "warp"} == set(ids.values())
+    other = cells(load_study(write(tmp_path, splats={"count": 501})))
+    assert not {c.id for c in other} & set(ids.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sizes": 64}, "sizes: unknown key; did you mean 'size'"),
+        ({"size": "large"}, "size: .*integer"),
+        ({"scenes": []}, "scenes: .*at least 1"),
+        ({"probes": {"warp": ["corected"]}}, "no variant 'corected'; did you mean 'corrected'"),
+        ({"variants": {"corrected": {"preset": "correct"}}}, "did you mean 'corrected'"),
+        ({"variants": {"corrected": {"set": {"pixel_centres": "half"}}}}, "did you mean 'pixel_centers'"),
+        ({"variants": {"corrected": {"splats": {"number": 3}}}}, "number"),
+        ({"seeds": [0, 0]}, "named twice"),
+        ({"name": "../escape"}, "name: .*pattern"),
+        ({"feature_sizes": [128]}, "expected 1 to 64, the image size"),
+        ({"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": []}]}, "add it to probes.fit"),
+        ({"fronts": [{"title": "t", "metric": "depth.foo", "variants": ["again"]}]}, "no metric 'depth.foo'"),
+        ({"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]}, "less is better"),
+        (
+            {"encoders": {"clip": "clip-smal"}},
+            r"encoders.clip: encoder 'clip-smal': unknown; did you mean 'clip-small'",
+        ),
+        ({"encoders": {"clip": "dino-small"}}, "encoders.clip: 'dino-small' is of kind 'dino'"),
+        ({"encoders": {"vlm": "clip-small"}}, "encoders.vlm"),
+        ({"probes": {"sensitivity": ["again"]}}, r"probes.sensitivity: got variants, expected \[\]"),
+        ({"variants": {}, "probes": {"warp": []}}, "variants: got none, expected at least one for probes.warp"),
+    ],
+)
+def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):
+    path = write(tmp_path, **changes)
+    with pytest.raises(StudyError, match=message) as caught:
+        load_study(path)
+    assert path in str(caught.value)
+
+
+def test_a_study_that_does_not_exist_names_those_that_do():
+    with pytest.raises(StudyError, match="did you mean 'quick'"):
+        load_study("quik")
+
+
+def test_a_view_that_a_scene_lacks_is_named(tmp_path):
+    with pytest.raises(StudyError, match="'yaw031'; did you mean 'yaw030'"):
+        cells(load_study(write(tmp_path, views=["yaw031"])))
+
+
+def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text("name: a\nscenes: [spheres]\nname: b\n")
+    with pytest.raises(StudyError, match=r"'name' stands twice(.|\n)*line 3"):
+        load_study(str(path))
+
+
+def test_feature_grids_follow_the_image_where_a_study_names_none(tmp_path):
+    study = {k: v for k, v in SMALL.items() if k != "feature_sizes"}
+    path = tmp_path / "study.yaml"
+    path.write_text(yaml.safe_dump(study))
+    assert load_study(str(path)).feature_sizes == [64, 8, 4]
+    assert load_study(str(path), size=128).feature_sizes == [128, 16, 8]
