@@ -1,8 +1,8 @@
 """Pinhole cameras.
 
-OpenCV axes (x right, y down, z forward). Pixel centres lie at +0.5, so an image spans [0, W] x [0, H] and resizing
-it by s maps a pixel coordinate u to exactly u * s. Everything is float64: the world-to-camera step is where large
-world coordinates lose their digits first.
+OpenCV axes (x right, y down, z forward). Pixel centres lie at +0.5, so an image spans [0, W] x [0,
+H] and resizing it by s maps a pixel coordinate u to exactly u * s. Everything is float64: the
+world-to-camera step is where large world coordinates lose their digits first.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from attnwarp import check
 Array = npt.NDArray[np.float64]
 
 ORTHONORMAL_TOLERANCE = 1e-5
-"""How far R R^T may be from the identity (largest entry). Poses read from float32 files stay well below it."""
+"""How far R R^T may be from the identity (largest entry). Poses read from float32 files stay well
+below it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +29,17 @@ class Camera:
     """A pinhole camera without lens distortion.
 
     Args:
-        K: (3, 3) intrinsics in pixels: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]. The principal point may lie
-            outside the image.
-        world_to_camera: (4, 4) rigid transform from world to camera axes (x right, y down, z forward).
+        K: (3, 3) intrinsics in pixels: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]. The principal
+            point may lie outside the image.
+        world_to_camera: (4, 4) rigid transform from world to camera axes (x right, y down, z
+            forward).
         width, height: image size in pixels, at least 1.
         name: a label for people; it takes no part in any computation.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a focal length that is not positive, a last row that
-            is not [0, 0, 0, 1] ([0, 0, 1] for K), a rotation that is not orthonormal to 1e-5 or mirrors.
+        ValueError: a wrong shape, a value that is not finite, a focal length that is not positive,
+            a last row that is not [0, 0, 0, 1] ([0, 0, 1] for K), a rotation that is not
+            orthonormal to 1e-5 or mirrors.
     """
 
     K: Array
@@ -52,22 +56,34 @@ class Camera:
         check.finite(K, "K")
         check.finite(pose, "world_to_camera")
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"width, height: got {self.width} x {self.height}, expected at least 1 x 1")
+            raise ValueError(
+                f"width, height: got {self.width} x {self.height}, expected at least 1 x 1"
+            )
         if K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise ValueError(f"K: got focal lengths fx={K[0, 0]}, fy={K[1, 1]}, expected positive values")
+            raise ValueError(
+                f"K: got focal lengths fx={K[0, 0]}, fy={K[1, 1]}, expected positive values"
+            )
         if K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
-            raise ValueError(f"K: got {K.tolist()}, expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]")
+            raise ValueError(
+                f"K: got {K.tolist()}, expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]"
+            )
         if not np.array_equal(pose[3], [0, 0, 0, 1]):
-            raise ValueError(f"world_to_camera: got last row {pose[3].tolist()}, expected [0, 0, 0, 1]")
+            raise ValueError(
+                f"world_to_camera: got last row {pose[3].tolist()}, expected [0, 0, 0, 1]"
+            )
         R = pose[:3, :3]
         error = float(np.abs(R @ R.T - np.eye(3)).max())
         if error > ORTHONORMAL_TOLERANCE:
             raise ValueError(
-                f"world_to_camera: rotation is not orthonormal, max |R R^T - I| = {error:.3g} "
-                f"(allowed {ORTHONORMAL_TOLERANCE:g}); remove any scale from the pose or orthonormalise it"
+                f"world_to_camera: rotation is not orthonormal, max |R R^T - I| = {error:.3g}"
+                f" (allowed {ORTHONORMAL_TOLERANCE:g}); remove any scale from the pose or"
+                " orthonormalise it"
             )
         if np.linalg.det(R) < 0:
-            raise ValueError("world_to_camera: rotation has determinant -1 (it mirrors); flip one axis of the pose")
+            raise ValueError(
+                "world_to_camera: rotation has determinant -1 (it mirrors); flip one axis of the"
+                " pose"
+            )
         K.setflags(write=False)
         pose.setflags(write=False)
         object.__setattr__(self, "K", K)
@@ -87,7 +103,8 @@ class Camera:
         up: Sequence[float] = (0.0, 0.0, 1.0),
         name: str = "",
     ) -> Camera:
-        """Camera at ``position`` looking at ``target`` with square pixels and a centred principal point.
+        """Camera at ``position`` looking at ``target`` with square pixels and a centred principal
+        point.
 
         Args:
             position, target: (3,) world points.
@@ -99,11 +116,15 @@ class Camera:
         eye = np.asarray(position, dtype=np.float64)
         forward = np.asarray(target, dtype=np.float64) - eye
         if np.linalg.norm(forward) == 0:
-            raise ValueError(f"target: equals position {eye.tolist()}, so the camera has no direction")
+            raise ValueError(
+                f"target: equals position {eye.tolist()}, so the camera has no direction"
+            )
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, dtype=np.float64))
         if np.linalg.norm(right) < 1e-9:
-            raise ValueError(f"up: {list(up)} is parallel to the viewing direction {forward.tolist()}")
+            raise ValueError(
+                f"up: {list(up)} is parallel to the viewing direction {forward.tolist()}"
+            )
         right = right / np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         pose = np.eye(4)
@@ -134,12 +155,17 @@ class Camera:
         return self.rotation[2].copy()
 
     def resize(self, width: int, height: int) -> Camera:
-        """The same camera with its image resampled to ``width`` x ``height``; u' = u * s exactly on each axis."""
+        """The same camera with its image resampled to ``width`` x ``height``; u' = u * s exactly on
+        each axis.
+        """
         sx, sy = width / self.width, height / self.height
-        return Camera(np.diag([sx, sy, 1.0]) @ self.K, self.world_to_camera, width, height, self.name)
+        return Camera(
+            np.diag([sx, sy, 1.0]) @ self.K, self.world_to_camera, width, height, self.name
+        )
 
     def moved(self, offset: Sequence[float]) -> Camera:
-        """The same camera in a world whose origin was moved: world points p become p + ``offset``."""
+        """The same camera in a world whose origin was moved: world points p become p +
+        ``offset``."""
         pose = self.world_to_camera.copy()
         pose[:3, 3] = self.translation - self.rotation @ np.asarray(offset, dtype=np.float64)
         return Camera(self.K, pose, self.width, self.height, self.name)
@@ -147,8 +173,8 @@ class Camera:
     def relative_to(self, other: Camera) -> Array:
         """(4, 4) transform from ``other``'s camera axes to this one's.
 
-        Formed from the difference of the two centres in float64, so that a baseline of 1e-6 in a world at 1e6 keeps
-        its digits where a product of the two 4x4 matrices would not.
+        Formed from the difference of the two centres in float64, so that a baseline of 1e-6 in a
+        world at 1e6 keeps its digits where a product of the two 4x4 matrices would not.
         """
         pose = np.eye(4)
         pose[:3, :3] = self.rotation @ other.rotation.T
@@ -161,7 +187,8 @@ class Camera:
         return np.stack([x, y], axis=-1)
 
     def directions(self, xy: npt.ArrayLike | None = None) -> Array:
-        """Ray directions K^-1 (x, y, 1) in camera axes with z = 1, so that a point is direction * depth.
+        """Ray directions K^-1 (x, y, 1) in camera axes with z = 1, so that a point is direction *
+        depth.
 
         Args:
             xy: (..., 2) pixel coordinates; the pixel centres, (H, W, 2), if left out.
@@ -170,7 +197,8 @@ class Camera:
             (..., 3) float64.
         """
         xy = self.pixel_centers() if xy is None else np.asarray(xy, dtype=np.float64)
-        # K^-1 by back-substitution on centred coordinates: exact for focal lengths from 1 to 1e5 px.
+        # K^-1 by back-substitution on centred coordinates: exact for focal lengths from 1 to 1e5
+        # px.
         y = (xy[..., 1] - self.K[1, 2]) / self.K[1, 1]
         x = (xy[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
         return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -188,11 +216,15 @@ class Camera:
         camera = (np.asarray(points, dtype=np.float64) - self.position) @ self.rotation.T
         z = camera[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            normalised = np.where((z > 0)[..., None], camera / np.where(z > 0, z, np.nan)[..., None], np.nan)
+            normalised = np.where(
+                (z > 0)[..., None], camera / np.where(z > 0, z, np.nan)[..., None], np.nan
+            )
         return (normalised @ self.K.T)[..., :2], z
 
     def unproject(self, xy: npt.ArrayLike, depth: npt.ArrayLike) -> Array:
-        """(..., 3) world points at ``depth`` (along the optical axis) behind pixels ``xy`` (..., 2)."""
+        """(..., 3) world points at ``depth`` (along the optical axis) behind pixels ``xy`` (...,
+        2).
+        """
         camera = self.directions(xy) * np.asarray(depth, dtype=np.float64)[..., None]
         return camera @ self.rotation + self.position
 

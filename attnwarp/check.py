@@ -1,4 +1,6 @@
-"""Checks at the public doors: return the value unchanged, or say which argument, what came, what was expected."""
+"""Checks at the public doors: return the value unchanged, or say which argument, what came, what
+was expected.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ if TYPE_CHECKING:
     import torch
 
 
-def shape(value: torch.Tensor | np.ndarray, expected: Sequence[int | str | None], name: str) -> None:
+def shape(
+    value: torch.Tensor | np.ndarray, expected: Sequence[int | str | None], name: str
+) -> None:
     """Raise ValueError unless ``value`` has the ``expected`` shape.
 
     An int must match; None or a string (a name for the reader, such as "N") matches any length.
@@ -33,7 +37,8 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name}: {array[where]} at index {where}; {int(bad.sum())} of {array.size} values are not finite"
+            f"{name}: {array[where]} at index {where}; {int(bad.sum())} of {array.size} values are"
+            " not finite"
         )
 
 
@@ -44,5 +49,7 @@ def one_of(value: str, allowed: Sequence[str], name: str) -> str:
 
         near = difflib.get_close_matches(str(value), list(allowed), n=1)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise ValueError(f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}{hint}")
+        raise ValueError(
+            f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}{hint}"
+        )
     return value

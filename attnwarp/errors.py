@@ -1,4 +1,6 @@
-"""The one kind of error that is a person's to mend: the command line shows its message and exits with code 2."""
+"""The one kind of error that is a person's to mend: the command line shows its message and exits
+with code 2.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from collections.abc import Sequence
 
 
 class InputError(ValueError):
-    """An input that cannot be used. The message names the file, what came, what was expected, and the remedy."""
+    """An input that cannot be used. The message names the file, what came, what was expected, and
+    the remedy.
+    """
 
 
 def suggest(word: str, known: Sequence[str]) -> str:

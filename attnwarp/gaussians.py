@@ -14,7 +14,9 @@ from attnwarp import check
 Kind = Literal["2d", "3d"]
 
 SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); a colour c is stored as (c - 0.5) / SH_C0."""
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi)); a colour c is stored as (c - 0.5) /
+SH_C0.
+"""
 
 
 @dataclass(eq=False)
@@ -24,18 +26,22 @@ class Gaussians:
     Args:
         kind: "2d" for flat discs with two scales (2DGS), "3d" for ellipsoids with three (3DGS).
         means: (N, 3) centres, float32 or float64, relative to ``origin``, in scene units.
-        quats: (N, 4) rotations as wxyz, any length but zero. They turn the splat's own axes into world axes; the third
-            axis of a 2D splat is its normal.
-        scales: (N, 2) for "2d", (N, 3) for "3d": standard deviations, linear, positive, in scene units.
+        quats: (N, 4) rotations as wxyz, any length but zero. They turn the splat's own axes into
+            world axes; the third axis of a 2D splat is its normal.
+        scales: (N, 2) for "2d", (N, 3) for "3d": standard deviations, linear, positive, in scene
+            units.
         opacities: (N,) in [0, 1].
-        sh: (N, (degree + 1)^2, 3) spherical-harmonic coefficients of sRGB colour, degree 0 to 3, in the layout of the
-            common PLY files: colour = max(0, sum_k sh_k Y_k(direction) + 0.5).
-        origin: (3,) float64 world position of the coordinate zero of ``means``. Keeps far-away scenes exact.
-        antialiased: the splats were fitted with the antialiased (opacity-compensated) 3DGS rasteriser.
+        sh: (N, (degree + 1)^2, 3) spherical-harmonic coefficients of sRGB colour, degree 0 to 3, in
+            the layout of the common PLY files: colour = max(0, sum_k sh_k Y_k(direction) + 0.5).
+        origin: (3,) float64 world position of the coordinate zero of ``means``. Keeps far-away
+            scenes exact.
+        antialiased: the splats were fitted with the antialiased (opacity-compensated) 3DGS
+            rasteriser.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is not positive, an
-            opacity outside [0, 1]; the message names the argument and the first bad row.
+        ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is
+            not positive, an opacity outside [0, 1]; the message names the argument and the first
+            bad row.
     """
 
     kind: Kind
@@ -57,7 +63,8 @@ class Gaussians:
         check.shape(self.sh, (n, "K", 3), "sh")
         if self.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(
-                f"sh: got {self.sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16 (degree 0 to 3)"
+                f"sh: got {self.sh.shape[1]} coefficients a channel, expected 1, 4, 9 or 16 (degree"
+                " 0 to 3)"
             )
         for name in ("means", "quats", "scales", "opacities", "sh"):
             tensor = getattr(self, name)
@@ -68,7 +75,9 @@ class Gaussians:
         check.shape(self.origin, (3,), "origin")
         check.finite(self.origin, "origin")
         self._refuse(self.quats.detach().norm(dim=-1) == 0, "quats", "zero quaternion")
-        self._refuse((self.scales.detach() <= 0).any(dim=-1), "scales", "a scale that is not positive")
+        self._refuse(
+            (self.scales.detach() <= 0).any(dim=-1), "scales", "a scale that is not positive"
+        )
         opacity = self.opacities.detach()
         self._refuse((opacity < 0) | (opacity > 1), "opacities", "opacity outside [0, 1]")
 
@@ -76,7 +85,9 @@ class Gaussians:
     def _refuse(bad: torch.Tensor, name: str, what: str) -> None:
         if bool(bad.any()):
             index = int(torch.nonzero(bad)[0, 0])
-            raise ValueError(f"{name}: {what} at index {index} ({int(bad.sum())} of {bad.shape[0]} rows)")
+            raise ValueError(
+                f"{name}: {what} at index {index} ({int(bad.sum())} of {bad.shape[0]} rows)"
+            )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -121,7 +132,9 @@ class Gaussians:
         """The splats that a (N,) boolean mask or (M,) integer index names, in that order."""
         return self._map(lambda tensor: tensor[index])
 
-    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Gaussians:
+    def to(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Gaussians:
         """A copy in another floating dtype or on another device."""
         return self._map(lambda tensor: tensor.to(dtype=dtype, device=device))
 

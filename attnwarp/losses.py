@@ -1,7 +1,8 @@
-"""Losses of a fit: differences of pictures, and regularisers of the surface that the splats describe.
+"""Losses of a fit: differences of pictures, and regularisers of the surface that the splats
+describe.
 
-Pictures are H x W x C, sRGB in [0, 1]. Every loss is a mean over pixels, so that its weight does not depend on the
-image's size.
+Pictures are H x W x C, sRGB in [0, 1]. Every loss is a mean over pixels, so that its weight does
+not depend on the image's size.
 """
 
 from __future__ import annotations
@@ -43,22 +44,27 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 
 def psnr_of_mse(error: float) -> float:
-    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0. To average views, average the error."""
+    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0. To average views,
+    average the error.
+    """
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0, 1]; 1 when they are equal.
+    """Mean structural similarity (Wang et al. 2004) of two (H, W, C) pictures in [0, 1]; 1 when
+    they are equal.
 
-    A mean over the windows that lie wholly inside the picture and over channels, as in the authors' own code and in
-    scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5, use_sample_covariance=False)``. The code
-    of 3DGS pads with zeros instead and so also scores windows that are partly outside. Differentiable in both.
+    A mean over the windows that lie wholly inside the picture and over channels, as in the authors'
+    own code and in scikit-image's ``structural_similarity(gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False)``. The code of 3DGS pads with zeros instead and so also scores
+    windows that are partly outside. Differentiable in both.
 
     Args:
         image, target: of one shape, at least 11 x 11 pixels, float32 or float64.
 
     Raises:
-        ValueError: different shapes, or a picture smaller than the window, for which it is undefined.
+        ValueError: different shapes, or a picture smaller than the window, for which it is
+            undefined.
     """
     return ssim_map(image, target).mean()
 
@@ -71,7 +77,8 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and contrast and structure.
+    """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and
+    contrast and structure.
 
     Returns:
         Two (H - 10, W - 10, C) tensors without gradients.
@@ -90,7 +97,8 @@ def _windowed(image: Tensor, target: Tensor) -> None:
         raise ValueError(f"image: got shape {tuple(image.shape)}, expected (H, W, C)")
     if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(
-            f"image: got {image.shape[1]} x {image.shape[0]} px; SSIM is undefined below {SSIM_WINDOW} x {SSIM_WINDOW}"
+            f"image: got {image.shape[1]} x {image.shape[0]} px; SSIM is undefined below"
+            f" {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
 
 
@@ -108,8 +116,8 @@ def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
 class _Ssim(torch.autograd.Function):
     """With its own backward pass: eight blurs in place of ten, and few passes over memory.
 
-    With mu = blur(x), e = blur(x^2), e12 = blur(x y) the similarity is a function of the five blurred images, and the
-    blur is its own adjoint: dx = blur(dmu) + 2 x blur(de) + y blur(de12).
+    With mu = blur(x), e = blur(x^2), e12 = blur(x y) the similarity is a function of the five
+    blurred images, and the blur is its own adjoint: dx = blur(dmu) + 2 x blur(de) + y blur(de12).
     """
 
     @staticmethod
@@ -129,7 +137,9 @@ class _Ssim(torch.autograd.Function):
         common = 2 * (a2 - a1) * share
         unlike = 2 * upstream * similarity * (1 / b1 - 1 / b2)
         grads: list[Tensor | None] = [None, None]
-        for k, (own, other, mu_own, mu_other) in enumerate(((x, y, mu_x, mu_y), (y, x, mu_y, mu_x))):
+        for k, (own, other, mu_own, mu_other) in enumerate(
+            ((x, y, mu_x, mu_y), (y, x, mu_y, mu_x))
+        ):
             if ctx.needs_input_grad[k]:
                 d_mean = _spread(common * mu_other - unlike * mu_own)
                 grads[k] = d_mean + 2 * own * d_square + other * d_cross
@@ -145,7 +155,9 @@ def _kernel() -> npt.NDArray[np.float64]:
 
 
 def _filter(values: Tensor) -> Tensor:
-    """Gaussian blur of (H, W, C), zeros outside. OpenCV's is 10 times as fast as a torch convolution on a CPU."""
+    """Gaussian blur of (H, W, C), zeros outside. OpenCV's is 10 times as fast as a torch
+    convolution on a CPU.
+    """
     import cv2
 
     array = np.ascontiguousarray(values.cpu().numpy())
@@ -168,8 +180,8 @@ def _spread(values: Tensor) -> Tensor:
 def normal_consistency(view: Render) -> Tensor:
     """Mean over pixels of sum_i w_i (1 - n_i . N), N the normal of the rendered depth (2DGS).
 
-    That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges of what is drawn)
-    count as 0. Gradients flow through both normals.
+    That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges
+    of what is drawn) count as 0. Gradients flow through both normals.
     """
     N = view.normal_from_depth
     defined = torch.isfinite(N.detach()).all(-1)
@@ -182,10 +194,10 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
 
     Args:
         view: what was rendered.
-        form: "l1", sum_ij w_i w_j |z_i - z_j| (the 2DGS paper, gsplat), or "l2_ndc", sum_{j<i} w_i w_j (m_i - m_j)^2
-            with depths mapped to [0, 1] (the original 2DGS code).
-        scale: a length in scene units that "l1" is divided by, so that its weight does not depend on the scene's
-            unit.
+        form: "l1", sum_ij w_i w_j |z_i - z_j| (the 2DGS paper, gsplat), or "l2_ndc", sum_{j<i} w_i
+            w_j (m_i - m_j)^2 with depths mapped to [0, 1] (the original 2DGS code).
+        scale: a length in scene units that "l1" is divided by, so that its weight does not depend
+            on the scene's unit.
 
     Raises:
         ValueError: another form.
@@ -196,4 +208,6 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
 
 def _same(image: Tensor, target: Tensor) -> None:
     if image.shape != target.shape:
-        raise ValueError(f"target: got shape {tuple(target.shape)}, expected that of image, {tuple(image.shape)}")
+        raise ValueError(
+            f"target: got shape {tuple(target.shape)}, expected that of image, {tuple(image.shape)}"
+        )

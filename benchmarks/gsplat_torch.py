@@ -1,11 +1,13 @@
-"""gsplat's own torch reference, run whole on a CPU: an independent judge for the tests and a yardstick for the
-benchmark.
+"""gsplat's own torch reference, run whole on a CPU: an independent judge for the tests and a
+yardstick for the benchmark.
 
-gsplat enumerates splat-pixel pairs in CUDA and composites with nerfacc; both are supplied here: the pairs by brute
-force over each splat's box, nerfacc's two functions by a cumulative sum of logarithms and an index_add. Projection,
-opacity, harmonics, colour and normals are gsplat's, unchanged; gradients reach the splats through its own functions.
+gsplat enumerates splat-pixel pairs in CUDA and composites with nerfacc; both are supplied here: the
+pairs by brute force over each splat's box, nerfacc's two functions by a cumulative sum of
+logarithms and an index_add. Projection, opacity, harmonics, colour and normals are gsplat's,
+unchanged; gradients reach the splats through its own functions.
 
-What gsplat's kernels leave out is drawn here, unless asked for: ``true_center``, ``box`` and ``stop`` of :func:`render`.
+What gsplat's kernels leave out is drawn here, unless asked for: ``true_center``, ``box`` and
+``stop`` of :func:`render`.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ STOP = 1e-4
 
 @dataclass(frozen=True)
 class Judged:
-    """gsplat's picture: (H, W, 3) colour over black, (H, W) alpha, (H, W, 3) normals in world axes (2D only), (H, W)
-    expected depth of the centres in scene units (NaN where nothing was drawn; None if not asked for); the pairs it
-    composited, and the seconds that gsplat's own functions took (the enumeration of pairs left out)."""
+    """gsplat's picture: (H, W, 3) colour over black, (H, W) alpha, (H, W, 3) normals in world axes
+    (2D only), (H, W) expected depth of the centres in scene units (NaN where nothing was drawn;
+    None if not asked for); the pairs it composited, and the seconds that gsplat's own functions
+    took (the enumeration of pairs left out)."""
 
     color: Tensor
     alpha: Tensor
@@ -50,16 +53,22 @@ class Judged:
 def _nerfacc() -> types.ModuleType:
     module = types.ModuleType("nerfacc")
 
-    def render_weight_from_alpha(alphas: Tensor, ray_indices: Tensor, n_rays: int) -> tuple[Tensor, Tensor]:
+    def render_weight_from_alpha(
+        alphas: Tensor, ray_indices: Tensor, n_rays: int
+    ) -> tuple[Tensor, Tensor]:
         logs = torch.log1p(-alphas.double())
         before = torch.cumsum(logs, 0) - logs
         first = torch.searchsorted(ray_indices, ray_indices)
         trans = torch.exp(before - before[first]).to(alphas.dtype)
         return alphas * trans, trans
 
-    def accumulate_along_rays(weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int) -> Tensor:
+    def accumulate_along_rays(
+        weights: Tensor, values: Tensor | None, ray_indices: Tensor, n_rays: int
+    ) -> Tensor:
         source = weights[:, None] if values is None else weights[:, None] * values
-        return torch.zeros(n_rays, source.shape[1], dtype=source.dtype).index_add(0, ray_indices, source)
+        return torch.zeros(n_rays, source.shape[1], dtype=source.dtype).index_add(
+            0, ray_indices, source
+        )
 
     module.render_weight_from_alpha = render_weight_from_alpha  # type: ignore[attr-defined]
     module.accumulate_along_rays = accumulate_along_rays  # type: ignore[attr-defined]
@@ -80,10 +89,12 @@ def render(
     """Render with gsplat's torch functions, in the splats' own dtype.
 
     Args:
-        true_center: 2D only: centre the screen filter on the projected centre, as here, in place of the middle of the
-            splat's box, as in gsplat.
-        box: draw a splat only in the tiles that its box of 3.33 sigma touches, as gsplat's kernels do.
-        stop: leave out the splat that brings a ray's transmittance to 1e-4 and all behind it, as gsplat's kernels do.
+        true_center: 2D only: centre the screen filter on the projected centre, as here, in place of
+            the middle of the splat's box, as in gsplat.
+        box: draw a splat only in the tiles that its box of 3.33 sigma touches, as gsplat's kernels
+            do.
+        stop: leave out the splat that brings a ray's transmittance to 1e-4 and all behind it, as
+            gsplat's kernels do.
         antialiased: 3D only.
         depth: composite the depth of the centres too.
 
@@ -107,16 +118,27 @@ def render(
     means = splats.means + torch.tensor(splats.origin, dtype=dtype)
     position = torch.tensor(camera.position, dtype=dtype)
     # As gsplat's rasterization() makes colours of them.
-    colors = (_spherical_harmonics(splats.sh_degree, means - position, splats.sh) + 0.5).clamp(min=0)
+    colors = (_spherical_harmonics(splats.sh_degree, means - position, splats.sh) + 0.5).clamp(
+        min=0
+    )
     opacities = splats.opacities
     installed = sys.modules.get("nerfacc")
     sys.modules["nerfacc"] = _nerfacc()
     try:
         start = time.perf_counter()
         if splats.kind == "3d":
-            covariances, _ = _quat_scale_to_covar_preci(splats.quats, splats.scales, compute_preci=False)
+            covariances, _ = _quat_scale_to_covar_preci(
+                splats.quats, splats.scales, compute_preci=False
+            )
             radii, means2d, depths, conics, factors = _fully_fused_projection(
-                means, covariances, view, K, width, height, near_plane=near, calc_compensations=antialiased
+                means,
+                covariances,
+                view,
+                K,
+                width,
+                height,
+                near_plane=near,
+                calc_compensations=antialiased,
             )
             if antialiased:
                 opacities = opacities * factors[0]
@@ -130,12 +152,23 @@ def render(
             if true_center:
                 means2d = table[..., :2, 2] / table[..., 2:, 2]
         seconds = time.perf_counter() - start
-        limits = torch.cat([boxes[0] - radii[0], boxes[0] + radii[0]], dim=-1).detach() / TILE if box else None
+        limits = (
+            torch.cat([boxes[0] - radii[0], boxes[0] + radii[0]], dim=-1).detach() / TILE
+            if box
+            else None
+        )
         with torch.no_grad():
             ids, pixels = _pairs(
-                splats, camera, means2d[0].detach(), depths[0].detach(), table[0].detach(), opacities.detach(), near,
-                limits, stop,
-            )  # fmt: skip
+                splats,
+                camera,
+                means2d[0].detach(),
+                depths[0].detach(),
+                table[0].detach(),
+                opacities.detach(),
+                near,
+                limits,
+                stop,
+            )
         images = torch.zeros_like(ids)
         if depth:
             colors = torch.cat([colors, depths[0][:, None]], dim=1)
@@ -147,7 +180,16 @@ def render(
             normal = None
         else:
             picture, alpha, in_camera = accumulate_2dgs(
-                means2d, table, opacities[None], colors[None], normals, ids, pixels, images, width, height
+                means2d,
+                table,
+                opacities[None],
+                colors[None],
+                normals,
+                ids,
+                pixels,
+                images,
+                width,
+                height,
             )
             normal = in_camera[0] @ view[0, :3, :3]
         seconds += time.perf_counter() - start
@@ -160,7 +202,9 @@ def render(
     expected = None
     if depth:
         drawn = covered > 0
-        expected = torch.where(drawn, picture[0, ..., 3] / torch.where(drawn, covered, 1.0), torch.nan)
+        expected = torch.where(
+            drawn, picture[0, ..., 3] / torch.where(drawn, covered, 1.0), torch.nan
+        )
     return Judged(picture[0, ..., :3], covered, normal, expected, len(ids), seconds)
 
 
@@ -175,17 +219,21 @@ def _pairs(
     boxes: Tensor | None,
     stop: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Splat and pixel of every pair with alpha >= 1/255, sorted by pixel, then depth; whole splats at a time.
+    """Splat and pixel of every pair with alpha >= 1/255, sorted by pixel, then depth; whole splats
+    at a time.
 
     ``boxes`` (N, 4) are low and high x, y in tiles, outside of which a splat is left out.
     """
     height, width = camera.height, camera.width
     rank = torch.empty(len(depths), dtype=torch.long)
     rank[torch.argsort(depths, stable=True)] = torch.arange(len(depths))
-    # A box that surely holds the footprint: the ball of 3.4 sigma around the mean, and the filters' few pixels.
+    # A box that surely holds the footprint: the ball of 3.4 sigma around the mean, and the filters'
+    # few pixels.
     reach = 3.4 * splats.scales.detach().amax(dim=-1)
     z = depths.clamp(min=near)
-    slope = torch.tensor(camera.directions([[0, 0], [width, height]]), dtype=depths.dtype).abs().amax()
+    slope = (
+        torch.tensor(camera.directions([[0, 0], [width, height]]), dtype=depths.dtype).abs().amax()
+    )
     spread = (reach / (z - reach).clamp(min=near) * (1 + slope) * float(camera.K.max()) + 4).numpy()
     xy = centers.numpy()
     low = np.clip(np.floor(xy - spread[:, None]), 0, [width, height]).astype(np.int64)
@@ -207,7 +255,9 @@ def _pairs(
             rho = a * dx * dx + 2 * b * dx * dy + d * dy * dy
         else:
             M = table[i]
-            cross = torch.linalg.cross(M[:, 2] * px[:, None] - M[:, 0], M[:, 2] * py[:, None] - M[:, 1])
+            cross = torch.linalg.cross(
+                M[:, 2] * px[:, None] - M[:, 0], M[:, 2] * py[:, None] - M[:, 1]
+            )
             uv = cross[:, :2] / cross[:, 2:]
             rho = torch.minimum((uv * uv).sum(-1), 2 * (dx * dx + dy * dy))
         alphas = opacities[i] * torch.exp(-0.5 * rho)
@@ -226,7 +276,8 @@ def _pairs(
         logs = torch.log1p(-torch.cat([f[2] for f in found])[order].clamp(max=0.999).double())
         along = torch.cumsum(logs, 0)
         first = torch.searchsorted(pixels, pixels)
-        # What is left of the light after each: it only falls along a ray, so all behind the first are left out too.
+        # What is left of the light after each: it only falls along a ray, so all behind the first
+        # are left out too.
         goes_on = torch.exp(along - (along - logs)[first]) > STOP
         ids_all, pixels = ids_all[goes_on], pixels[goes_on]
     return ids_all, pixels

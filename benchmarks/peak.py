@@ -1,5 +1,7 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""The yardstick of the benchmark: as many fused multiply-adds a second as this machine does from registers."""
+"""The yardstick of the benchmark: as many fused multiply-adds a second as this machine does from
+registers.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +11,18 @@ from attnwarp.render._kernels import lanes as L
 from attnwarp.render._kernels.layout import jit
 
 CHAINS = 12
-"""Independent chains of 16 lanes: enough to hide the latency of both multiply-add units, few enough for registers of
-either width (LLVM splits a vector of 16 in two where the machine's are shorter)."""
+"""Independent chains of 16 lanes: enough to hide the latency of both multiply-add units, few enough
+for registers of either width (LLVM splits a vector of 16 in two where the machine's are
+shorter)."""
 
 
 @jit
 def multiply_add(rounds, result):
-    """64 ``rounds`` times a = a b + c in each of CHAINS vectors; what becomes of them goes to ``result`` (16), so that
-    none is left out.
+    """64 ``rounds`` times a = a b + c in each of CHAINS vectors; what becomes of them goes to
+    ``result`` (16), so that none is left out.
 
-    In explicit vectors: left to itself LLVM uses half of the width on processors that it believes to be slower with
-    all of it, and a peak measured so is half of the true one.
+    In explicit vectors: left to itself LLVM uses half of the width on processors that it believes
+    to be slower with all of it, and a peak measured so is half of the true one.
     """
     b, c = L.load(result, 0), L.load(result, 16)
     a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = a8 = a9 = a10 = a11 = c

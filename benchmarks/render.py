@@ -1,21 +1,24 @@
 """How fast splats are rendered on this machine: ``python -m benchmarks.render`` (``make bench``).
 
-One process. The cases take turns, round after round, so that a slow moment of the machine falls on all of them; the
-median over rounds is reported, with the fastest beside it. The machine's own peak is measured in the same rounds:
-independent fused multiply-adds in registers, on as many threads as the renderer uses.
+One process. The cases take turns, round after round, so that a slow moment of the machine falls on
+all of them; the median over rounds is reported, with the fastest beside it. The machine's own peak
+is measured in the same rounds: independent fused multiply-adds in registers, on as many threads as
+the renderer uses.
 
-The share of the peak is that of processor time on both sides, so that a busy machine, which makes everything take
-longer, hardly changes it; on a quiet one it is the share of wall time but for the moments in which a thread waits.
+The share of the peak is that of processor time on both sides, so that a busy machine, which makes
+everything take longer, hardly changes it; on a quiet one it is the share of wall time but for the
+moments in which a thread waits.
 
-A splat-pixel pair counts as 45 floating-point operations (an intersection, a Gaussian, and the sums of colour, normal,
-depth and distortion). The share of the peak is that of the pairs evaluated, 16 for each splat whose intersection with a
-4 x 4 square of pixels was computed; beside it stands that of those composited, in squares that the splat draws to.
+A splat-pixel pair counts as 45 floating-point operations (an intersection, a Gaussian, and the sums
+of colour, normal, depth and distortion). The share of the peak is that of the pairs evaluated, 16
+for each splat whose intersection with a 4 x 4 square of pixels was computed; beside it stands that
+of those composited, in squares that the splat draws to.
 
-Two models are fitted over the cases by least squares of the relative error, and reported with R^2 (of the plain
-residuals) and 95 % intervals: processor time of the forward pass = a pairs + b splats + c pixels (and, for comparison,
-= a + b pairs alone); and memory, the most bytes held beyond what was held before the call, = a splats + b pixels. An
-interval holds if the cases were a random draw of such scenes, which a grid of cases is not; it says how well the
-cases determine the number.
+Two models are fitted over the cases by least squares of the relative error, and reported with R^2
+(of the plain residuals) and 95 % intervals: processor time of the forward pass = a pairs + b splats
++ c pixels (and, for comparison, = a + b pairs alone); and memory, the most bytes held beyond what
+was held before the call, = a splats + b pixels. An interval holds if the cases were a random draw
+of such scenes, which a grid of cases is not; it says how well the cases determine the number.
 """
 
 from __future__ import annotations
@@ -49,7 +52,9 @@ GSPLAT_SECONDS = 90.0
 
 @dataclass
 class Case:
-    """One picture to be timed: kind, image size, number of splats, largest sigma; and what was measured."""
+    """One picture to be timed: kind, image size, number of splats, largest sigma; and what was
+    measured.
+    """
 
     kind: str
     size: int
@@ -72,11 +77,20 @@ class Case:
 
 
 def scene(kind: str, count: int, sigma: float, seed: int = 0) -> Gaussians:
-    """Random splats in a unit ball: sigmas uniform up to ``sigma``, opacities uniform in [0, 1], degree 0 colours."""
+    """Random splats in a unit ball: sigmas uniform up to ``sigma``, opacities uniform in [0, 1],
+    degree 0 colours.
+    """
     generator = torch.Generator().manual_seed(seed)
     means = torch.randn(count, 3, generator=generator)
-    means = means / means.norm(dim=1, keepdim=True) * torch.rand(count, 1, generator=generator) ** (1 / 3)
-    scales = torch.rand(count, 2 if kind == "2d" else 3, generator=generator) * 0.95 * sigma + 0.05 * sigma
+    means = (
+        means
+        / means.norm(dim=1, keepdim=True)
+        * torch.rand(count, 1, generator=generator) ** (1 / 3)
+    )
+    scales = (
+        torch.rand(count, 2 if kind == "2d" else 3, generator=generator) * 0.95 * sigma
+        + 0.05 * sigma
+    )
     return Gaussians(
         "2d" if kind == "2d" else "3d",
         means,
@@ -93,8 +107,8 @@ def camera(size: int) -> Camera:
 
 
 def measure_peak(threads: int, milliseconds: float = 15) -> float:
-    """Floating-point operations a second in independent fused multiply-adds held in registers, on ``threads``
-    threads."""
+    """Floating-point operations a second in independent fused multiply-adds held in registers, on
+    ``threads`` threads."""
     from benchmarks import peak
 
     operations = 2.0 * 16 * peak.CHAINS * 64
@@ -107,16 +121,21 @@ def measure_peak(threads: int, milliseconds: float = 15) -> float:
 
 
 def _differentiate(splats: Gaussians, view: Camera) -> None:
-    """A forward and a backward pass. Upstream gradients of ones: the loss is not what is measured."""
+    """A forward and a backward pass. Upstream gradients of ones: the loss is not what is
+    measured."""
     traced = render(splats, view, backend="cpu")
     outputs = [traced.color, traced.alpha, traced.normal, traced.distortion_l1]
     ones = torch.ones(view.height, view.width)
-    torch.autograd.backward(outputs, [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs])
+    torch.autograd.backward(
+        outputs, [ones[..., None].expand_as(o) if o.ndim == 3 else ones for o in outputs]
+    )
 
 
 def _with_leaves(splats: Gaussians) -> Gaussians:
     names = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(splats.kind, *(getattr(splats, name).clone().requires_grad_() for name in names))
+    return Gaussians(
+        splats.kind, *(getattr(splats, name).clone().requires_grad_() for name in names)
+    )
 
 
 def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
@@ -136,7 +155,9 @@ def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
 
 
 def measure_memory(case: Case, splats: Gaussians, view: Camera) -> None:
-    """The most that one forward pass, and one with a backward pass, hold at once: results, gradients and all."""
+    """The most that one forward pass, and one with a backward pass, hold at once: results,
+    gradients and all.
+    """
     again = _with_leaves(splats)
 
     def most(work: Any) -> int:
@@ -154,24 +175,31 @@ def measure_memory(case: Case, splats: Gaussians, view: Camera) -> None:
 
 
 def fit(columns: Mapping[str, Sequence[float]], y: Sequence[float]) -> dict[str, Any] | None:
-    """Least squares in relative error (each case weighs 1 / y^2) of ``y`` as a sum of multiples of ``columns``.
+    """Least squares in relative error (each case weighs 1 / y^2) of ``y`` as a sum of multiples of
+    ``columns``.
 
     Returns:
-        For each column its factor and the ends of its 95 % interval (Student's t); "r2" of the plain residuals, and
-        "typical_error", the median of the relative ones. None if there are too few cases, or columns that are
-        multiples of one another.
+        For each column its factor and the ends of its 95 % interval (Student's t); "r2" of the
+        plain residuals, and "typical_error", the median of the relative ones. None if there are too
+        few cases, or columns that are multiples of one another.
     """
     b = np.asarray(y, float)
     design = np.stack([np.asarray(c, float) for c in columns.values()], axis=1) / b[:, None]
     freedom = len(b) - design.shape[1]
-    if freedom < 1 or np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
+    if (
+        freedom < 1
+        or np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]
+    ):
         return None
     factors, *_ = np.linalg.lstsq(design, np.ones(len(b)), rcond=None)
     residual = 1 - design @ factors
     variance = residual @ residual / freedom * np.diag(np.linalg.inv(design.T @ design))
     reach = stats.t.ppf(0.975, freedom) * np.sqrt(variance)
     return {
-        **{name: [float(f), float(f - r), float(f + r)] for name, f, r in zip(columns, factors, reach, strict=True)},
+        **{
+            name: [float(f), float(f - r), float(f + r)]
+            for name, f, r in zip(columns, factors, reach, strict=True)
+        },
         "r2": float(1 - np.var(residual * b) / np.var(b)),
         "typical_error": float(np.median(np.abs(residual))),
     }
@@ -185,13 +213,19 @@ def fits(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         "time": fit({"pairs": pairs, "splats": splats, "pixels": pixels}, time_ns),
         "time_by_pairs_alone": fit({"call": one, "pairs": pairs}, time_ns),
-        "memory_forward": fit({"splats": splats, "pixels": pixels}, [r["forward_bytes"] for r in rows]),
-        "memory_both": fit({"splats": splats, "pixels": pixels}, [r["forward_backward_bytes"] for r in rows]),
+        "memory_forward": fit(
+            {"splats": splats, "pixels": pixels}, [r["forward_bytes"] for r in rows]
+        ),
+        "memory_both": fit(
+            {"splats": splats, "pixels": pixels}, [r["forward_backward_bytes"] for r in rows]
+        ),
     }
 
 
 def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
-    """Time ``cases``, gsplat's reference up to ``gsplat`` contributing pairs; all of the table, as JSON values."""
+    """Time ``cases``, gsplat's reference up to ``gsplat`` contributing pairs; all of the table, as
+    JSON values.
+    """
     start = time.perf_counter()
     for kind in sorted({case.kind for case in cases}):
         time_once(Case(kind, 32, 100, 0.1), scene(kind, 100, 0.1), camera(32))
@@ -213,7 +247,9 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
         "rounds": rounds,
         "first_call_seconds": round(warm_up, 2),
         "peak_memory_mib": round(memory, 1),
-        "fma_peak_gflops_per_thread": round(statistics.median(p for case in cases for p in case.peak) / 1e9, 1),
+        "fma_peak_gflops_per_thread": round(
+            statistics.median(p for case in cases for p in case.peak) / 1e9, 1
+        ),
         "fits": fits(rows),
         "cases": rows,
     }
@@ -230,9 +266,11 @@ def _processor() -> str:
 
 
 def judge(built: list[tuple[Case, Gaussians, Camera]], most: int) -> None:
-    """Time gsplat's torch reference on the cases with up to ``most`` contributing pairs; its memory grows with them.
+    """Time gsplat's torch reference on the cases with up to ``most`` contributing pairs; its memory
+    grows with them.
 
-    The pictures of the aim (50k splats, 512 x 512) first, then the easy ones; no further one after GSPLAT_SECONDS.
+    The pictures of the aim (50k splats, 512 x 512) first, then the easy ones; no further one after
+    GSPLAT_SECONDS.
     """
     try:
         from benchmarks import gsplat_torch
@@ -240,7 +278,12 @@ def judge(built: list[tuple[Case, Gaussians, Camera]], most: int) -> None:
         start = time.perf_counter()
         wanted = [item for item in built if item[0].counters["contributing"] <= most]
         aim = (512, 50_000)
-        wanted.sort(key=lambda item: ((item[0].size, item[0].splats) != aim, item[0].counters["contributing"]))
+        wanted.sort(
+            key=lambda item: (
+                (item[0].size, item[0].splats) != aim,
+                item[0].counters["contributing"],
+            )
+        )
         for case, splats, view in wanted:
             if time.perf_counter() - start > GSPLAT_SECONDS:
                 break
@@ -255,7 +298,9 @@ def row(case: Case) -> dict[str, Any]:
     pairs = case.counters["pairs"]
     cpu, both_cpu = statistics.median(case.forward_cpu), statistics.median(case.both_cpu)
     # Against the peak of the same rounds: the processor's clock moves.
-    share = statistics.median(FLOPS_PER_PAIR / f / p for f, p in zip(case.forward_cpu, case.peak, strict=True))
+    share = statistics.median(
+        FLOPS_PER_PAIR / f / p for f, p in zip(case.forward_cpu, case.peak, strict=True)
+    )
     return {
         "kind": case.kind,
         "size": case.size,
@@ -275,8 +320,12 @@ def row(case: Case) -> dict[str, Any]:
         "fma_share_composited": round(case.counters["composited"] * share, 4),
         "forward_bytes": case.forward_bytes,
         "forward_backward_bytes": case.both_bytes,
-        "gsplat_torch_ms": None if case.gsplat_seconds is None else round(1e3 * case.gsplat_seconds, 1),
-        "times_gsplat": None if case.gsplat_seconds is None else round(case.gsplat_seconds / forward, 1),
+        "gsplat_torch_ms": (
+            None if case.gsplat_seconds is None else round(1e3 * case.gsplat_seconds, 1)
+        ),
+        "times_gsplat": (
+            None if case.gsplat_seconds is None else round(case.gsplat_seconds / forward, 1)
+        ),
     }
 
 
@@ -289,8 +338,11 @@ def table(result: dict[str, Any]) -> str:
     lines = [
         head,
         "",
-        "| kind | size | splats | max sigma | forward ms (best; cpu) | fwd + bwd ms (cpu) | bwd / fwd | Mpairs | Gpairs/s "
-        "| of FMA peak (composited) | MiB (fwd + bwd) | gsplat torch ms | times faster |",
+        (
+            "| kind | size | splats | max sigma | forward ms (best; cpu) | fwd + bwd ms (cpu) | bwd"
+            " / fwd | Mpairs | Gpairs/s | of FMA peak (composited) | MiB (fwd + bwd) | gsplat torch"
+            " ms | times faster |"
+        ),
         "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in result["cases"]:
@@ -319,8 +371,13 @@ def table(result: dict[str, Any]) -> str:
 def _sentences(models: Mapping[str, Any]) -> list[str]:
     def terms(model: Mapping[str, Any], unit: str) -> str:
         factors = [(name, value) for name, value in model.items() if isinstance(value, list)]
-        said = [f"{f:.3g} {unit} a {name.rstrip('s')} [{low:.3g}, {high:.3g}]" for name, (f, low, high) in factors]
-        fitted = f"R^2 {model['r2']:.3f}, half of the cases within {100 * model['typical_error']:.0f} %"
+        said = [
+            f"{f:.3g} {unit} a {name.rstrip('s')} [{low:.3g}, {high:.3g}]"
+            for name, (f, low, high) in factors
+        ]
+        fitted = (
+            f"R^2 {model['r2']:.3f}, half of the cases within {100 * model['typical_error']:.0f} %"
+        )
         return f"{' + '.join(said)}; {fitted}"
 
     names = {
@@ -329,18 +386,32 @@ def _sentences(models: Mapping[str, Any]) -> list[str]:
         "memory_forward": ("memory, forward", "bytes"),
         "memory_both": ("memory, forward and backward", "bytes"),
     }
-    return [f"- {said} = {terms(models[key], unit)}" for key, (said, unit) in names.items() if models[key]]
+    return [
+        f"- {said} = {terms(models[key], unit)}"
+        for key, (said, unit) in names.items()
+        if models[key]
+    ]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.render", description="Time the CPU renderer.")
-    parser.add_argument("--quick", action="store_true", help="256 x 256 with 10k and 50k splats only, 3 rounds")
-    parser.add_argument("--rounds", type=int, default=7, help="times each case is measured (default 7)")
-    parser.add_argument("--no-gsplat", action="store_true", help="leave out gsplat's torch reference")
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.render", description="Time the CPU renderer."
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="256 x 256 with 10k and 50k splats only, 3 rounds"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=7, help="times each case is measured (default 7)"
+    )
+    parser.add_argument(
+        "--no-gsplat", action="store_true", help="leave out gsplat's torch reference"
+    )
     parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
     options = parser.parse_args(arguments)
-    sizes, counts = ([256], [10_000, 50_000]) if options.quick else ([256, 512], [10_000, 50_000, 200_000])
+    sizes, counts = (
+        ([256], [10_000, 50_000]) if options.quick else ([256, 512], [10_000, 50_000, 200_000])
+    )
     cases = [
         Case(kind, size, count, sigma)
         for size in sizes

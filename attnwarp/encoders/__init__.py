@@ -1,4 +1,5 @@
-"""One door for all encoders: small bundled ones that need no download, and real ones from a local folder.
+"""One door for all encoders: small bundled ones that need no download, and real ones from a local
+folder.
 
     load_encoder("clip-small").images([picture])
     load_encoder("clip:/models/clip-vit-large-patch14-336").texts(["a photo of a bear statue"])
@@ -42,15 +43,27 @@ __all__ = [
 
 BUNDLED: dict[str, tuple[Kind, str]] = {
     "clip-small": ("clip", "a small text and image encoder trained on random rendered scenes"),
-    "dino-small": ("dino", "a small image encoder trained on random rendered scenes, without labels"),
+    "dino-small": (
+        "dino",
+        "a small image encoder trained on random rendered scenes, without labels",
+    ),
     "perceptual-small": ("perceptual", "a small perceptual distance in the manner of LPIPS"),
 }
 """What ships with the package: name -> (kind, one line)."""
 
 REAL: dict[str, tuple[Kind, str]] = {
-    "clip:FOLDER": ("clip", "CLIP in the transformers format, such as openai/clip-vit-large-patch14-336"),
-    "dinov2:FOLDER": ("dino", "DINOv2 in the transformers format, such as facebook/dinov2-with-registers-small"),
-    "lpips:FILE_OR_FOLDER": ("perceptual", "LPIPS: a torchvision backbone (alex, vgg, squeeze) and its linear layers"),
+    "clip:FOLDER": (
+        "clip",
+        "CLIP in the transformers format, such as openai/clip-vit-large-patch14-336",
+    ),
+    "dinov2:FOLDER": (
+        "dino",
+        "DINOv2 in the transformers format, such as facebook/dinov2-with-registers-small",
+    ),
+    "lpips:FILE_OR_FOLDER": (
+        "perceptual",
+        "LPIPS: a torchvision backbone (alex, vgg, squeeze) and its linear layers",
+    ),
 }
 """What is read from a place of the user's own: pattern -> (kind, one line)."""
 
@@ -73,7 +86,9 @@ def kind_of(name: str) -> Kind:
         return BUNDLED[name][0]
     if colon and scheme in _SCHEMES:
         if not place.strip():
-            raise InputError(f"encoder {name!r}: no place behind the colon, expected {_pattern(scheme)}")
+            raise InputError(
+                f"encoder {name!r}: no place behind the colon, expected {_pattern(scheme)}"
+            )
         return _SCHEMES[scheme]
     known = [*BUNDLED, *_SCHEMES]
     close = difflib.get_close_matches((scheme if colon else name).lower(), known, n=1, cutoff=0.5)
@@ -86,34 +101,39 @@ def load_encoder(name: str, kind: Literal["clip"], *, device: str = "cpu") -> Te
 @overload
 def load_encoder(name: str, kind: Literal["dino"], *, device: str = "cpu") -> TokenEncoder: ...
 @overload
-def load_encoder(name: str, kind: Literal["perceptual"], *, device: str = "cpu") -> PerceptualDistance: ...
+def load_encoder(
+    name: str, kind: Literal["perceptual"], *, device: str = "cpu"
+) -> PerceptualDistance: ...
 @overload
 def load_encoder(name: str, kind: None = None, *, device: str = "cpu") -> Encoder: ...
 def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") -> Any:
     """Load an encoder by name.
 
     Args:
-        name: a bundled one (``clip-small``, ``dino-small``, ``perceptual-small``), or ``clip:FOLDER``,
-            ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
+        name: a bundled one (``clip-small``, ``dino-small``, ``perceptual-small``), or
+            ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
         kind: what is needed; an encoder of another kind is refused before it is loaded.
         device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.
 
     Returns:
-        A :class:`TextImageEncoder` ("clip"), a :class:`TokenEncoder` ("dino") or a :class:`PerceptualDistance`
-        ("perceptual").
+        A :class:`TextImageEncoder` ("clip"), a :class:`TokenEncoder` ("dino") or a
+        :class:`PerceptualDistance` ("perceptual").
 
     Raises:
-        InputError: no such name, another kind than asked for, or weights that are missing or not what they should be;
-            the message says which files go where.
+        InputError: no such name, another kind than asked for, or weights that are missing or not
+            what they should be; the message says which files go where.
     """
     found = kind_of(name)
     if kind is not None and found != kind:
         fitting = ", ".join(n for n, (k, _) in (BUNDLED | REAL).items() if k == kind)
-        raise InputError(f"encoder {name!r}: is of kind {found!r}, expected {kind!r}; name one of {fitting}")
+        raise InputError(
+            f"encoder {name!r}: is of kind {found!r}, expected {kind!r}; name one of {fitting}"
+        )
     if name in BUNDLED:
         if importlib.util.find_spec("attnwarp.encoders.bundled") is None:
             raise InputError(
-                f"encoder {name!r}: this installation carries no bundled weights; name a real one: {', '.join(REAL)}"
+                f"encoder {name!r}: this installation carries no bundled weights; name a real one:"
+                f" {', '.join(REAL)}"
             )
         return importlib.import_module("attnwarp.encoders.bundled").load(name)
     scheme, _, place = name.partition(":")

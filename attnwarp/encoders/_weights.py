@@ -1,4 +1,5 @@
-"""Files of weights: finding them, naming them by content, and running them the same way everywhere."""
+"""Files of weights: finding them, naming them by content, and running them the same way
+everywhere."""
 
 from __future__ import annotations
 
@@ -36,9 +37,13 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError:
         raise
-    except Exception as error:  # the two readers raise many kinds, all of which mean the same to a person
+    except (
+        Exception
+    ) as error:  # the two readers raise many kinds, all of which mean the same to a person
         first = str(error).strip().splitlines()[:1]
-        raise InputError(f"{path}: cannot be read as weights ({''.join(first)}); fetch the file again") from None
+        raise InputError(
+            f"{path}: cannot be read as weights ({''.join(first)}); fetch the file again"
+        ) from None
     if isinstance(state, dict) and isinstance(state.get("state_dict"), dict):
         state = state["state_dict"]
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
@@ -61,6 +66,8 @@ def device_of(name: str) -> torch.device:
 
 @contextmanager
 def full_float32() -> Iterator[None]:
-    """No gradients, and true float32 in convolutions: cuDNN would take TF32, of 10 bits, by default."""
+    """No gradients, and true float32 in convolutions: cuDNN would take TF32, of 10 bits, by
+    default.
+    """
     with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
         yield

@@ -1,4 +1,5 @@
-"""What an encoder is: the protocols that bundled and real ones share, and the checks at their doors.
+"""What an encoder is: the protocols that bundled and real ones share, and the checks at their
+doors.
 
 Nothing heavy is imported here.
 """
@@ -21,15 +22,19 @@ Image = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class EncoderInfo:
-    """Which encoder gave a figure. It stands beside every result, since figures of two encoders do not compare.
+    """Which encoder gave a figure. It stands beside every result, since figures of two encoders do
+    not compare.
 
     Attributes:
         name: what :func:`attnwarp.encoders.load_encoder` was asked for.
-        kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a distance of images).
+        kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a
+            distance of images).
         source: "bundled", or the folder or file that the weights were read from.
-        weights_sha256: of the weights' file; where there are several, of their bytes in the order of their names.
+        weights_sha256: of the weights' file; where there are several, of their bytes in the order
+            of their names.
         preprocessing: in words, what happens to a picture before the network sees it.
-        size: side in px of the square that the network sees; None: pictures go in at their own size.
+        size: side in px of the square that the network sees; None: pictures go in at their own
+            size.
         dim: length of an embedding; None where there is none.
     """
 
@@ -59,8 +64,8 @@ class ImageEncoder(Protocol):
         """(N, D) float64 embeddings, not normalised; (0, D) of an empty list.
 
         Args:
-            images: N pictures (H, W, 3), sRGB, floating, in [0, 1]; each of its own size. What becomes of a picture
-                does not depend on the others in the list.
+            images: N pictures (H, W, 3), sRGB, floating, in [0, 1]; each of its own size. What
+                becomes of a picture does not depend on the others in the list.
 
         Raises:
             ValueError: a picture of another shape, dtype or range; the message names its index.
@@ -82,7 +87,9 @@ class TokenEncoder(ImageEncoder, Protocol):
     """Pictures to an embedding each and to a grid of patch embeddings, as DINO."""
 
     def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, h, w, D) float64 embeddings of the patches, row by row as they lie in the preprocessed picture."""
+        """(N, h, w, D) float64 embeddings of the patches, row by row as they lie in the
+        preprocessed picture.
+        """
         ...
 
 
@@ -99,12 +106,13 @@ class PerceptualDistance(Protocol):
         """(N,) float64 distances, 0 for equal pictures.
 
         Args:
-            a, b: N pictures each, (H, W, 3), sRGB, floating, in [0, 1] (the scaling to [-1, 1] happens inside);
-                ``a[i]`` and ``b[i]`` of one size, which may differ from pair to pair.
+            a, b: N pictures each, (H, W, 3), sRGB, floating, in [0, 1] (the scaling to [-1, 1]
+                happens inside); ``a[i]`` and ``b[i]`` of one size, which may differ from pair to
+                pair.
 
         Raises:
-            ValueError: lists of different lengths, a pair of different sizes, a bad picture; the message names the
-                index.
+            ValueError: lists of different lengths, a pair of different sizes, a bad picture; the
+                message names the index.
         """
         ...
 
@@ -117,10 +125,13 @@ def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.ND
 
     Raises:
         TypeError: one picture where a list was expected.
-        ValueError: not (H, W, 3), not floating, not finite, or out of [0, 1]; the message names the index.
+        ValueError: not (H, W, 3), not floating, not finite, or out of [0, 1]; the message names the
+            index.
     """
     if isinstance(images, np.ndarray) and images.ndim == 3:
-        raise TypeError(f"{name}: got one picture of shape {images.shape}, expected a list of pictures")
+        raise TypeError(
+            f"{name}: got one picture of shape {images.shape}, expected a list of pictures"
+        )
     return [checked_image(image, f"{name}[{i}]") for i, image in enumerate(images)]
 
 
@@ -128,12 +139,19 @@ def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
     """One picture in float32. Raises ValueError, see :func:`checked_images`."""
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
-        raise ValueError(f"{name}: got shape {array.shape}, expected (H, W, 3) with at least one pixel")
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected (H, W, 3) with at least one pixel"
+        )
     if array.dtype.kind != "f":
-        raise ValueError(f"{name}: got {array.dtype}, expected floating sRGB in [0, 1]; divide 8 bits by 255")
-    # Tested in its own dtype: a float64 of 1e300 must be refused as out of range, not overflow on the way.
+        raise ValueError(
+            f"{name}: got {array.dtype}, expected floating sRGB in [0, 1]; divide 8 bits by 255"
+        )
+    # Tested in its own dtype: a float64 of 1e300 must be refused as out of range, not overflow on
+    # the way.
     if not np.isfinite(array).all():
-        raise ValueError(f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite, expected none")
+        raise ValueError(
+            f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite, expected none"
+        )
     low, high = float(array.min()), float(array.max())
     if low < 0 or high > 1:
         raise ValueError(f"{name}: got values in [{low:g}, {high:g}], expected [0, 1]")
@@ -146,7 +164,8 @@ def checked_pairs(
     """Pairs of pictures in float32, equal in size within each pair.
 
     Raises:
-        TypeError, ValueError: as :func:`checked_images`; lists of different lengths; a pair of different sizes.
+        TypeError, ValueError: as :func:`checked_images`; lists of different lengths; a pair of
+            different sizes.
     """
     left, right = checked_images(a, "a"), checked_images(b, "b")
     if len(left) != len(right):
@@ -154,7 +173,8 @@ def checked_pairs(
     for i, (one, other) in enumerate(zip(left, right, strict=True)):
         if one.shape != other.shape:
             raise ValueError(
-                f"b[{i}]: got {other.shape[1]} x {other.shape[0]} px, expected {one.shape[1]} x {one.shape[0]}, as a[{i}]"
+                f"b[{i}]: got {other.shape[1]} x {other.shape[0]} px, expected {one.shape[1]} x"
+                f" {one.shape[0]}, as a[{i}]"
             )
     return list(zip(left, right, strict=True))
 

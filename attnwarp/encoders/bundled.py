@@ -1,4 +1,6 @@
-"""The three encoders that ship with the package: small, trained from nothing by eval/training/, read from weights/."""
+"""The three encoders that ship with the package: small, trained from nothing by eval/training/,
+read from weights/.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.encoders._weights import full_float32, sha256_of
-from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_images, checked_pairs, checked_texts
+from attnwarp.encoders.base import (
+    EncoderInfo,
+    Image,
+    Kind,
+    checked_images,
+    checked_pairs,
+    checked_texts,
+)
 from attnwarp.encoders.nets import ClipSmall, DinoSmall, PerceptualSmall
 from attnwarp.encoders.preprocess import Preprocessing
 from attnwarp.errors import InputError
@@ -28,7 +37,8 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
 
     Args:
         name: which.
-        folder: where ``name``.safetensors lies, and clip-small's tokenizer; the package's own if left out.
+        folder: where ``name``.safetensors lies, and clip-small's tokenizer; the package's own if
+            left out.
 
     Raises:
         InputError: no such encoder, or weights that are missing or of another network.
@@ -42,21 +52,29 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     return made
 
 
-def _info(name: str, kind: Kind, files: Sequence[Path], how: str, size: int | None, dim: int | None) -> EncoderInfo:
+def _info(
+    name: str, kind: Kind, files: Sequence[Path], how: str, size: int | None, dim: int | None
+) -> EncoderInfo:
     return EncoderInfo(name, kind, "bundled", sha256_of(files), how, size, dim)
 
 
 def _read(net: torch.nn.Module, path: Path) -> None:
-    """Fill a network with the weights of a file, which are stored in half precision and used in single."""
+    """Fill a network with the weights of a file, which are stored in half precision and used in
+    single.
+    """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
         net.load_state_dict({key: value.float() for key, value in load_file(path).items()})
     except FileNotFoundError:
-        raise InputError(f"{path}: missing; install the package again, or train it (eval/training/README.md)") from None
+        raise InputError(
+            f"{path}: missing; install the package again, or train it (eval/training/README.md)"
+        ) from None
     except (SafetensorError, RuntimeError) as error:
-        raise InputError(f"{path}: not the weights of this version ({str(error).splitlines()[0]})") from None
+        raise InputError(
+            f"{path}: not the weights of this version ({str(error).splitlines()[0]})"
+        ) from None
     net.eval().requires_grad_(False)
 
 
@@ -81,12 +99,17 @@ class BundledClip(_OfSquares):
 
         words = folder / f"{name}.tokenizer.json"
         if not words.is_file():
-            raise InputError(f"{words}: missing; install the package again, or train it (eval/training/README.md)")
+            raise InputError(
+                f"{words}: missing; install the package again, or train it"
+                " (eval/training/README.md)"
+            )
         self.tokenizer = Tokenizer.from_file(str(words))
         self.net = ClipSmall(self.tokenizer.get_vocab_size())
         weights = folder / f"{name}.safetensors"
         _read(self.net, weights)
-        self.preprocess = Preprocessing(resize=ClipSmall.size, crop=(ClipSmall.size, ClipSmall.size))
+        self.preprocess = Preprocessing(
+            resize=ClipSmall.size, crop=(ClipSmall.size, ClipSmall.size)
+        )
         dim = self.net.pool.project.out_features
         how = f"{self.preprocess}; mean of the picture's embedding and its mirror image's"
         self.about = _info(name, "clip", [weights, words], how, ClipSmall.size, dim)
@@ -94,8 +117,8 @@ class BundledClip(_OfSquares):
     def images(self, images: Sequence[Image]) -> Array:
         """(N, D) float64 embeddings, not normalised.
 
-        Each is the mean with the mirror image's: no caption that was trained on knows left from right, so what a mirror changes
-        is error.
+        Each is the mean with the mirror image's: no caption that was trained on knows left from
+        right, so what a mirror changes is error.
         """
         with full_float32():
             found = [
@@ -109,12 +132,16 @@ class BundledClip(_OfSquares):
         return sum(len(rest.ids) - 1 for rest in self.tokenizer.encode(text).overflowing)
 
     def texts(self, texts: Sequence[str]) -> Array:
-        """(N, D) float64 embeddings, not normalised; words that are not in the vocabulary are read in pieces."""
+        """(N, D) float64 embeddings, not normalised; words that are not in the vocabulary are read
+        in pieces.
+        """
         said = checked_texts(texts)
         if not said:
             return np.zeros((0, self.about.dim or 0))
         with full_float32():
-            codes = torch.tensor([code.ids for code in self.tokenizer.encode_batch(said)], dtype=torch.int64)
+            codes = torch.tensor(
+                [code.ids for code in self.tokenizer.encode_batch(said)], dtype=torch.int64
+            )
             return self.net.texts(codes).double().numpy()
 
 
@@ -125,8 +152,12 @@ class BundledDino(_OfSquares):
         self.net = DinoSmall()
         weights = folder / f"{name}.safetensors"
         _read(self.net, weights)
-        self.preprocess = Preprocessing(resize=DinoSmall.size, crop=(DinoSmall.size, DinoSmall.size))
-        self.about = _info(name, "dino", [weights], str(self.preprocess), DinoSmall.size, self.net.dim)
+        self.preprocess = Preprocessing(
+            resize=DinoSmall.size, crop=(DinoSmall.size, DinoSmall.size)
+        )
+        self.about = _info(
+            name, "dino", [weights], str(self.preprocess), DinoSmall.size, self.net.dim
+        )
 
     def images(self, images: Sequence[Image]) -> Array:
         """(N, D) float64 class tokens, not normalised."""
@@ -135,9 +166,13 @@ class BundledDino(_OfSquares):
         return np.concatenate(found) if found else np.zeros((0, self.net.dim))
 
     def tokens(self, images: Sequence[Image]) -> Array:
-        """(N, 8, 8, D) float64 patch tokens of the central square, each of 16 x 16 px of 128 x 128."""
+        """(N, 8, 8, D) float64 patch tokens of the central square, each of 16 x 16 px of 128 x
+        128."""
         with full_float32():
-            found = [self.net(batch)[1].permute(0, 2, 3, 1).double().numpy() for batch in self._batches(images)]
+            found = [
+                self.net(batch)[1].permute(0, 2, 3, 1).double().numpy()
+                for batch in self._batches(images)
+            ]
         side = DinoSmall.size // DinoSmall.patch
         return np.concatenate(found) if found else np.zeros((0, side, side, self.net.dim))
 
@@ -152,7 +187,9 @@ class BundledPerceptual:
         self.about = _info(name, "perceptual", [weights], "as it is, at its own size", None, None)
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> Array:
-        """(N,) float64 distances, 0 for equal pictures; about (strength of the distortion / 5)^2, see the model card."""
+        """(N,) float64 distances, 0 for equal pictures; about (strength of the distortion / 5)^2,
+        see the model card.
+        """
         found = []
         with full_float32():
             for one, other in checked_pairs(a, b):

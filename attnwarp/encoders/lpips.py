@@ -1,9 +1,11 @@
-"""LPIPS from local weights: a torchvision backbone (AlexNet, VGG16, SqueezeNet 1.1) and the published linear layers.
+"""LPIPS from local weights: a torchvision backbone (AlexNet, VGG16, SqueezeNet 1.1) and the
+published linear layers.
 
-The networks are written here, with torchvision's names for their tensors, so that torchvision need not be installed.
+The networks are written here, with torchvision's names for their tensors, so that torchvision need
+not be installed.
 
-Source: R. Zhang, P. Isola, A. A. Efros, E. Shechtman, O. Wang, "The Unreasonable Effectiveness of Deep Features as a
-Perceptual Metric", CVPR 2018, and its released weights, version 0.1.
+Source: R. Zhang, P. Isola, A. A. Efros, E. Shechtman, O. Wang, "The Unreasonable Effectiveness of
+Deep Features as a Perceptual Metric", CVPR 2018, and its released weights, version 0.1.
 """
 
 from __future__ import annotations
@@ -24,10 +26,14 @@ from attnwarp.errors import InputError
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-"""The published scaling layer: (x - shift) / scale of x in [-1, 1], which is ImageNet's normalisation."""
+"""The published scaling layer: (x - shift) / scale of x in [-1, 1], which is ImageNet's
+normalisation.
+"""
 
 EPSILON = 1e-10
-"""Added to a feature's norm before dividing, as published: it matters only where no channel responds at all."""
+"""Added to a feature's norm before dividing, as published: it matters only where no channel
+responds at all.
+"""
 
 SUFFIXES = (".pth", ".pt", ".bin", ".safetensors")
 
@@ -54,10 +60,16 @@ class Backbone:
 BACKBONES = {
     b.name: b
     for b in (
-        Backbone("alex", "alexnet-owt-7be5be79.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31),
+        Backbone(
+            "alex", "alexnet-owt-7be5be79.pth", (1, 4, 7, 9, 11), (64, 192, 384, 256, 256), 31
+        ),
         Backbone("vgg", "vgg16-397923af.pth", (3, 8, 15, 22, 29), (64, 128, 256, 512, 512), 16),
         Backbone(
-            "squeeze", "squeezenet1_1-b8a52dc0.pth", (1, 4, 7, 9, 10, 11, 12), (64, 128, 256, 384, 384, 512, 512), 17
+            "squeeze",
+            "squeezenet1_1-b8a52dc0.pth",
+            (1, 4, 7, 9, 10, 11, 12),
+            (64, 128, 256, 384, 384, 512, 512),
+            17,
         ),
     )
 }
@@ -79,9 +91,15 @@ class Fire(nn.Module):
 
 
 def features(name: str) -> nn.Sequential:
-    """torchvision's ``features`` of a network up to LPIPS's last stage; its tensors are named as there, ``0.weight``."""
+    """torchvision's ``features`` of a network up to LPIPS's last stage; its tensors are named as
+    there, ``0.weight``.
+    """
     if name == "alex":
-        layers: list[nn.Module] = [nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
+        layers: list[nn.Module] = [
+            nn.Conv2d(3, 64, 11, stride=4, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, 2),
+        ]
         layers += [nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)]
         for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
             layers += [nn.Conv2d(inputs, outputs, 3, padding=1), nn.ReLU()]
@@ -97,8 +115,21 @@ def features(name: str) -> nn.Sequential:
         def pool() -> nn.Module:
             return nn.MaxPool2d(3, 2, ceil_mode=True)
 
-        layers = [nn.Conv2d(3, 64, 3, stride=2), nn.ReLU(), pool(), Fire(64, 16, 64), Fire(128, 16, 64), pool()]
-        layers += [Fire(128, 32, 128), Fire(256, 32, 128), pool(), Fire(256, 48, 192), Fire(384, 48, 192)]
+        layers = [
+            nn.Conv2d(3, 64, 3, stride=2),
+            nn.ReLU(),
+            pool(),
+            Fire(64, 16, 64),
+            Fire(128, 16, 64),
+            pool(),
+        ]
+        layers += [
+            Fire(128, 32, 128),
+            Fire(256, 32, 128),
+            pool(),
+            Fire(256, 48, 192),
+            Fire(384, 48, 192),
+        ]
         layers += [Fire(384, 64, 256), Fire(512, 64, 256)]
     else:
         raise ValueError(f"name: got {name!r}, expected one of {', '.join(BACKBONES)}")
@@ -117,9 +148,13 @@ class Lpips:
     """
 
     def __init__(
-        self, backbone: Backbone, network: nn.Sequential, weights: Sequence[torch.Tensor], about: EncoderInfo,
+        self,
+        backbone: Backbone,
+        network: nn.Sequential,
+        weights: Sequence[torch.Tensor],
+        about: EncoderInfo,
         device: torch.device | str = "cpu",
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.about = about
         self._backbone = backbone
         self._device = torch.device(device)
@@ -147,7 +182,9 @@ class Lpips:
             return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
         with full_float32():
             both = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2).to(self._device)
-            shift, scale = (torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE))
+            shift, scale = (
+                torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
+            )
             x = (2 * both - 1 - shift) / scale
             total = 0.0
             stage = 0
@@ -162,12 +199,14 @@ class Lpips:
 
 
 def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
-    """LPIPS from one file that holds everything, or from a folder with a backbone and linear layers.
+    """LPIPS from one file that holds everything, or from a folder with a backbone and linear
+    layers.
 
     Args:
-        place: a state dict saved from an LPIPS network (``net.slice1.0.weight``, ``lin0.model.1.weight``, ...), or a
-            folder with torchvision's state dict of a backbone (``features.0.weight``, ...) and one or more of the
-            published files of linear layers, of which the fitting one is taken.
+        place: a state dict saved from an LPIPS network (``net.slice1.0.weight``,
+            ``lin0.model.1.weight``, ...), or a folder with torchvision's state dict of a backbone
+            (``features.0.weight``, ...) and one or more of the published files of linear layers, of
+            which the fitting one is taken.
         name: what the caller named it by.
         device: "cpu" or "cuda".
 
@@ -194,13 +233,20 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
         if lines := _linear_tensors(state):
             linears.append((path, lines))
     if len(networks) != 1:
-        what = "no backbone" if not networks else "several backbones: " + ", ".join(p.name for p, _, _ in networks)
+        what = (
+            "no backbone"
+            if not networks
+            else "several backbones: " + ", ".join(p.name for p, _, _ in networks)
+        )
         raise InputError(f"{name}: {place} holds {what}, expected one. {_HOW}")
     path, backbone, layers = networks[0]
     fitting = [(p, ws) for p, ws in linears if tuple(w.numel() for w in ws) == backbone.channels]
     if len(fitting) != 1:
         what = "no" if not fitting else "several files of"
-        raise InputError(f"{name}: {place} holds {what} linear layers for {backbone.name}, expected one file. {_HOW}")
+        raise InputError(
+            f"{name}: {place} holds {what} linear layers for {backbone.name}, expected one file."
+            f" {_HOW}"
+        )
     used = sorted({path, fitting[0][0]})
     if not all(bool(torch.isfinite(v).all()) for v in [*layers.values(), *fitting[0][1]]):
         raise InputError(f"{name}: weights in {place} are NaN or infinite; fetch the files again")
@@ -212,7 +258,10 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
         kind="perceptual",
         source=", ".join(str(p) for p in used),
         weights_sha256=sha256_of(used),
-        preprocessing=f"LPIPS 0.1 with {backbone.name}: [0, 1] to [-1, 1], minus {SHIFT}, over {SCALE}; not resized",
+        preprocessing=(
+            f"LPIPS 0.1 with {backbone.name}: [0, 1] to [-1, 1], minus {SHIFT}, over {SCALE}; not"
+            " resized"
+        ),
     )
     return Lpips(backbone, network, fitting[0][1], about, where)
 
@@ -220,25 +269,35 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
 _HOW = (
     "Place there two files: the backbone's weights as torchvision publishes them ("
     + ", ".join(b.file for b in BACKBONES.values())
-    + ") and the file of linear layers of the lpips package, version 0.1 (alex.pth, vgg.pth or squeeze.pth). Or name one "
-    "file saved with torch.save(lpips.LPIPS(net='alex').state_dict(), FILE) on a machine that has that package"
+    + ") and the file of linear layers of the lpips package, version 0.1 (alex.pth, vgg.pth or"
+    " squeeze.pth). Or name one file saved with torch.save(lpips.LPIPS(net='alex').state_dict(),"
+    " FILE) on a machine that has that package"
 )
 
 
 def _backbone_tensors(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The backbone's tensors by torchvision's names without ``features.``, whichever way they were saved."""
-    # lpips numbers the layers inside its slices as torchvision does: net.slice3.6.weight is features.6.weight.
+    """The backbone's tensors by torchvision's names without ``features.``, whichever way they were
+    saved.
+    """
+    # lpips numbers the layers inside its slices as torchvision does: net.slice3.6.weight is
+    # features.6.weight.
     pattern = re.compile(r"(?:module\.)?(?:features|net\.slice\d+|net\.slices\.\d+)\.(\d+\..+)")
     return {m[1]: v for key, v in state.items() if (m := pattern.fullmatch(key))}
 
 
 def _fits(backbone: Backbone, layers: dict[str, torch.Tensor]) -> bool:
     with torch.device("meta"):
-        expected = {key: tuple(value.shape) for key, value in features(backbone.name).state_dict().items()}
+        expected = {
+            key: tuple(value.shape) for key, value in features(backbone.name).state_dict().items()
+        }
     return expected == {key: tuple(value.shape) for key, value in layers.items()}
 
 
 def _linear_tensors(state: dict[str, torch.Tensor]) -> list[torch.Tensor]:
     pattern = re.compile(r"(?:module\.)?lin(\d+)\.model\.\d+\.weight")
-    found = {int(m[1]): value.detach().flatten() for key, value in state.items() if (m := pattern.fullmatch(key))}
+    found = {
+        int(m[1]): value.detach().flatten()
+        for key, value in state.items()
+        if (m := pattern.fullmatch(key))
+    }
     return [found[i] for i in sorted(found)]

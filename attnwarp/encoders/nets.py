@@ -1,4 +1,5 @@
-"""The networks of the bundled encoders. Small enough for a CPU; the recipes in eval/training/ train them.
+"""The networks of the bundled encoders. Small enough for a CPU; the recipes in eval/training/ train
+them.
 
 Pictures come in as (N, 3, H, W) sRGB in [0, 1]; each network centres them itself.
 """
@@ -15,7 +16,8 @@ Tensor = torch.Tensor
 
 
 class Residual(nn.Module):
-    """Two 3 x 3 convolutions with batch normalisation about an identity (He et al. 2016, figure 2)."""
+    """Two 3 x 3 convolutions with batch normalisation about an identity (He et al. 2016, figure
+    2)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -31,7 +33,8 @@ class Residual(nn.Module):
 
 
 class Stages(nn.Module):
-    """Convolutional stages: the first at a quarter of the size, each further one at half of the one before.
+    """Convolutional stages: the first at a quarter of the size, each further one at half of the one
+    before.
 
     Args:
         widths: channels of the stages.
@@ -52,7 +55,9 @@ class Stages(nn.Module):
             self.stages.append(nn.Sequential(*down, *(Residual(width) for _ in range(depth))))
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """(N, 3, H, W) in [0, 1] -> the output of every stage, (N, C_k, H / 2^(k + 2), W / 2^(k + 2))."""
+        """(N, 3, H, W) in [0, 1] -> the output of every stage, (N, C_k, H / 2^(k + 2), W / 2^(k +
+        2)).
+        """
         x = self.stem(4 * x - 2)
         out = []
         for stage in self.stages:
@@ -62,7 +67,9 @@ class Stages(nn.Module):
 
 
 class Pool(nn.Module):
-    """Mean and maximum over all places, projected: the mean for ground and light, the maximum for what is in one place."""
+    """Mean and maximum over all places, projected: the mean for ground and light, the maximum for
+    what is in one place.
+    """
 
     def __init__(self, channels: int, dim: int) -> None:
         super().__init__()
@@ -93,8 +100,13 @@ class Block(nn.Module):
     def forward(self, x: Tensor, absent: Tensor | None = None) -> Tensor:
         """(N, L, D) -> (N, L, D); what is ``absent``, (N, L) bool, is looked at by nobody."""
         n, length, dim = x.shape
-        q, k, v = self.qkv(self.attend_norm(x)).view(n, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
-        # Written out: for a few hundred tokens on a CPU, two matrix products are several times faster than the fused kernel.
+        q, k, v = (
+            self.qkv(self.attend_norm(x))
+            .view(n, length, 3, self.heads, dim // self.heads)
+            .permute(2, 0, 3, 1, 4)
+        )
+        # Written out: for a few hundred tokens on a CPU, two matrix products are several times
+        # faster than the fused kernel.
         scores = q @ k.transpose(-1, -2) * (dim // self.heads) ** -0.5
         if absent is not None:
             scores = scores.masked_fill(absent[:, None, None], -torch.inf)
@@ -114,7 +126,9 @@ class TextTower(nn.Module):
         dim: of the embedding.
     """
 
-    def __init__(self, vocabulary: int, width: int, depth: int, heads: int, length: int, dim: int) -> None:
+    def __init__(
+        self, vocabulary: int, width: int, depth: int, heads: int, length: int, dim: int
+    ) -> None:
         super().__init__()
         self.length = length
         self.words = nn.Embedding(vocabulary, width, padding_idx=0)
@@ -161,10 +175,11 @@ class ClipSmall(nn.Module):
 
 
 class DinoSmall(nn.Module):
-    """Convolutions to a sixteenth of the size, then a transformer with a class token (Caron et al. 2021), small.
+    """Convolutions to a sixteenth of the size, then a transformer with a class token (Caron et al.
+    2021), small.
 
-    The convolutions take the place of the patch embedding: a transformer alone needs far more pictures. The class token
-    starts as mean and maximum of their features.
+    The convolutions take the place of the patch embedding: a transformer alone needs far more
+    pictures. The class token starts as mean and maximum of their features.
     """
 
     size = 128
@@ -181,7 +196,9 @@ class DinoSmall(nn.Module):
         self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens (N, D, H / 16, W / 16)."""
+        """(N, 3, H, W) in [0, 1], sides multiples of 16 -> class token (N, D), patch tokens (N, D,
+        H / 16, W / 16).
+        """
         x = self.stages(x)[-1]
         y = self.embed(x)
         h, w = y.shape[-2:]
@@ -194,10 +211,12 @@ class DinoSmall(nn.Module):
 
 
 class PerceptualSmall(nn.Module):
-    """Differences of features, weighted by channel and averaged over places and stages (Zhang et al. 2018, eq. 1), small.
+    """Differences of features, weighted by channel and averaged over places and stages (Zhang et
+    al. 2018, eq. 1), small.
 
-    Features are normalised at each place; weights are kept positive by their exponential. The picture itself, a little
-    blurred, is a first stage of its own, so that differences too faint for the features still count.
+    Features are normalised at each place; weights are kept positive by their exponential. The
+    picture itself, a little blurred, is a first stage of its own, so that differences too faint for
+    the features still count.
     """
 
     def __init__(self) -> None:
@@ -206,13 +225,19 @@ class PerceptualSmall(nn.Module):
         self.layers = nn.ModuleList()
         before = 3
         for k, width in enumerate(self.widths):
-            self.layers.append(nn.Conv2d(before, width, 5 if k == 0 else 3, padding=2 if k == 0 else 1))
+            self.layers.append(
+                nn.Conv2d(before, width, 5 if k == 0 else 3, padding=2 if k == 0 else 1)
+            )
             before = width
-        self.log_weights = nn.ParameterList(nn.Parameter(torch.zeros(width)) for width in self.widths)
+        self.log_weights = nn.ParameterList(
+            nn.Parameter(torch.zeros(width)) for width in self.widths
+        )
         self.color_log_weight = nn.Parameter(torch.zeros(3))
 
     def features(self, x: Tensor) -> list[Tensor]:
-        """(N, 3, H, W) in [0, 1] -> (N, C_k, h_k, w_k): full size, then a half of the size before at each stage."""
+        """(N, 3, H, W) in [0, 1] -> (N, C_k, h_k, w_k): full size, then a half of the size before
+        at each stage.
+        """
         x = 4 * x - 2
         out = []
         for k, layer in enumerate(self.layers):
@@ -227,14 +252,18 @@ class PerceptualSmall(nn.Module):
         return self.between(self.stack(a), self.stack(b))
 
     def stack(self, x: Tensor) -> list[Tensor]:
-        """What is compared of pictures: themselves averaged over 4 x 4 px, then their unit features."""
+        """What is compared of pictures: themselves averaged over 4 x 4 px, then their unit
+        features.
+        """
         size = 4 if min(x.shape[-2:]) >= 4 else 1
         return [F.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
 
     def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """(N,) distances of what :meth:`stack` gave."""
         weights = [self.color_log_weight, *self.log_weights]
-        parts = [(x - y).square().mean((2, 3)) @ w.exp() for x, y, w in zip(a, b, weights, strict=True)]
+        parts = [
+            (x - y).square().mean((2, 3)) @ w.exp() for x, y, w in zip(a, b, weights, strict=True)
+        ]
         return torch.stack(parts).sum(dim=0)
 
 

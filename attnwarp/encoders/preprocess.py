@@ -1,7 +1,9 @@
-"""What happens to a picture before a pretrained network sees it, read from the file that lies beside the weights.
+"""What happens to a picture before a pretrained network sees it, read from the file that lies
+beside the weights.
 
-The resizing is Pillow's own filter, as in the encoders' reference pipelines, but on floating values: those pipelines
-round to 8 bits before and after it, which here would turn differences below 1/255 into noise.
+The resizing is Pillow's own filter, as in the encoders' reference pipelines, but on floating
+values: those pipelines round to 8 bits before and after it, which here would turn differences below
+1/255 into noise.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ class Preprocessing:
     """Resize, crop, scale, normalise; in this order, each left out where it is None.
 
     Attributes:
-        resize: side in px that the shorter edge is resized to (the other one rounded down), or (height, width).
+        resize: side in px that the shorter edge is resized to (the other one rounded down), or
+            (height, width).
         resample: Pillow's number of the filter.
         crop: (height, width) in px, cut from the centre; a smaller picture is padded with black.
         scale: what [0, 1] is multiplied by, 1 for networks that expect [0, 1].
@@ -73,8 +76,11 @@ class Preprocessing:
         return "; ".join([*steps, f"minus ({mean}), over ({std})"])
 
 
-def resize(image: npt.NDArray[np.float32], size: tuple[int, int], resample: int = 3) -> npt.NDArray[np.float32]:
-    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, which widens it when a picture gets smaller.
+def resize(
+    image: npt.NDArray[np.float32], size: tuple[int, int], resample: int = 3
+) -> npt.NDArray[np.float32]:
+    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, which widens it when a picture
+    gets smaller.
 
     Args:
         image: the picture.
@@ -91,8 +97,9 @@ def resize(image: npt.NDArray[np.float32], size: tuple[int, int], resample: int 
     channels = []
     for c in range(3):
         channel = np.ascontiguousarray(image[..., c])
-        # One axis, then the other, as in 8 bits, where the overshoot is cut off after each. Which axis comes first is
-        # Pillow's affair where a picture is squeezed to another shape; the cut-off values differ there, and no others.
+        # One axis, then the other, as in 8 bits, where the overshoot is cut off after each. Which
+        # axis comes first is Pillow's affair where a picture is squeezed to another shape; the
+        # cut-off values differ there, and no others.
         for shape in ((size[1], image.shape[0]), (size[1], size[0])):
             channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
         channels.append(channel)
@@ -120,25 +127,38 @@ def _target(image: npt.NDArray[np.float32], wanted: int | tuple[int, int]) -> tu
 
 
 def read_preprocessing(folder: Path) -> Preprocessing:
-    """Read preprocessor_config.json, or the part of processor_config.json that newer versions write.
+    """Read preprocessor_config.json, or the part of processor_config.json that newer versions
+    write.
 
-    What the file leaves out is as CLIP's: shorter edge to 224 px, bicubic, the central 224 x 224 px, CLIP's mean and
-    deviation.
+    What the file leaves out is as CLIP's: shorter edge to 224 px, bicubic, the central 224 x 224
+    px, CLIP's mean and deviation.
 
     Raises:
-        InputError: neither file, not JSON, or something that is not known here; the message names file and key.
+        InputError: neither file, not JSON, or something that is not known here; the message names
+            file and key.
     """
     path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
     if path is None:
-        raise InputError(f"{folder}: no {' or '.join(_FILES)}; place the one that was published with the weights there")
+        raise InputError(
+            f"{folder}: no {' or '.join(_FILES)}; place the one that was published with the weights"
+            " there"
+        )
     said = read_json(path)
     if path.name == _FILES[1]:
         said = said.get("image_processor") or {}
-    family = said.get("image_processor_type") or said.get("feature_extractor_type") or "CLIPImageProcessor"
+    family = (
+        said.get("image_processor_type")
+        or said.get("feature_extractor_type")
+        or "CLIPImageProcessor"
+    )
     if str(family).removesuffix("Fast").removesuffix("Pil") not in _FAMILIES:
-        raise InputError(f"{path}: image_processor_type is {family!r}, expected one of {', '.join(_FAMILIES)}")
+        raise InputError(
+            f"{path}: image_processor_type is {family!r}, expected one of {', '.join(_FAMILIES)}"
+        )
     if said.get("do_pad"):
-        raise InputError(f"{path}: do_pad is true, which is not supported; encoders that pad are not known here")
+        raise InputError(
+            f"{path}: do_pad is true, which is not supported; encoders that pad are not known here"
+        )
     rescale = float(said.get("rescale_factor", 1 / 255)) if said.get("do_rescale", True) else 1.0
     normalise = said.get("do_normalize", True)
     try:
@@ -146,13 +166,16 @@ def read_preprocessing(folder: Path) -> Preprocessing:
             resize=_size(said.get("size", 224), edge=True) if said.get("do_resize", True) else None,
             resample=_resample(said.get("resample", 3)),
             crop=_pair(said.get("crop_size", 224)) if said.get("do_center_crop", True) else None,
-            # The file speaks of 0 .. 255. A factor of 1/255 that was rounded on its way must still give exactly 1.
+            # The file speaks of 0 .. 255. A factor of 1/255 that was rounded on its way must still
+            # give exactly 1.
             scale=1.0 if abs(rescale * 255 - 1) < 1e-6 else rescale * 255,
             mean=_three(said.get("image_mean", CLIP_MEAN)) if normalise else (0.0, 0.0, 0.0),
             std=_three(said.get("image_std", CLIP_STD)) if normalise else (1.0, 1.0, 1.0),
         )
     except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: {error}; place the file that was published with the weights") from None
+        raise InputError(
+            f"{path}: {error}; place the file that was published with the weights"
+        ) from None
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -173,7 +196,9 @@ def _size(value: Any, *, edge: bool) -> int | tuple[int, int]:
             return _side(value["shortest_edge"])
         if keys == {"height", "width"}:
             return _side(value["height"]), _side(value["width"])
-        raise ValueError(f"size {value} is not known here, expected shortest_edge, or height and width")
+        raise ValueError(
+            f"size {value} is not known here, expected shortest_edge, or height and width"
+        )
     return _side(value)
 
 

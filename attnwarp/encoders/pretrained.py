@@ -1,8 +1,9 @@
-"""CLIP and DINOv2 from a folder of one's own, in the format of the transformers package. Nothing is ever fetched.
+"""CLIP and DINOv2 from a folder of one's own, in the format of the transformers package. Nothing is
+ever fetched.
 
-What transformers does silently and would give figures that look fine is refused here: tensors that the file lacks
-(they are filled with random numbers), a tokenizer of another model (every text then reads its first token), a model of
-another kind.
+What transformers does silently and would give figures that look fine is refused here: tensors that
+the file lacks (they are filled with random numbers), a tokenizer of another model (every text then
+reads its first token), a model of another kind.
 """
 
 from __future__ import annotations
@@ -24,23 +25,33 @@ from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preproce
 from attnwarp.errors import InputError
 
 BATCH = 8
-"""Pictures that go through a network together: enough to keep it busy, few enough to fit beside ViT-L's weights."""
+"""Pictures that go through a network together: enough to keep it busy, few enough to fit beside
+ViT-L's weights.
+"""
 
 _ASK = {
-    "clip": "openai/clip-vit-large-patch14-336 (the paper's) or openai/clip-vit-base-patch32 (small)",
+    "clip": (
+        "openai/clip-vit-large-patch14-336 (the paper's) or openai/clip-vit-base-patch32 (small)"
+    ),
     "dino": "facebook/dinov2-with-registers-small (the paper's) or facebook/dinov2-small",
 }
 _FILES = {
-    "clip": "config.json, model.safetensors (or pytorch_model.bin), preprocessor_config.json, and tokenizer.json (or "
-    "vocab.json with merges.txt)",
+    "clip": (
+        "config.json, model.safetensors (or pytorch_model.bin), preprocessor_config.json, and"
+        " tokenizer.json (or vocab.json with merges.txt)"
+    ),
     "dino": "config.json, model.safetensors (or pytorch_model.bin) and preprocessor_config.json",
 }
 
 
 class _Pictures:
-    """What CLIP and DINOv2 share: pictures through preprocessing and network, batch by batch, in float32."""
+    """What CLIP and DINOv2 share: pictures through preprocessing and network, batch by batch, in
+    float32.
+    """
 
-    def __init__(self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device) -> None:
+    def __init__(
+        self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
+    ) -> None:
         self.about = about
         self._preprocess = preprocessing
         self._device = device
@@ -50,7 +61,9 @@ class _Pictures:
     ) -> list[npt.NDArray[np.float64]]:
         """One result a picture. Only neighbours of equal size share a batch."""
         if isinstance(images, np.ndarray) and images.ndim == 3:
-            raise TypeError(f"images: got one picture of shape {images.shape}, expected a list of pictures")
+            raise TypeError(
+                f"images: got one picture of shape {images.shape}, expected a list of pictures"
+            )
         done: list[npt.NDArray[np.float64]] = []
         for start in range(0, len(images), BATCH):
             ready = [
@@ -67,12 +80,18 @@ class _Pictures:
 class Clip(_Pictures):
     """CLIP; see :class:`attnwarp.encoders.TextImageEncoder`.
 
-    Embeddings are those behind the two projections, as the field compares them. Texts longer than the network takes
-    (77 tokens with the published ones) are cut, as the field does; ``cut`` says which.
+    Embeddings are those behind the two projections, as the field compares them. Texts longer than
+    the network takes (77 tokens with the published ones) are cut, as the field does; ``cut`` says
+    which.
     """
 
     def __init__(
-        self, model: Any, tokenizer: Any, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
+        self,
+        model: Any,
+        tokenizer: Any,
+        about: EncoderInfo,
+        preprocessing: Preprocessing,
+        device: torch.device,
     ) -> None:
         super().__init__(about, preprocessing, device)
         self._model = model
@@ -88,10 +107,15 @@ class Clip(_Pictures):
         """(N, D) float64, not normalised."""
         rows: list[npt.NDArray[np.float64]] = []
         for text in checked_texts(texts):
-            # One at a time: a few prompts, and no padding that a row would have to be independent of.
+            # One at a time: a few prompts, and no padding that a row would have to be independent
+            # of.
             ids = self._ids(text)[0]
             with full_float32():
-                out = _pooled(self._model.get_text_features(input_ids=torch.tensor([ids], device=self._device)))
+                out = _pooled(
+                    self._model.get_text_features(
+                        input_ids=torch.tensor([ids], device=self._device)
+                    )
+                )
             rows.extend(out.double().cpu().numpy())
         return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
 
@@ -113,10 +137,13 @@ class Clip(_Pictures):
 class Dino(_Pictures):
     """DINOv2, with registers or without; see :class:`attnwarp.encoders.TokenEncoder`.
 
-    A picture's embedding is the class token, and a patch's its own token, both behind the last normalisation.
+    A picture's embedding is the class token, and a patch's its own token, both behind the last
+    normalisation.
     """
 
-    def __init__(self, model: Any, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device) -> None:
+    def __init__(
+        self, model: Any, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
+    ) -> None:
         super().__init__(about, preprocessing, device)
         self._model = model
         self._patch = int(model.config.patch_size)
@@ -131,13 +158,15 @@ class Dino(_Pictures):
         """(N, h, w, D) float64; 16 x 16 with the published preprocessing of 224 px.
 
         Raises:
-            ValueError: also where the folder's preprocessing leaves pictures of different shapes different.
+            ValueError: also where the folder's preprocessing leaves pictures of different shapes
+                different.
         """
         grids = self._run(images, self._grid)
         if len({grid.shape for grid in grids}) > 1:
             raise ValueError(
-                f"images: their grids have the sizes {sorted({grid.shape[:2] for grid in grids})}, expected one; this "
-                "encoder's preprocessing keeps a picture's shape, so give pictures of one shape"
+                f"images: their grids have the sizes {sorted({grid.shape[:2] for grid in grids})},"
+                " expected one; this encoder's preprocessing keeps a picture's shape, so give"
+                " pictures of one shape"
             )
         if grids:
             return np.stack(grids)
@@ -146,7 +175,9 @@ class Dino(_Pictures):
 
     def _grid(self, x: torch.Tensor) -> torch.Tensor:
         tokens = self._model(pixel_values=x).last_hidden_state[:, self._special :]
-        return tokens.reshape(len(x), x.shape[2] // self._patch, x.shape[3] // self._patch, self._dim)
+        return tokens.reshape(
+            len(x), x.shape[2] // self._patch, x.shape[3] // self._patch, self._dim
+        )
 
     @property
     def _dim(self) -> int:
@@ -157,13 +188,14 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
     """CLIP from a folder in the transformers format.
 
     Args:
-        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with its index),
-            preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
+        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
+            its index), preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
         name: what the caller named it by.
         device: "cpu" or "cuda".
 
     Raises:
-        InputError: a file is missing or is not what it should be; the message says which, and how to get it.
+        InputError: a file is missing or is not what it should be; the message says which, and how
+            to get it.
     """
     where = device_of(device)
     _config(folder, name, "clip", ("clip",))
@@ -175,12 +207,19 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
     side = int(model.config.vision_config.image_size)
     if preprocessing.shape != (side, side):
         raise InputError(
-            f"{name}: the preprocessing in {folder} gives {preprocessing.shape or 'pictures of any size'}, the network "
-            f"in config.json takes ({side}, {side}); the two files are not of one model"
+            f"{name}: the preprocessing in {folder} gives"
+            f" {preprocessing.shape or 'pictures of any size'}, the network in config.json takes"
+            f" ({side}, {side}); the two files are not of one model"
         )
     _fitting_tokenizer(tokenizer, model.config.text_config, folder, name)
     about = EncoderInfo(
-        name, "clip", str(folder), sha256_of(files), str(preprocessing), side, int(model.config.projection_dim)
+        name,
+        "clip",
+        str(folder),
+        sha256_of(files),
+        str(preprocessing),
+        side,
+        int(model.config.projection_dim),
     )
     return Clip(model, tokenizer, about, preprocessing, where)
 
@@ -189,13 +228,14 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
     """DINOv2 from a folder in the transformers format, with registers or without.
 
     Args:
-        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with its index) and
-            preprocessor_config.json.
+        folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
+            its index) and preprocessor_config.json.
         name: what the caller named it by.
         device: "cpu" or "cuda".
 
     Raises:
-        InputError: a file is missing or is not what it should be; the message says which, and how to get it.
+        InputError: a file is missing or is not what it should be; the message says which, and how
+            to get it.
     """
     where = device_of(device)
     config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))
@@ -206,10 +246,19 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
     model, files = _load(kind, folder, name, "dino", where)
     shape, patch = preprocessing.shape, int(model.config.patch_size)
     if shape is not None and min(shape) < patch:
-        raise InputError(f"{name}: the preprocessing in {folder} gives {shape} px, smaller than one patch of {patch}")
+        raise InputError(
+            f"{name}: the preprocessing in {folder} gives {shape} px, smaller than one patch of"
+            f" {patch}"
+        )
     size = shape[0] if shape is not None and shape[0] == shape[1] else None
     about = EncoderInfo(
-        name, "dino", str(folder), sha256_of(files), str(preprocessing), size, int(model.config.hidden_size)
+        name,
+        "dino",
+        str(folder),
+        sha256_of(files),
+        str(preprocessing),
+        size,
+        int(model.config.hidden_size),
     )
     return Dino(model, about, preprocessing, where)
 
@@ -223,17 +272,17 @@ def _config(folder: Path, name: str, kind: Kind, types: tuple[str, ...]) -> dict
     config = read_json(path)
     if config.get("model_type") not in types:
         raise InputError(
-            f"{name}: {path} is of model_type {config.get('model_type')!r}, expected {' or '.join(map(repr, types))}. "
-            f"{_how(kind, folder)}"
+            f"{name}: {path} is of model_type {config.get('model_type')!r}, expected"
+            f" {' or '.join(map(repr, types))}. {_how(kind, folder)}"
         )
     return config
 
 
 def _how(kind: Kind, folder: Path) -> str:
     return (
-        f"Place these files there: {_FILES[kind]}. They are published on the Hugging Face hub, for instance as "
-        f"{_ASK[kind]}: on a machine with a network, `hf download MODEL_ID --local-dir {folder}`; this program itself "
-        "fetches nothing"
+        f"Place these files there: {_FILES[kind]}. They are published on the Hugging Face hub, for"
+        f" instance as {_ASK[kind]}: on a machine with a network, `hf download MODEL_ID --local-dir"
+        f" {folder}`; this program itself fetches nothing"
     )
 
 
@@ -243,15 +292,23 @@ def _weight_files(folder: Path, name: str, kind: Kind) -> list[Path]:
             return [folder / single]
         index = folder / f"{single}.index.json"
         if index.is_file():
-            parts = sorted({folder / str(part) for part in read_json(index).get("weight_map", {}).values()})
+            parts = sorted(
+                {folder / str(part) for part in read_json(index).get("weight_map", {}).values()}
+            )
             missing = [part.name for part in parts if not part.is_file()]
             if missing or not parts:
-                raise InputError(f"{name}: {index} names {', '.join(missing) or 'no files'}, not in {folder}")
+                raise InputError(
+                    f"{name}: {index} names {', '.join(missing) or 'no files'}, not in {folder}"
+                )
             return parts
-    raise InputError(f"{name}: {folder} has no model.safetensors and no pytorch_model.bin. {_how(kind, folder)}")
+    raise InputError(
+        f"{name}: {folder} has no model.safetensors and no pytorch_model.bin. {_how(kind, folder)}"
+    )
 
 
-def _load(model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device) -> tuple[Any, list[Path]]:
+def _load(
+    model_class: Any, folder: Path, name: str, kind: Kind, device: torch.device
+) -> tuple[Any, list[Path]]:
     files = _weight_files(folder, name, kind)
     try:
         with _silent():
@@ -261,16 +318,25 @@ def _load(model_class: Any, folder: Path, name: str, kind: Kind, device: torch.d
             )  # fmt: skip
     except InputError:
         raise
-    except Exception as error:  # transformers raises many kinds for files that do not fit each other
-        first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise InputError(f"{name}: the weights in {folder} cannot be loaded: {first}; fetch its files again") from None
+    except (
+        Exception
+    ) as error:  # transformers raises many kinds for files that do not fit each other
+        first = next(
+            (line for line in str(error).splitlines() if line.strip()), type(error).__name__
+        )
+        raise InputError(
+            f"{name}: the weights in {folder} cannot be loaded: {first}; fetch its files again"
+        ) from None
     absent = sorted(str(key) for key in said["missing_keys"])
     if absent:
         raise InputError(
-            f"{name}: {files[0]} lacks {len(absent)} tensors that config.json calls for, {absent[0]} first; the files "
-            f"are not of one model. {_how(kind, folder)}"
+            f"{name}: {files[0]} lacks {len(absent)} tensors that config.json calls for,"
+            f" {absent[0]} first; the files are not of one model. {_how(kind, folder)}"
         )
-    bad = next((key for key, value in model.state_dict().items() if not bool(torch.isfinite(value).all())), None)
+    bad = next(
+        (key for key, value in model.state_dict().items() if not bool(torch.isfinite(value).all())),
+        None,
+    )
     if bad is not None:
         raise InputError(f"{name}: {bad} in {files[0]} is NaN or infinite; fetch the file again")
     return model.to(device).eval().requires_grad_(False), files
@@ -296,31 +362,46 @@ def _tokenizer(folder: Path, name: str) -> Any:
     """A ``tokenizers.Tokenizer`` that neither pads nor cuts."""
     from tokenizers import Tokenizer
 
-    whole, vocabulary, merges = (folder / file for file in ("tokenizer.json", "vocab.json", "merges.txt"))
+    whole, vocabulary, merges = (
+        folder / file for file in ("tokenizer.json", "vocab.json", "merges.txt")
+    )
     if whole.is_file():
         try:
             tokenizer = Tokenizer.from_str(whole.read_text(encoding="utf-8"))
         except Exception as error:  # the Rust side raises a bare Exception
-            raise InputError(f"{name}: {whole}: not a tokenizer ({error}); fetch the file again") from None
+            raise InputError(
+                f"{name}: {whole}: not a tokenizer ({error}); fetch the file again"
+            ) from None
     elif vocabulary.is_file() and merges.is_file():
         from transformers import CLIPTokenizer
 
         lines = merges.read_text(encoding="utf-8").splitlines()
-        pairs = [tuple(line.split()) for line in lines if line.strip() and not line.startswith("#version")]
+        pairs = [
+            tuple(line.split())
+            for line in lines
+            if line.strip() and not line.startswith("#version")
+        ]
         odd = next((pair for pair in pairs if len(pair) != 2), None)
         if odd is not None:
-            raise InputError(f"{name}: {merges}: a line reads {' '.join(odd)!r}, expected two words; fetch it again")
+            raise InputError(
+                f"{name}: {merges}: a line reads {' '.join(odd)!r}, expected two words; fetch it"
+                " again"
+            )
         try:
-            # By value and by these names: an older version's vocab_file= is ignored, and leaves two tokens.
+            # By value and by these names: an older version's vocab_file= is ignored, and leaves two
+            # tokens.
             built: Any = CLIPTokenizer
             tokenizer = built(vocab=read_json(vocabulary), merges=pairs)._tokenizer
         except InputError:
             raise
         except Exception as error:  # as above
-            raise InputError(f"{name}: {vocabulary} and {merges} do not fit each other ({error})") from None
+            raise InputError(
+                f"{name}: {vocabulary} and {merges} do not fit each other ({error})"
+            ) from None
     else:
         raise InputError(
-            f"{name}: {folder} has no tokenizer.json, nor vocab.json with merges.txt. {_how('clip', folder)}"
+            f"{name}: {folder} has no tokenizer.json, nor vocab.json with merges.txt."
+            f" {_how('clip', folder)}"
         )
     tokenizer.no_padding()
     tokenizer.no_truncation()
@@ -328,15 +409,19 @@ def _tokenizer(folder: Path, name: str) -> Any:
 
 
 def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> None:
-    """Refuse a tokenizer that is not this model's; the network would read the wrong token and say nothing."""
+    """Refuse a tokenizer that is not this model's; the network would read the wrong token and say
+    nothing.
+    """
     first, last = tokenizer.encode("a").ids[0], tokenizer.encode("a").ids[-1]
     top = max(tokenizer.get_vocab().values())
-    # 2 is what old files say whatever the tokenizer; the network then takes the highest number, as the first ones did.
+    # 2 is what old files say whatever the tokenizer; the network then takes the highest number, as
+    # the first ones did.
     expected = top if config.eos_token_id == 2 else config.eos_token_id
     if first == last or last != expected or top >= config.vocab_size:
         raise InputError(
-            f"{name}: the tokenizer in {folder} has {top + 1} tokens and ends a text with {last}, the model in "
-            f"config.json knows {config.vocab_size} and expects {expected}; the files are not of one model"
+            f"{name}: the tokenizer in {folder} has {top + 1} tokens and ends a text with {last},"
+            f" the model in config.json knows {config.vocab_size} and expects {expected}; the files"
+            " are not of one model"
         )
 
 

@@ -1,4 +1,6 @@
-"""Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images. See docs/fitting.md."""
+"""Splats from pictures: the optimisation of 2D and 3D Gaussians on posed images. See
+docs/fitting.md.
+"""
 
 from attnwarp.fit.loop import Fit, Record, Step, fit
 from attnwarp.fit.settings import FitSettings

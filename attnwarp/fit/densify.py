@@ -1,12 +1,15 @@
-"""Where splats are added and removed: the published strategy of 3DGS (adaptive density control), for both kinds.
+"""Where splats are added and removed: the published strategy of 3DGS (adaptive density control),
+for both kinds.
 
-Splats whose position on screen the loss wants to change strongly are too few or too large there: small ones are
-cloned, large ones split in two. Splats that are nearly transparent or far too large are removed. From time to time
-every opacity is lowered, so that splats that are not needed stay low and go.
+Splats whose position on screen the loss wants to change strongly are too few or too large there:
+small ones are cloned, large ones split in two. Splats that are nearly transparent or far too large
+are removed. From time to time every opacity is lowered, so that splats that are not needed stay low
+and go.
 
-Two things differ from the published code. The gradient on screen is computed from the one in space (see
-:func:`screen_gradient`). And sizes are judged against the extent of the scene or the splat's distance from its middle,
-whichever is larger: splats of a sky or of far hills are large without being too large.
+Two things differ from the published code. The gradient on screen is computed from the one in space
+(see :func:`screen_gradient`). And sizes are judged against the extent of the scene or the splat's
+distance from its middle, whichever is larger: splats of a sky or of far hills are large without
+being too large.
 """
 
 from __future__ import annotations
@@ -24,18 +27,23 @@ from attnwarp.gaussians import Gaussians
 Tensor = torch.Tensor
 
 
-def screen_gradient(gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float) -> Tensor:
-    """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2 wide and 2 high.
+def screen_gradient(
+    gradient: Tensor, means: Tensor, camera: Camera, origin: np.ndarray, near: float
+) -> Tensor:
+    """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2
+    wide and 2 high.
 
-    With c = R m + t the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel, a loss that knows a centre
-    only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z dL/dy. Read backwards, the two components of
-    R dL/dm across the view give the gradient on screen. What the loss knows of a centre beyond its pixel (its depth,
-    the direction it is seen from, how its outline turns with it) enters as well, which the published code leaves out
-    or, for 2DGS, overwrites. A screen 2 wide makes the thresholds of 3DGS independent of the image's size.
+    With c = R m + t the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel, a loss
+    that knows a centre only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z dL/dy.
+    Read backwards, the two components of R dL/dm across the view give the gradient on screen. What
+    the loss knows of a centre beyond its pixel (its depth, the direction it is seen from, how its
+    outline turns with it) enters as well, which the published code leaves out or, for 2DGS,
+    overwrites. A screen 2 wide makes the thresholds of 3DGS independent of the image's size.
 
     Args:
         gradient, means: (N, 3) in world axes, ``means`` relative to ``origin``.
-        near: depth in scene units below which a centre has no position on screen; 0 comes out there.
+        near: depth in scene units below which a centre has no position on screen; 0 comes out
+            there.
     """
     R = torch.from_numpy(camera.rotation.copy())
     moved = torch.from_numpy(camera.rotation @ origin + camera.translation)
@@ -51,11 +59,13 @@ class Density:
     """Gathers gradients and, every ``densify_every`` iterations, adds and removes splats.
 
     Attributes:
-        total, seen: (N,) sum of the gradients' lengths since the last refinement, and the number of views that showed
-            the splat.
+        total, seen: (N,) sum of the gradients' lengths since the last refinement, and the number of
+            views that showed the splat.
     """
 
-    def __init__(self, settings: FitSettings, extent: float, center: np.ndarray, count: int) -> None:
+    def __init__(
+        self, settings: FitSettings, extent: float, center: np.ndarray, count: int
+    ) -> None:
         self.settings, self.extent = settings, extent
         self.center = torch.from_numpy(np.asarray(center, dtype=np.float32))
         self.total, self.seen = torch.zeros(count), torch.zeros(count)
@@ -67,7 +77,9 @@ class Density:
         if means.grad is None:
             return
         shown = weight > 0
-        length = screen_gradient(means.grad, means.detach(), camera, gaussians.origin, self.settings.near * self.extent)
+        length = screen_gradient(
+            means.grad, means.detach(), camera, gaussians.origin, self.settings.near * self.extent
+        )
         self.total += torch.where(shown, length, 0.0)
         self.seen += shown
 
@@ -108,8 +120,11 @@ class Density:
             # Either way of growing adds one splat.
             spare = max(0, s.max_splats - int((~gone).sum()))
             if int(wanted.sum()) > spare:
-                # Stable, so that equal gradients do not make the choice depend on the sorting method.
-                order = torch.argsort(torch.where(wanted, gradient, -1.0), descending=True, stable=True)
+                # Stable, so that equal gradients do not make the choice depend on the sorting
+                # method.
+                order = torch.argsort(
+                    torch.where(wanted, gradient, -1.0), descending=True, stable=True
+                )
                 wanted = torch.zeros_like(wanted)
                 wanted[order[:spare]] = True
         small = largest <= s.grow_scale * room
@@ -117,25 +132,33 @@ class Density:
         split = torch.nonzero(wanted & ~small)[:, 0]
         keep = torch.nonzero(~gone & ~(wanted & ~small))[:, 0]
         halves = [self._half(t, split, random) for _ in range(2)]
-        added = {name: torch.cat([t[name][cloned], *(half[name] for half in halves)]) for name in NAMES}
+        added = {
+            name: torch.cat([t[name][cloned], *(half[name] for half in halves)]) for name in NAMES
+        }
         if len(keep) + len(added["means"]) == 0:
             raise RuntimeError(
-                f"every one of the {len(model)} splats fell below prune_opacity {s.opacity_floor:g} or above "
-                f"prune_scale {s.prune_scale:g}: the views do not show what the first splats describe; check that "
-                "cameras and points are in one coordinate system"
+                f"every one of the {len(model)} splats fell below prune_opacity {s.opacity_floor:g}"
+                f" or above prune_scale {s.prune_scale:g}: the views do not show what the first"
+                " splats describe; check that cameras and points are in one coordinate system"
             )
         model.replace(keep, added)
         self.total, self.seen = torch.zeros(len(model)), torch.zeros(len(model))
 
-    def _half(self, t: dict[str, Tensor], index: Tensor, random: torch.Generator) -> dict[str, Tensor]:
-        """One of the two that take a splat's place: a smaller copy at a point drawn from its own Gaussian."""
+    def _half(
+        self, t: dict[str, Tensor], index: Tensor, random: torch.Generator
+    ) -> dict[str, Tensor]:
+        """One of the two that take a splat's place: a smaller copy at a point drawn from its own
+        Gaussian.
+        """
         half = {name: tensor[index].clone() for name, tensor in t.items()}
         scales = half["scales"].exp()
         offset = torch.randn(scales.shape, generator=random) * scales
         if scales.shape[1] == 2:
             offset = torch.nn.functional.pad(offset, (0, 1))
         kind = self.settings.kind
-        axes = Gaussians(kind, half["means"], half["quats"], scales, half["opacity"].sigmoid(), half["dc"]).rotations()
+        axes = Gaussians(
+            kind, half["means"], half["quats"], scales, half["opacity"].sigmoid(), half["dc"]
+        ).rotations()
         half["means"] += (axes @ offset[:, :, None])[:, :, 0]
         half["scales"] -= float(np.log(self.settings.split_shrink))
         return half

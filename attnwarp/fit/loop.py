@@ -1,4 +1,6 @@
-"""The fit itself: one view an iteration, until the iterations, the time or the patience are used up."""
+"""The fit itself: one view an iteration, until the iterations, the time or the patience are used
+up.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,12 @@ class Record:
 
     Attributes:
         iteration: iterations done.
-        seconds, cpu_seconds: spent on iterations alone: no evaluation, no writing, over all sittings.
+        seconds, cpu_seconds: spent on iterations alone: no evaluation, no writing, over all
+            sittings.
         splats: their number.
         loss: of the last iterations, smoothed; None before the first.
-        psnr: mean over the held-out views, dB; None without any. Infinite where all are equal to their pictures.
+        psnr: mean over the held-out views, dB; None without any. Infinite where all are equal to
+            their pictures.
         psnr_pooled: of their mean squared error.
         measures: what the caller's own measure gave.
     """
@@ -119,9 +123,10 @@ def fit(
 ) -> Fit:
     """Fit splats to posed pictures.
 
-    With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every ``checkpoint_seconds`` and at
-    the end, each atomically; a fit found there is taken up where it was, and then gives the same bits as one that was
-    never interrupted (on the same machine, with the same number of torch threads).
+    With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every
+    ``checkpoint_seconds`` and at the end, each atomically; a fit found there is taken up where it
+    was, and then gives the same bits as one that was never interrupted (on the same machine, with
+    the same number of torch threads).
 
     Args:
         start: what to begin with, see :func:`attnwarp.fit.from_points`; of the settings' kind.
@@ -129,31 +134,40 @@ def fit(
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
         folder: made if need be.
-        max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates follow
-            ``settings.iterations`` all the same.
+        max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates
+            follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above.
         backend: of :func:`attnwarp.render.render`.
-        measure: called at every evaluation with the splats; its figures go into the history. A view of the truth,
-            such as the error of depth.
+        measure: called at every evaluation with the splats; its figures go into the history. A view
+            of the truth, such as the error of depth.
         watch: told how the fit stands after every iteration; see :mod:`attnwarp.fit.progress`.
         stop: asked before every iteration; True ends the fit in good order.
 
     Raises:
-        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a fit of other
-            views or settings, or a number is out of range.
+        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
+            fit of other views or settings, or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
-        RuntimeError: the loss is no longer finite, or no splat is left; the message says what to try. The last
-            checkpoint stays.
+        RuntimeError: the loss is no longer finite, or no splat is left; the message says what to
+            try. The last checkpoint stays.
     """
-    settings = FitSettings(kind=start.kind, sh_degree=start.sh_degree) if settings is None else settings
+    settings = (
+        FitSettings(kind=start.kind, sh_degree=start.sh_degree) if settings is None else settings
+    )
     if start.kind != settings.kind:
-        raise ValueError(f"start: is of kind {start.kind!r}, but settings.kind is {settings.kind!r}")
+        raise ValueError(
+            f"start: is of kind {start.kind!r}, but settings.kind is {settings.kind!r}"
+        )
     if start.sh_degree != settings.sh_degree:
-        raise ValueError(f"start: has harmonics of degree {start.sh_degree}, but settings.sh_degree is "
-                         f"{settings.sh_degree}")  # fmt: skip
+        raise ValueError(
+            f"start: has harmonics of degree {start.sh_degree}, but settings.sh_degree is "
+            f"{settings.sh_degree}"
+        )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
-    for name, value in {"max_seconds": max_seconds, "checkpoint_seconds": checkpoint_seconds}.items():
+    for name, value in {
+        "max_seconds": max_seconds,
+        "checkpoint_seconds": checkpoint_seconds,
+    }.items():
         if value is not None and not value >= 0:
             raise ValueError(f"{name}: got {value}, expected seconds >= 0")
     run = _Run(start, views, settings, held_out, backend, measure)
@@ -164,7 +178,8 @@ def fit(
 
 
 class _Run:
-    """A fit in progress: everything that the next iteration depends on, and how to write it down."""
+    """A fit in progress: everything that the next iteration depends on, and how to write it
+    down."""
 
     def __init__(
         self,
@@ -209,11 +224,15 @@ class _Run:
             if theirs == ours:
                 continue
             if isinstance(ours, dict) and isinstance(theirs, dict):
-                differ = [f"{k}: {theirs.get(k)!r}, now {v!r}" for k, v in ours.items() if theirs.get(k) != v]
+                differ = [
+                    f"{k}: {theirs.get(k)!r}, now {v!r}"
+                    for k, v in ours.items()
+                    if theirs.get(k) != v
+                ]
                 what = f"settings ({'; '.join(differ)})"
             raise ValueError(
-                f"folder: {folder} holds a fit of other {what}; go on with the same ones, or name another folder "
-                "or remove its checkpoint.pt to begin again"
+                f"folder: {folder} holds a fit of other {what}; go on with the same ones, or name"
+                " another folder or remove its checkpoint.pt to begin again"
             )
         try:
             self.model.restore(state["model"])
@@ -225,7 +244,9 @@ class _Run:
             self.loss, self.error = float(state["loss"]), float(state["error"])
             self.history = [Record(**record) for record in state["history"]]
         except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(path, f"lacks something or is damaged: {error}; remove it to begin again") from error
+            raise FileFormatError(
+                path, f"lacks something or is damaged: {error}; remove it to begin again"
+            ) from error
 
     def save(self) -> None:
         if self.folder is None:
@@ -278,9 +299,15 @@ class _Run:
             self.evaluate()
         self.save()
         return Fit(
-            self.model.gaussians().detach(), s, list(self.history), self.iteration, self.seconds, self.cpu_seconds,
-            stopped, self.extent,
-        )  # fmt: skip
+            self.model.gaussians().detach(),
+            s,
+            list(self.history),
+            self.iteration,
+            self.seconds,
+            self.cpu_seconds,
+            stopped,
+            self.extent,
+        )
 
     def _reason_to_stop(self, max_seconds: float | None, stop: Callable[[], bool] | None) -> str:
         if self.iteration >= self.settings.iterations:
@@ -301,9 +328,14 @@ class _Run:
     def step(self) -> Step:
         held = self.history[-1].psnr if self.history else None
         return Step(
-            self.iteration, self.settings.iterations, self.loss, losses.psnr_of_mse(self.error), held,
-            len(self.model), self.seconds,
-        )  # fmt: skip
+            self.iteration,
+            self.settings.iterations,
+            self.loss,
+            losses.psnr_of_mse(self.error),
+            held,
+            len(self.model),
+            self.seconds,
+        )
 
     def background(self, *, fitting: bool) -> Tensor:
         """What is behind everything; for pictures that are looked at or measured, never random."""
@@ -316,8 +348,8 @@ class _Run:
 
     def iterate(self) -> None:
         s = self.settings
-        # At the beginning of an iteration, so that what is evaluated or written after one is never fresh from a
-        # refinement, which costs some dB at first.
+        # At the beginning of an iteration, so that what is evaluated or written after one is never
+        # fresh from a refinement, which costs some dB at first.
         self.density.refine(self.model, self.iteration, self.random)
         if not self.queue:
             self.queue = torch.randperm(len(self.views), generator=self.random).tolist()
@@ -328,14 +360,16 @@ class _Run:
         try:
             gaussians = self.model.gaussians()
         except ValueError as error:
-            raise RuntimeError(f"after {self.iteration} iterations: {error}; lower the learning rates") from error
+            raise RuntimeError(
+                f"after {self.iteration} iterations: {error}; lower the learning rates"
+            ) from error
         view = self.render(gaussians, camera, background)
         loss = self.loss_of(view, target)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise RuntimeError(
-                f"after {self.iteration} iterations: the loss is {value} on view {camera.name!r}; lower the learning "
-                "rates"
+                f"after {self.iteration} iterations: the loss is {value} on view {camera.name!r};"
+                " lower the learning rates"
             )
         loss.backward()
         self.iteration += 1
@@ -343,8 +377,14 @@ class _Run:
             self.density.watch(self.model, gaussians, camera, view.weight.detach())
         self.model.step(self.iteration / s.iterations)
         squared = float((view.color.detach() - target).square().mean())
-        self.loss = value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
-        self.error = squared if math.isnan(self.error) else SMOOTHING * self.error + (1 - SMOOTHING) * squared
+        self.loss = (
+            value if math.isnan(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * value
+        )
+        self.error = (
+            squared
+            if math.isnan(self.error)
+            else SMOOTHING * self.error + (1 - SMOOTHING) * squared
+        )
 
     def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
         degree = min(self.settings.sh_degree, self.iteration // self.settings.sh_every)
@@ -367,7 +407,9 @@ class _Run:
         if s.normal_weight and done >= s.normal_from:
             loss = loss + s.normal_weight * losses.normal_consistency(view)
         if s.distortion_weight and done >= s.distortion_from:
-            loss = loss + s.distortion_weight * losses.depth_distortion(view, s.distortion_form, scale=self.extent)
+            loss = loss + s.distortion_weight * losses.depth_distortion(
+                view, s.distortion_form, scale=self.extent
+            )
         return loss
 
     def evaluate(self) -> None:
@@ -377,7 +419,9 @@ class _Run:
             background = self.background(fitting=False)
             for index, camera in enumerate(self.held_out.cameras):
                 image = self.render(gaussians, camera, background).color.clamp(0, 1)
-                errors.append(float((image - self.held_out.target(index, background)).square().mean()))
+                errors.append(
+                    float((image - self.held_out.target(index, background)).square().mean())
+                )
         known = bool(errors)
         self.history.append(
             Record(

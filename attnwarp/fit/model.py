@@ -18,21 +18,26 @@ Tensor = torch.Tensor
 NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
 SMALLEST, LARGEST = 1e-7, 1e3
-"""Scales stay within these shares of the extent: beyond, they would leave float32 and show nothing."""
+"""Scales stay within these shares of the extent: beyond, they would leave float32 and show nothing.
+
+"""
 
 EPSILON = 1e-15
 """Adam's (3DGS): gradients of a mean over pixels are tiny, and must not be taken for noise."""
 
 LARGEST_LOGIT = 15.0
-"""Opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its gradient can still bring it back in float32."""
+"""Opacity stays within sigmoid(+-15), 3e-7 from 0 and 1, where its gradient can still bring it back
+in float32.
+"""
 
 
 class Model:
-    """Splats as Adam sees them: centres, harmonics, logit of opacity, logarithm of scales, quaternions.
+    """Splats as Adam sees them: centres, harmonics, logit of opacity, logarithm of scales,
+    quaternions.
 
     Attributes:
-        tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity" (N,) logits,
-            "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
+        tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
+            (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
         steps: steps done.
         rates: learning rates by name.
@@ -62,8 +67,12 @@ class Model:
         for tensor in self.tensors.values():
             tensor.requires_grad_(True)
         self.steps = 0
-        self.first = {name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()}
-        self.second = {name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()}
+        self.first = {
+            name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()
+        }
+        self.second = {
+            name: torch.zeros_like(tensor.detach()) for name, tensor in self.tensors.items()
+        }
 
     def __len__(self) -> int:
         return int(self.tensors["means"].shape[0])
@@ -86,11 +95,14 @@ class Model:
         """One step of Adam along the leaves' gradients, which are then dropped.
 
         Args:
-            progress: share of the fit that is done, in [0, 1]; decides the learning rate of the centres.
+            progress: share of the fit that is done, in [0, 1]; decides the learning rate of the
+                centres.
         """
         s = self.settings
         if s.lr_means > 0 and s.lr_means_final > 0:
-            rate = math.exp((1 - progress) * math.log(s.lr_means) + progress * math.log(s.lr_means_final))
+            rate = math.exp(
+                (1 - progress) * math.log(s.lr_means) + progress * math.log(s.lr_means_final)
+            )
         else:
             rate = (1 - progress) * s.lr_means + progress * s.lr_means_final
         self.rates["means"] = rate * self.extent
@@ -98,20 +110,37 @@ class Model:
             if tensor.grad is None or tensor.numel() == 0:
                 continue
             adam(
-                [tensor.detach()], [tensor.grad], [self.first[name]], [self.second[name]], [],
-                [torch.tensor(float(self.steps))], fused=True, amsgrad=False, beta1=0.9, beta2=0.999,
-                lr=self.rates[name], weight_decay=0.0, eps=EPSILON, maximize=False,
-            )  # fmt: skip
+                [tensor.detach()],
+                [tensor.grad],
+                [self.first[name]],
+                [self.second[name]],
+                [],
+                [torch.tensor(float(self.steps))],
+                fused=True,
+                amsgrad=False,
+                beta1=0.9,
+                beta2=0.999,
+                lr=self.rates[name],
+                weight_decay=0.0,
+                eps=EPSILON,
+                maximize=False,
+            )
             tensor.grad = None
         self.steps += 1
         with torch.no_grad():
-            self.tensors["scales"].clamp_(math.log(SMALLEST * self.extent), math.log(LARGEST * self.extent))
+            self.tensors["scales"].clamp_(
+                math.log(SMALLEST * self.extent), math.log(LARGEST * self.extent)
+            )
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:
-        """Keep the splats at the index ``keep`` with Adam's memory of them, and append ``added``, which have none."""
+        """Keep the splats at the index ``keep`` with Adam's memory of them, and append ``added``,
+        which have none.
+        """
         for name in NAMES:
-            self.tensors[name] = torch.cat([self.tensors[name].detach()[keep], added[name]]).requires_grad_(True)
+            self.tensors[name] = torch.cat(
+                [self.tensors[name].detach()[keep], added[name]]
+            ).requires_grad_(True)
             for moment in (self.first, self.second):
                 moment[name] = torch.cat([moment[name][keep], torch.zeros_like(added[name])])
 
@@ -136,4 +165,7 @@ class Model:
         self.steps = int(state["steps"])
         for name in NAMES:
             self.tensors[name] = state["tensors"][name].clone().requires_grad_(True)
-            self.first[name], self.second[name] = state["first"][name].clone(), state["second"][name].clone()
+            self.first[name], self.second[name] = (
+                state["first"][name].clone(),
+                state["second"][name].clone(),
+            )

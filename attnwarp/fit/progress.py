@@ -28,7 +28,9 @@ def _decibels(value: float) -> str:
 
 
 @contextmanager
-def shown(console: Console | None = None, *, title: str = "fit") -> Iterator[Callable[[Step], None]]:
+def shown(
+    console: Console | None = None, *, title: str = "fit"
+) -> Iterator[Callable[[Step], None]]:
     """What to pass as ``watch`` to :func:`attnwarp.fit.fit`; writes to stderr unless told where.
 
     Example:
@@ -61,7 +63,9 @@ def shown(console: Console | None = None, *, title: str = "fit") -> Iterator[Cal
         task = bar.add_task(title, total=None, figures="")
 
         def update(step: Step) -> None:
-            bar.update(task, completed=step.iteration, total=step.iterations, figures=describe(step))
+            bar.update(
+                task, completed=step.iteration, total=step.iterations, figures=describe(step)
+            )
 
         yield update
 
@@ -75,7 +79,9 @@ def _lines(console: Console, title: str) -> Callable[[Step], None]:
         if now - last < LINE_SECONDS and step.iteration != step.iterations:
             return
         last = now
-        text = f"{title} [{step.iteration}/{step.iterations}] {step.seconds:.0f} s: {describe(step)}"
+        text = (
+            f"{title} [{step.iteration}/{step.iterations}] {step.seconds:.0f} s: {describe(step)}"
+        )
         console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     return write

@@ -1,4 +1,6 @@
-"""Everything that decides what a fit computes. The published numbers, and where they had to be changed, why."""
+"""Everything that decides what a fit computes. The published numbers, and where they had to be
+changed, why.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +17,12 @@ Background = Literal["auto", "random", "black", "white"]
 
 @dataclass(frozen=True)
 class FitSettings:
-    """What a fit optimises and how. Equal settings, views, first splats and threads give equal bits.
+    """What a fit optimises and how. Equal settings, views, first splats and threads give equal
+    bits.
 
-    Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take 30,000 iterations
-    on a GPU. What they fix in iterations and what has to scale with a shorter fit is given as a share of
-    ``iterations`` here.
+    Learning rates, thresholds and intervals are those published for 3DGS and 2DGS, whose fits take
+    30,000 iterations on a GPU. What they fix in iterations and what has to scale with a shorter fit
+    is given as a share of ``iterations`` here.
 
     Args:
         kind: "2d" (2DGS) or "3d" (3DGS).
@@ -27,41 +30,45 @@ class FitSettings:
         seed: of the order of views, the random background and the splitting of splats.
         sh_degree: of the colour's spherical harmonics, 0 to 3.
         sh_every: iterations after which one more degree is used, from degree 0.
-        lr_means, lr_means_final: learning rates of the centres at the beginning and the end, exponential in between,
-            times the scene's extent.
-        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: of the constant and the other harmonics, the opacity's logit,
-            the scales' logarithm, and the quaternions.
+        lr_means, lr_means_final: learning rates of the centres at the beginning and the end,
+            exponential in between, times the scene's extent.
+        lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: of the constant and the other harmonics,
+            the opacity's logit, the scales' logarithm, and the quaternions.
         ssim: share of 1 - SSIM in the picture's loss; the rest is L1.
         normal: weight of normal consistency. None: 0.05 for "2d" (published), 0 for "3d".
         distortion: weight of depth distortion. None: 0.01 for "2d", 0 for "3d".
         distortion_form: "l1" (in units of the scene's extent) or "l2_ndc"; see
             :func:`attnwarp.losses.depth_distortion`.
-        normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000 and 3,000 of
-            30,000).
-        background: what is behind the splats and behind transparent pixels of the images: "black", "white", "random"
-            (another colour each iteration, so that transparency cannot be faked by colour), or "auto": random for
-            images with transparency and black for others.
+        normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000
+            and 3,000 of 30,000).
+        background: what is behind the splats and behind transparent pixels of the images: "black",
+            "white", "random" (another colour each iteration, so that transparency cannot be faked
+            by colour), or "auto": random for images with transparency and black for others.
         densify: clone, split and prune splats.
         densify_from: first iteration at which splats are added.
         densify_every: iterations between two refinements.
         densify_until: share of the iterations after which splats are neither added nor removed.
-        grow_gradient: mean norm of the loss's gradient in a splat's position on screen above which it is cloned or
-            split, the screen being 2 wide and high.
-        grow_scale: share of the extent up to which a splat counts as small: small ones are cloned, large ones split.
+        grow_gradient: mean norm of the loss's gradient in a splat's position on screen above which
+            it is cloned or split, the screen being 2 wide and high.
+        grow_scale: share of the extent up to which a splat counts as small: small ones are cloned,
+            large ones split.
         split_shrink: what the scales of the two halves of a split splat are divided by.
-        max_splats: no refinement grows the model beyond this number; those of the largest gradient go first. None:
-            without limit.
-        prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d" (published).
-        prune_scale: splats larger than this share of the extent are removed after the first opacity reset.
-        reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long as splats are
-            added.
+        max_splats: no refinement grows the model beyond this number; those of the largest gradient
+            go first. None: without limit.
+        prune_opacity: splats below this opacity are removed. None: 0.05 for "2d", 0.005 for "3d"
+            (published).
+        prune_scale: splats larger than this share of the extent are removed after the first opacity
+            reset.
+        reset_every: iterations after which all opacities are lowered to ``reset_opacity``, as long
+            as splats are added.
         reset_opacity: see there.
         antialiased: "3d" only: fit for the opacity-compensated rasteriser.
         near: nothing nearer to a camera is drawn, as a share of the extent.
-        evaluate_every: iterations between two evaluations on the held-out views, which also the curve of the result
-            is made of.
-        patience: stop when the held-out PSNR has not risen by ``min_gain`` dB in so many evaluations. None: never.
-            The held-out figures of a fit that stopped early are slightly optimistic.
+        evaluate_every: iterations between two evaluations on the held-out views, which also the
+            curve of the result is made of.
+        patience: stop when the held-out PSNR has not risen by ``min_gain`` dB in so many
+            evaluations. None: never. The held-out figures of a fit that stopped early are slightly
+            optimistic.
         min_gain: see ``patience``, dB.
 
     Raises:
@@ -113,7 +120,9 @@ class FitSettings:
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
         if self.antialiased and self.kind == "2d":
-            raise ValueError("antialiased: applies to kind '3d' only; 2D splats have a screen filter instead")
+            raise ValueError(
+                "antialiased: applies to kind '3d' only; 2D splats have a screen filter instead"
+            )
         for name, (low, high) in _LIMITS.items():
             value = getattr(self, name)
             if value is None and name in _OPTIONAL:
@@ -140,7 +149,11 @@ class FitSettings:
     @property
     def opacity_floor(self) -> float:
         """``prune_opacity``, or its default for the kind."""
-        return (0.05 if self.kind == "2d" else 0.005) if self.prune_opacity is None else self.prune_opacity
+        return (
+            (0.05 if self.kind == "2d" else 0.005)
+            if self.prune_opacity is None
+            else self.prune_opacity
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
@@ -159,16 +172,27 @@ class FitSettings:
 
 
 _WHOLE = {
-    "iterations", "seed", "sh_degree", "sh_every", "densify_from", "densify_every", "max_splats", "reset_every",
-    "evaluate_every", "patience",
-}  # fmt: skip
+    "iterations",
+    "seed",
+    "sh_degree",
+    "sh_every",
+    "densify_from",
+    "densify_every",
+    "max_splats",
+    "reset_every",
+    "evaluate_every",
+    "patience",
+}
 _OPTIONAL = {"normal", "distortion", "prune_opacity", "max_splats", "patience"}
 _LIMITS: dict[str, tuple[float, float]] = {
     "iterations": (1, math.inf),
     "seed": (0, 2**63 - 1),
     "sh_degree": (0, 3),
     "sh_every": (1, math.inf),
-    **{f"lr_{name}": (0, math.inf) for name in ("means_final", "dc", "rest", "opacity", "scales", "quats")},
+    **{
+        f"lr_{name}": (0, math.inf)
+        for name in ("means_final", "dc", "rest", "opacity", "scales", "quats")
+    },
     "lr_means": (0, math.inf),
     "ssim": (0, 1),
     "normal": (0, math.inf),

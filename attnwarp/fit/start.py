@@ -22,7 +22,8 @@ NEIGHBOURS = 3
 
 
 def extent_of(cameras: Sequence[Camera]) -> float:
-    """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean (3DGS).
+    """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean
+    (3DGS).
 
     Cameras that stand at one place say nothing about it; then it is 1.
     """
@@ -39,7 +40,8 @@ def from_points(
     sh_degree: int = 3,
     seed: int = 0,
 ) -> Gaussians:
-    """One splat a point: as large as the gaps around it, opacity 0.1, grey where no colour is given.
+    """One splat a point: as large as the gaps around it, opacity 0.1, grey where no colour is
+    given.
 
     3D splats begin round, and unturned. 2D splats begin as discs that are turned at random (2DGS).
 
@@ -54,7 +56,8 @@ def from_points(
         float32 splats relative to an ``origin`` at the points' median.
 
     Raises:
-        ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out of range.
+        ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out
+            of range.
     """
     from scipy.spatial import cKDTree
 
@@ -101,11 +104,14 @@ def from_points(
     )
 
 
-def random_points(cameras: Sequence[Camera], count: int, *, seed: int = 0) -> tuple[Array, npt.NDArray[np.uint8]]:
+def random_points(
+    cameras: Sequence[Camera], count: int, *, seed: int = 0
+) -> tuple[Array, npt.NDArray[np.uint8]]:
     """Points and colours to begin with where nothing is known of the surfaces.
 
-    They fill a cube about the point that the cameras look at (the nearest to all optical axes), with half an edge of
-    the cameras' mean distance from it; cameras that look along parallel axes get one in front of them.
+    They fill a cube about the point that the cameras look at (the nearest to all optical axes),
+    with half an edge of the cameras' mean distance from it; cameras that look along parallel axes
+    get one in front of them.
 
     Returns:
         points: (count, 3) world coordinates.

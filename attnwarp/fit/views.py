@@ -19,7 +19,9 @@ from attnwarp.camera import Camera
 from attnwarp.io import Dataset, FileFormatError
 
 HELD_OUT_EVERY = 8
-"""Where a data set names no split, one image of so many is held out (the field's habit since LLFF)."""
+"""Where a data set names no split, one image of so many is held out (the field's habit since LLFF).
+
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +30,13 @@ class Views:
 
     Args:
         cameras: one for each picture, at least one.
-        images: (H, W, 3), or (H, W, 4) with straight (not premultiplied) alpha; sRGB; uint8, uint16, or floating in
-            [0, 1]. They are kept as they are: 8 bits take a quarter of the memory.
+        images: (H, W, 3), or (H, W, 4) with straight (not premultiplied) alpha; sRGB; uint8,
+            uint16, or floating in [0, 1]. They are kept as they are: 8 bits take a quarter of the
+            memory.
 
     Raises:
-        ValueError: lists of different lengths, a picture of another size than its camera's, a wrong dtype, values
-            out of range; the message names the picture.
+        ValueError: lists of different lengths, a picture of another size than its camera's, a wrong
+            dtype, values out of range; the message names the picture.
     """
 
     cameras: Sequence[Camera]
@@ -43,22 +46,30 @@ class Views:
         if not self.cameras:
             raise ValueError("cameras: got none, expected at least one")
         if len(self.images) != len(self.cameras):
-            raise ValueError(f"images: got {len(self.images)}, expected {len(self.cameras)}, as cameras")
+            raise ValueError(
+                f"images: got {len(self.images)}, expected {len(self.cameras)}, as cameras"
+            )
         for i, (camera, image) in enumerate(zip(self.cameras, self.images, strict=True)):
             name = f"images[{i}] ({camera.name})"
             if image.ndim != 3 or image.shape[2] not in (3, 4):
-                raise ValueError(f"{name}: got shape {image.shape}, expected (H, W, 3) or (H, W, 4)")
+                raise ValueError(
+                    f"{name}: got shape {image.shape}, expected (H, W, 3) or (H, W, 4)"
+                )
             if image.shape[:2] != (camera.height, camera.width):
                 raise ValueError(
                     f"{name}: got {image.shape[1]} x {image.shape[0]} px, its camera has "
                     f"{camera.width} x {camera.height}; resize one of them"
                 )
             if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-                raise ValueError(f"{name}: got {image.dtype}, expected uint8, uint16, float32 or float64")
+                raise ValueError(
+                    f"{name}: got {image.dtype}, expected uint8, uint16, float32 or float64"
+                )
             if image.dtype.kind == "f":
                 check.finite(image, name)
                 if image.min() < 0 or image.max() > 1:
-                    raise ValueError(f"{name}: got values in [{image.min()}, {image.max()}], expected [0, 1]")
+                    raise ValueError(
+                        f"{name}: got values in [{image.min()}, {image.max()}], expected [0, 1]"
+                    )
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -66,7 +77,10 @@ class Views:
     @cached_property
     def transparent(self) -> bool:
         """Whether any picture has pixels that are not opaque."""
-        return any(image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any()) for image in self.images)
+        return any(
+            image.shape[2] == 4 and bool((image[..., 3] < _top(image)).any())
+            for image in self.images
+        )
 
     def target(self, index: int, background: torch.Tensor) -> torch.Tensor:
         """(H, W, 3) float32 picture in [0, 1], over ``background`` (3,) where it is transparent."""
@@ -79,7 +93,8 @@ class Views:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of cameras and pictures: whether a fit that is taken up again has the same ones."""
+        """SHA-256 of cameras and pictures: whether a fit that is taken up again has the same
+        ones."""
         total = hashlib.sha256()
         for camera, image in zip(self.cameras, self.images, strict=True):
             said = {**camera.to_dict(), "name": "", "dtype": str(image.dtype), "shape": image.shape}
@@ -97,7 +112,8 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
 
     Args:
         dataset: see :func:`attnwarp.io.read_dataset`.
-        max_size: longest side in px; larger pictures are averaged down to it, and their cameras with them.
+        max_size: longest side in px; larger pictures are averaged down to it, and their cameras
+            with them.
 
     Raises:
         FileFormatError: a picture that cannot be read, or of another size than its camera.
@@ -110,7 +126,9 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
             raise FileFormatError(
-                path, f"is {image.shape[1]} x {image.shape[0]}, its camera has {camera.width} x {camera.height}"
+                path,
+                f"is {image.shape[1]} x {image.shape[0]}, its camera has {camera.width} x"
+                f" {camera.height}",
             )
         if max_size is not None and max(image.shape[:2]) > max_size:
             image = _shrink(image, max_size)
@@ -125,7 +143,8 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
 def read_image(path: Path) -> npt.NDArray[Any]:
     """(H, W, 3) or (H, W, 4) RGB(A) in the file's own depth, as its pixels lie in the file.
 
-    A camera's pose belongs to the pixels as stored, so a tag that asks for the picture to be turned is not followed.
+    A camera's pose belongs to the pixels as stored, so a tag that asks for the picture to be turned
+    is not followed.
 
     Raises:
         FileFormatError: not a picture of 8 or 16 bits.
@@ -136,7 +155,9 @@ def read_image(path: Path) -> npt.NDArray[Any]:
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; convert it to PNG or JPEG")
     if image.dtype not in (np.uint8, np.uint16):
-        raise FileFormatError(path, f"holds {image.dtype}, expected 8 or 16 bits a channel of sRGB; convert it to PNG")
+        raise FileFormatError(
+            path, f"holds {image.dtype}, expected 8 or 16 bits a channel of sRGB; convert it to PNG"
+        )
     if image.ndim == 2:
         return np.repeat(image[..., None], 3, axis=2)
     code = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
@@ -154,15 +175,18 @@ def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
     values: npt.NDArray[Any] = image.astype(np.float32) / _top(image)
     values[..., :3] *= values[..., 3:]
     small = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
-    small = np.concatenate([small[..., :3] / np.maximum(small[..., 3:], 1e-6), small[..., 3:]], axis=2)
+    small = np.concatenate(
+        [small[..., :3] / np.maximum(small[..., 3:], 1e-6), small[..., 3:]], axis=2
+    )
     return np.round(np.clip(small, 0, 1) * _top(image)).astype(image.dtype)
 
 
 def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Dataset | None]:
     """The part to fit on and the part to measure on.
 
-    Where the data set names splits, those: "train", and "test" or else "val". Elsewhere one of ``every`` images is
-    held out, in the order of their names, beginning with the first; 0 holds out none.
+    Where the data set names splits, those: "train", and "test" or else "val". Elsewhere one of
+    ``every`` images is held out, in the order of their names, beginning with the first; 0 holds out
+    none.
 
     Raises:
         ValueError: the data set's splits leave nothing to fit on.
@@ -172,7 +196,9 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
     named = {split for split in dataset.splits if split is not None}
     if named:
         if "train" not in named:
-            raise ValueError(f"dataset: its splits are {', '.join(sorted(named))}; none is 'train' to fit on")
+            raise ValueError(
+                f"dataset: its splits are {', '.join(sorted(named))}; none is 'train' to fit on"
+            )
         rest = next((name for name in ("test", "val") if name in named), None)
         return dataset.split("train"), dataset.split(rest) if rest else None
     order = sorted(range(len(dataset)), key=lambda i: dataset.cameras[i].name)

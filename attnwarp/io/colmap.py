@@ -1,7 +1,8 @@
 """COLMAP sparse models, binary and text: cameras, images and points.
 
-COLMAP's conventions are ours: OpenCV axes, world-to-camera poses, the corner of the image at (0, 0) and the first
-pixel's centre at (0.5, 0.5) (colmap/sensor/models.h), so the principal point is taken as it is.
+COLMAP's conventions are ours: OpenCV axes, world-to-camera poses, the corner of the image at (0, 0)
+and the first pixel's centre at (0.5, 0.5) (colmap/sensor/models.h), so the principal point is taken
+as it is.
 """
 
 from __future__ import annotations
@@ -59,18 +60,21 @@ def read_colmap(
     resize_cameras: bool = False,
     points: bool = True,
 ) -> Dataset:
-    """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as COLMAP does.
+    """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as
+    COLMAP does.
 
     Images come sorted by name. Quaternions are normalised, as COLMAP does on reading.
 
     Args:
-        path: the folder of the model, or one that holds it as ``sparse/0``, ``sparse`` or ``colmap/sparse/0``.
-        images: folder of the images; a relative one is tried in ``path`` first and then as it is. Left out, the
-            folder ``images`` in ``path`` or in a folder above the model.
+        path: the folder of the model, or one that holds it as ``sparse/0``, ``sparse`` or
+            ``colmap/sparse/0``.
+        images: folder of the images; a relative one is tried in ``path`` first and then as it is.
+            Left out, the folder ``images`` in ``path`` or in a folder above the model.
         missing_images: "error", or "none" to get None for the path of an image that is not there.
-        resize_cameras: when an image has another size than its camera (``images_4`` for instance), resize the camera
-            instead of refusing.
-        points: False to leave the points out; their file is then not read, and may be missing or damaged.
+        resize_cameras: when an image has another size than its camera (``images_4`` for instance),
+            resize the camera instead of refusing.
+        points: False to leave the points out; their file is then not read, and may be missing or
+            damaged.
 
     Raises:
         FileNotFoundError: no model there.
@@ -80,11 +84,14 @@ def read_colmap(
     model = find_model(path)
     if model is None:
         raise FileNotFoundError(
-            f"{path}: no COLMAP model (cameras.bin or cameras.txt) here or in {', '.join(MODEL_FOLDERS[1:])}"
+            f"{path}: no COLMAP model (cameras.bin or cameras.txt) here or in"
+            f" {', '.join(MODEL_FOLDERS[1:])}"
         )
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     binary = suffix == ".bin"
-    lenses = (_binary_cameras if binary else _text_cameras)(existing_file(model / f"cameras{suffix}"))
+    lenses = (_binary_cameras if binary else _text_cameras)(
+        existing_file(model / f"cameras{suffix}")
+    )
     source = existing_file(model / f"images{suffix}")
     poses = sorted((_binary_images if binary else _text_images)(source), key=lambda pose: pose.name)
     if not poses:
@@ -93,7 +100,8 @@ def read_colmap(
     for pose in poses:
         if pose.camera not in lenses:
             raise FileFormatError(
-                source, f"image {pose.name!r} uses camera {pose.camera}, which is not in cameras{suffix}"
+                source,
+                f"image {pose.name!r} uses camera {pose.camera}, which is not in cameras{suffix}",
             )
         cameras.append(_camera(source, pose, lenses[pose.camera], model / f"cameras{suffix}"))
     folder = _image_folder(path, model, images)
@@ -109,11 +117,12 @@ def read_colmap(
         return Dataset(cameras, paths)
     if binary:
         return Dataset(cameras, paths, *_binary_points(existing_file(cloud)))
-    # Empty is what COLMAP's own guide asks for where poses are known and points are not: no points, not a damaged file.
+    # Empty is what COLMAP's own guide asks for where poses are known and points are not: no points,
+    # not a damaged file.
     return Dataset(cameras, paths, *_text_points(cloud))
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -148,8 +157,9 @@ def _camera(source: Path, pose: _Pose, lens: _Lens, cameras_file: Path) -> Camer
         case _:
             raise FileFormatError(
                 cameras_file,
-                f"camera {pose.camera}, of image {pose.name!r}, has model {lens.model}, expected PINHOLE or "
-                "SIMPLE_PINHOLE; run COLMAP's image_undistorter and read the folder that it writes",
+                f"camera {pose.camera}, of image {pose.name!r}, has model {lens.model}, expected"
+                " PINHOLE or SIMPLE_PINHOLE; run COLMAP's image_undistorter and read the folder"
+                " that it writes",
                 field="model",
             )
     quat = np.array(pose.quat)
@@ -158,7 +168,8 @@ def _camera(source: Path, pose: _Pose, lens: _Lens, cameras_file: Path) -> Camer
     if not (np.isfinite(norm) and norm > 0) or not np.isfinite(pose.translation).all():
         raise FileFormatError(
             source,
-            f"got quaternion {pose.quat} and translation {pose.translation}, expected a finite pose",
+            f"got quaternion {pose.quat} and translation {pose.translation}, expected a finite"
+            " pose",
             field=where,
         )
     w, x, y, z = quat / norm
@@ -177,16 +188,24 @@ def _camera(source: Path, pose: _Pose, lens: _Lens, cameras_file: Path) -> Camer
 
 
 class _Reader:
-    """Little-endian values off a file's bytes, with an error that says what was being read when they ran out."""
+    """Little-endian values off a file's bytes, with an error that says what was being read when
+    they ran out.
+    """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at, self.what = path, path.read_bytes(), 0, "the number of entries"
+        self.path, self.data, self.at, self.what = (
+            path,
+            path.read_bytes(),
+            0,
+            "the number of entries",
+        )
 
     def need(self, count: int) -> None:
         if self.at + count > len(self.data):
             raise FileFormatError(
                 self.path,
-                f"ends at byte {len(self.data)} while reading {self.what}; get the file again, whole",
+                f"ends at byte {len(self.data)} while reading {self.what}; get the file again,"
+                " whole",
             )
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -217,7 +236,8 @@ class _Reader:
         if self.at != len(self.data):
             raise FileFormatError(
                 self.path,
-                f"{len(self.data) - self.at} bytes are left after {count} entries; not a COLMAP file, or damaged",
+                f"{len(self.data) - self.at} bytes are left after {count} entries; not a COLMAP"
+                " file, or damaged",
             )
 
 
@@ -263,7 +283,9 @@ def _binary_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:
 
 
 def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Line numbers and lines without comments. Empty lines are kept: in images.txt they mean 'no keypoints'."""
+    """Line numbers and lines without comments. Empty lines are kept: in images.txt they mean 'no
+    keypoints'.
+    """
     try:
         text = path.read_text(encoding="utf-8", errors="surrogateescape")
     except OSError as error:
@@ -274,7 +296,9 @@ def _text_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _damaged(path: Path, number: int, line: str, expected: str) -> FileFormatError:
-    return FileFormatError(path, f"line {number}: got {line[:80]!r}, expected {expected}", row=number)
+    return FileFormatError(
+        path, f"line {number}: got {line[:80]!r}, expected {expected}", row=number
+    )
 
 
 def _text_cameras(path: Path) -> dict[int, _Lens]:
@@ -285,7 +309,9 @@ def _text_cameras(path: Path) -> dict[int, _Lens]:
         fields = line.split()
         try:
             camera, model, width, height, *params = fields
-            lenses[int(camera)] = _Lens(model, int(width), int(height), tuple(float(v) for v in params))
+            lenses[int(camera)] = _Lens(
+                model, int(width), int(height), tuple(float(v) for v in params)
+            )
         except ValueError as error:
             raise _damaged(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from error
         count = next((count for name, count in MODELS.values() if name == model), len(params))
@@ -302,11 +328,15 @@ def _text_images(path: Path) -> list[_Pose]:
             continue
         try:
             _, *pose, camera, name = line.split(maxsplit=9)
-            poses.append(_Pose(tuple(map(float, pose[:4])), tuple(map(float, pose[4:])), int(camera), name))
+            poses.append(
+                _Pose(tuple(map(float, pose[:4])), tuple(map(float, pose[4:])), int(camera), name)
+            )
             if len(pose) != 7:
                 raise ValueError(len(pose))
         except ValueError as error:
-            raise _damaged(path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME") from error
+            raise _damaged(
+                path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
+            ) from error
         # The line after it holds the keypoints and may be empty, or missing at the end.
         next(lines, None)
     return poses
@@ -335,5 +365,7 @@ def _points(
     bad = ~np.isfinite(xyz).all(axis=1)
     if bad.any():
         row = int(np.argmax(bad))
-        raise FileFormatError(path, f"point {row} (counted from 0) is {points[row]}, not finite", field="xyz", row=row)
+        raise FileFormatError(
+            path, f"point {row} (counted from 0) is {points[row]}, not finite", field="xyz", row=row
+        )
     return xyz, np.array(colors, dtype=np.uint8).reshape(-1, 3)

@@ -20,7 +20,9 @@ EXACT_ROTATION = 1e-12
 """Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
 
 ROTATION_TOLERANCE = 1e-4
-"""Largest |R R^T - I| that is taken for float32 or printing noise and repaired; Camera itself allows 1e-5."""
+"""Largest |R R^T - I| that is taken for float32 or printing noise and repaired; Camera itself
+allows 1e-5.
+"""
 
 Missing = Literal["error", "none"]
 
@@ -30,13 +32,15 @@ class Dataset:
     """Posed images of one scene, and perhaps a first point cloud of it.
 
     Args:
-        cameras: one for each image, OpenCV axes, pixel centres at +0.5; ``name`` is the image's name in the file.
+        cameras: one for each image, OpenCV axes, pixel centres at +0.5; ``name`` is the image's
+            name in the file.
         image_paths: one for each camera; None where there is no image.
         points: (P, 3) float64 world coordinates, or None.
         colors: (P, 3) uint8 sRGB of the points, or None.
         splits: one for each camera: "train", "val", "test", or None where the file names no split.
-        applied_transform: (3, 4) transform that the program which wrote a transforms.json applied to the original
-            world before it wrote; cameras and points are in the world after it. Information only.
+        applied_transform: (3, 4) transform that the program which wrote a transforms.json applied
+            to the original world before it wrote; cameras and points are in the world after it.
+            Information only.
 
     Raises:
         ValueError: lists of different lengths, a wrong shape or dtype.
@@ -53,7 +57,10 @@ class Dataset:
         self.splits = self.splits or [None] * len(self.cameras)
         for name in ("image_paths", "splits"):
             if len(getattr(self, name)) != len(self.cameras):
-                raise ValueError(f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as cameras")
+                raise ValueError(
+                    f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as"
+                    " cameras"
+                )
         if self.points is not None:
             self.points = np.asarray(self.points, dtype=np.float64)
             check.shape(self.points, ("P", 3), "points")
@@ -92,26 +99,36 @@ class Dataset:
         indices = [i for i, split in enumerate(self.splits) if split == name]
         if not indices:
             there = sorted({split for split in self.splits if split is not None})
-            raise ValueError(f"name: got {name!r}, expected one of {', '.join(map(repr, there)) or '(no splits)'}")
+            raise ValueError(
+                f"name: got {name!r}, expected one of"
+                f" {', '.join(map(repr, there)) or '(no splits)'}"
+            )
         return self.select(indices)
 
 
 def nearest_rotation(path: Path, where: str, R: Array) -> Array:
-    """``R`` if it is a rotation to 1e-12; the nearest one (by SVD) if it is to 1e-4; an error that says by how much."""
+    """``R`` if it is a rotation to 1e-12; the nearest one (by SVD) if it is to 1e-4; an error that
+    says by how much.
+    """
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE:
         size = np.linalg.norm(R, axis=0)
-        hint = "its axes are not at right angles, or it was rounded too coarsely; export the poses again"
+        hint = (
+            "its axes are not at right angles, or it was rounded too coarsely; export the poses"
+            " again"
+        )
         if np.ptp(size) <= ROTATION_TOLERANCE * size.max():
             hint = f"its columns have length {size.mean():.6g}: remove the scale from the pose"
         raise FileFormatError(
             path,
-            f"rotation is not orthonormal, max |R R^T - I| = {error:.3g}, and only up to {ROTATION_TOLERANCE:g} is "
-            f"repaired; {hint}",
+            f"rotation is not orthonormal, max |R R^T - I| = {error:.3g}, and only up to"
+            f" {ROTATION_TOLERANCE:g} is repaired; {hint}",
             field=where,
         )
     if np.linalg.det(R) < 0:
-        raise FileFormatError(path, "rotation has determinant -1 (it mirrors); flip one axis of the pose", field=where)
+        raise FileFormatError(
+            path, "rotation has determinant -1 (it mirrors); flip one axis of the pose", field=where
+        )
     if error <= EXACT_ROTATION:
         return R
     U, _, Vt = np.linalg.svd(R)
@@ -120,14 +137,18 @@ def nearest_rotation(path: Path, where: str, R: Array) -> Array:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from an image's header, without decoding it and without turning it by its EXIF tag."""
+    """(width, height) from an image's header, without decoding it and without turning it by its
+    EXIF tag.
+    """
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
             return image.size
     except UnidentifiedImageError as error:
-        raise FileFormatError(path, "not an image that can be read; replace it or leave it out") from error
+        raise FileFormatError(
+            path, "not an image that can be read; replace it or leave it out"
+        ) from error
 
 
 def with_images(
@@ -141,7 +162,8 @@ def with_images(
     """Check that each camera's image exists and has the camera's size.
 
     Returns:
-        the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None where missing.
+        the cameras (resized to their images where ``resize_cameras`` says so), and the paths, None
+        where missing.
     """
     check.one_of(missing_images, ("error", "none"), "missing_images")
     absent = [path for path in paths if not path.is_file()]
@@ -165,8 +187,9 @@ def with_images(
         if not resize_cameras:
             raise FileFormatError(
                 source,
-                f"{path} is {width} x {height}, but its camera is {camera.width} x {camera.height}; use the images the "
-                "cameras were made for, or pass resize_cameras=True if they are the same pictures at another size",
+                f"{path} is {width} x {height}, but its camera is {camera.width} x {camera.height};"
+                " use the images the cameras were made for, or pass resize_cameras=True if they"
+                " are the same pictures at another size",
             )
         cameras[i] = camera.resize(width, height)
     return cameras, found

@@ -1,4 +1,6 @@
-"""What every reader and writer here shares: the error a bad file gets, and a write that cannot leave half a file."""
+"""What every reader and writer here shares: the error a bad file gets, and a write that cannot
+leave half a file.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,8 @@ from typing import BinaryIO
 class FileFormatError(ValueError):
     """A file that cannot be read as what it claims to be.
 
-    The message names the file, the property or field, the first bad row where there is one (counted from 0), and
-    what to do.
+    The message names the file, the property or field, the first bad row where there is one (counted
+    from 0), and what to do.
 
     Attributes:
         path: the file.
@@ -21,7 +23,9 @@ class FileFormatError(ValueError):
         row: the first bad row or frame, counted from 0, or None.
     """
 
-    def __init__(self, path: Path, message: str, *, field: str | None = None, row: int | None = None) -> None:
+    def __init__(
+        self, path: Path, message: str, *, field: str | None = None, row: int | None = None
+    ) -> None:
         self.path = path
         self.field = field
         self.row = row
@@ -41,20 +45,24 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
     if path.is_dir():
         raise FileFormatError(path, "is a folder, expected a file")
     if path.stat().st_size == 0:
-        raise FileFormatError(path, "the file is empty; write it again, the program that made it probably failed")
+        raise FileFormatError(
+            path, "the file is empty; write it again, the program that made it probably failed"
+        )
     return path
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
-    """Call ``write`` on a temporary file beside ``path``, flush it to disk and rename it to ``path``.
+    """Call ``write`` on a temporary file beside ``path``, flush it to disk and rename it to
+    ``path``.
 
-    A reader, or a run that is killed, sees the old file or the new one and never a part. When ``write`` raises, the
-    old file stays and the temporary one is removed. The folder must exist.
+    A reader, or a run that is killed, sees the old file or the new one and never a part. When
+    ``write`` raises, the old file stays and the temporary one is removed. The folder must exist.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
-    # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner alone.
+    # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner
+    # alone.
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with temporary.open("xb") as stream:

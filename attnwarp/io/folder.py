@@ -26,18 +26,20 @@ def read_dataset(
 ) -> Dataset:
     """Read a transforms.json or a COLMAP model.
 
-    A file is a transforms.json. A folder with transforms.json, or transforms_train.json and its like, is that; one
-    with a sparse model (``cameras.bin`` or ``.txt`` in it, in ``sparse/0`` or in ``sparse``) is COLMAP's. A folder
-    that is both needs ``format``, except that a model under ``colmap/`` is what nerfstudio made the transforms.json
-    from, and is passed over.
+    A file is a transforms.json. A folder with transforms.json, or transforms_train.json and its
+    like, is that; one with a sparse model (``cameras.bin`` or ``.txt`` in it, in ``sparse/0`` or in
+    ``sparse``) is COLMAP's. A folder that is both needs ``format``, except that a model under
+    ``colmap/`` is what nerfstudio made the transforms.json from, and is passed over.
 
     Args:
         path: file or folder.
         format: "transforms" or "colmap", for a folder that is both.
         images: folder of the images of a COLMAP model; see :func:`read_colmap`.
         missing_images: "error", or "none" to get None for the path of an image that is not there.
-        resize_cameras: when an image has another size than its camera, resize the camera instead of refusing.
-        points: False to leave the points out; their file is then not read, and may be missing or damaged.
+        resize_cameras: when an image has another size than its camera, resize the camera instead of
+            refusing.
+        points: False to leave the points out; their file is then not read, and may be missing or
+            damaged.
 
     Raises:
         FileNotFoundError: nothing there that could be read.
@@ -54,18 +56,28 @@ def read_dataset(
         model = None if path.is_file() else find_model(path)
         if transforms and model is not None and model.relative_to(path).parts[:1] != ("colmap",):
             raise FileFormatError(
-                path, f"holds both a transforms.json and a COLMAP model ({model}); pass format='transforms' or 'colmap'"
+                path,
+                f"holds both a transforms.json and a COLMAP model ({model}); pass"
+                " format='transforms' or 'colmap'",
             )
         if not transforms and model is None:
             raise FileNotFoundError(
-                f"{path}: neither a transforms.json nor a COLMAP model (cameras.bin or cameras.txt, here, in sparse/0 "
-                "or in sparse) is there"
+                f"{path}: neither a transforms.json nor a COLMAP model (cameras.bin or cameras.txt,"
+                " here, in sparse/0 or in sparse) is there"
             )
         format = "transforms" if transforms else "colmap"
     if format == "colmap":
         return read_colmap(
-            path, images=images, missing_images=missing_images, resize_cameras=resize_cameras, points=points
+            path,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            points=points,
         )
     if images is not None:
-        raise ValueError("images: only COLMAP models take a folder of images; a transforms.json names its own")
-    return read_transforms(path, missing_images=missing_images, resize_cameras=resize_cameras, points=points)
+        raise ValueError(
+            "images: only COLMAP models take a folder of images; a transforms.json names its own"
+        )
+    return read_transforms(
+        path, missing_images=missing_images, resize_cameras=resize_cameras, points=points
+    )

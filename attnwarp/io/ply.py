@@ -1,9 +1,10 @@
 """PLY files: splats as the 2DGS and 3DGS trainers and viewers write them, and plain point clouds.
 
-Properties of a splat file, in the order of the original trainers: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
-``f_rest_*`` (all coefficients of red, then green, then blue), ``opacity`` (logit), ``scale_0..1`` for 2DGS or
-``scale_0..2`` for 3DGS (natural logarithm), ``rot_0..3`` (wxyz, any length). Header comments carry what the
-properties cannot; docs/files.md lists them and says who else writes them.
+Properties of a splat file, in the order of the original trainers: ``x y z``, ``nx ny nz`` (zeros),
+``f_dc_0..2``, ``f_rest_*`` (all coefficients of red, then green, then blue), ``opacity`` (logit),
+``scale_0..1`` for 2DGS or ``scale_0..2`` for 3DGS (natural logarithm), ``rot_0..3`` (wxyz, any
+length). Header comments carry what the properties cannot; docs/files.md lists them and says who
+else writes them.
 """
 
 from __future__ import annotations
@@ -28,43 +29,47 @@ Columns = dict[str, npt.NDArray[Any]]
 THIRD_SCALE = 1e-6
 """Third scale, in scene units, that turns a 2D splat into one that viewers of 3D splats show.
 
-The value the authors of 2DGS recommend for that (hbb1/2d-gaussian-splatting, issue 94). A file whose third scales are
-all exactly this is read back as 2D.
+The value the authors of 2DGS recommend for that (hbb1/2d-gaussian-splatting, issue 94). A file
+whose third scales are all exactly this is read back as 2D.
 """
 
 LOGIT_OF_ZERO = -120.0
 LOGIT_OF_ONE = 40.0
 """Logits written for opacity 0 and 1, whose own are infinite.
 
-Their sigmoids are 0 and 1 exactly in float32 (and 1 in float64), beyond every logit that a float32 opacity strictly
-between 0 and 1 can have (-103.3 to 16.6): nothing else is mapped onto 0 or 1, and nothing in the file is infinite.
+Their sigmoids are 0 and 1 exactly in float32 (and 1 in float64), beyond every logit that a float32
+opacity strictly between 0 and 1 can have (-103.3 to 16.6): nothing else is mapped onto 0 or 1, and
+nothing in the file is infinite.
 """
 
 
-def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialiased: bool | None = None) -> Gaussians:
+def read_ply(
+    path: str | os.PathLike[str], *, kind: Kind | None = None, antialiased: bool | None = None
+) -> Gaussians:
     """Read splats.
 
-    ASCII and binary PLY of either byte order are read; further properties and elements are ignored. The kind is, in
-    this order: ``kind``; what a comment says (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``); 2D when there is no
-    ``scale_2``; 2D when every ``scale_2`` is exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale
-    that is one constant, a hundredth of both others or less in every row, could be either and is refused without
-    ``kind``. For the 2D kind a third scale is dropped.
+    ASCII and binary PLY of either byte order are read; further properties and elements are ignored.
+    The kind is, in this order: ``kind``; what a comment says (``attnwarp kind 2d``,
+    ``SplatRenderMode: 2dgs``); 2D when there is no ``scale_2``; 2D when every ``scale_2`` is
+        exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale
+    that is one constant, a hundredth of both others or less in every row, could be either and is
+    refused without ``kind``. For the 2D kind a third scale is dropped.
 
     Args:
         path: the file.
         kind: "2d" or "3d" to override the rule above.
-        antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased 1|0``; False without
-            any.
+        antialiased: overrides the comments ``SplatRenderMode: mip|default`` and ``antialiased
+            1|0``; False without any.
 
     Returns:
-        Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further from zero than
-        twice the extent of the scene become float32 means relative to a rounded ``origin``. Logits of +-inf become
-        opacity 1 and 0; everything else must be finite.
+        Gaussians in float32. ``x y z`` of type double that float32 cannot hold and that lie further
+        from zero than twice the extent of the scene become float32 means relative to a rounded
+        ``origin``. Logits of +-inf become opacity 1 and 0; everything else must be finite.
 
     Raises:
         FileNotFoundError: no such file.
-        FileFormatError: it is not a splat file, or a value in it is out of range; the message names the property and
-            the first bad row.
+        FileFormatError: it is not a splat file, or a value in it is out of range; the message names
+            the property and the first bad row.
     """
     path = existing_file(path)
     if kind is not None:
@@ -75,10 +80,17 @@ def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialia
     xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
     opacity = _column(path, columns, "opacity", np.float64, infinities=True)
     quats = _stack(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"), np.float32)
-    # In float32, as the model normalises: 1e-30 is as good as zero there, and 1e30 as bad as infinite.
+    # In float32, as the model normalises: 1e-30 is as good as zero there, and 1e30 as bad as
+    # infinite.
     norm = torch.from_numpy(quats).norm(dim=-1).numpy()
     _refuse(path, "rot_0..3", norm == 0, "a zero quaternion has no rotation", "remove the row")
-    _refuse(path, "rot_0..3", ~np.isfinite(norm), "the quaternion's length overflows float32", "remove the row")
+    _refuse(
+        path,
+        "rot_0..3",
+        ~np.isfinite(norm),
+        "the quaternion's length overflows float32",
+        "remove the row",
+    )
     says = _read_comments(path, comments)
     kind, names = _recognise(path, columns, says, kind)
     scales = np.empty((n, len(names)), np.float32)
@@ -98,7 +110,13 @@ def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialia
         antialiased = says.antialiased(path)
     offset, means = _split_origin(xyz)
     if not np.isfinite(means).all():
-        _refuse(path, "x, y, z", ~np.isfinite(means).all(axis=1), "does not fit float32", "remove the row")
+        _refuse(
+            path,
+            "x, y, z",
+            ~np.isfinite(means).all(axis=1),
+            "does not fit float32",
+            "remove the row",
+        )
     with np.errstate(over="ignore"):
         alpha = 1.0 / (1.0 + np.exp(-opacity))
     return Gaussians(
@@ -113,36 +131,44 @@ def read_ply(path: str | os.PathLike[str], *, kind: Kind | None = None, antialia
     )
 
 
-def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, *, third_scale: float | None = None) -> None:
+def write_ply(
+    path: str | os.PathLike[str], gaussians: Gaussians, *, third_scale: float | None = None
+) -> None:
     """Write splats as binary little-endian PLY, all properties float32, atomically.
 
-    Read back, means (float32), quaternions, spherical harmonics, origin, kind and the antialias flag are the same
-    bit for bit, and opacities 0 and 1 are exact; other opacities and the scales pass through a float32 logarithm and
-    come back within 4e-6 of their value. float64 means are stored in float32 relative to an origin moved to the
-    scene, when they would otherwise lose digits.
+    Read back, means (float32), quaternions, spherical harmonics, origin, kind and the antialias
+    flag are the same bit for bit, and opacities 0 and 1 are exact; other opacities and the scales
+    pass through a float32 logarithm and come back within 4e-6 of their value. float64 means are
+    stored in float32 relative to an origin moved to the scene, when they would otherwise lose
+    digits.
 
     Args:
         path: the file; an older one is replaced.
         gaussians: what to write.
-        third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers that know only 3D
-            splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are written, as 2DGS trainers do.
+        third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers
+            that know only 3D splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are
+            written, as 2DGS trainers do.
 
     Raises:
-        ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion), ``third_scale`` is not
-            positive or is given for the 3D kind.
+        ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
+            ``third_scale`` is not positive or is given for the 3D kind.
     """
     from plyfile import PlyData, PlyElement
 
-    # The fields may have been assigned, or trained, since the checks ran, and float64 may not fit the file's float32:
-    # replace() runs the checks again.
+    # The fields may have been assigned, or trained, since the checks ran, and float64 may not fit
+    # the file's float32: replace() runs the checks again.
     original = gaussians.detach().to(device="cpu")
     g = replace(original.to(dtype=torch.float32))
     scales = g.scales.numpy().astype(np.float64)
     if third_scale is not None:
         if g.kind != "2d":
-            raise ValueError(f"third_scale: got {third_scale} for splats of kind '3d', expected None")
+            raise ValueError(
+                f"third_scale: got {third_scale} for splats of kind '3d', expected None"
+            )
         if not (np.isfinite(third_scale) and third_scale > 0):
-            raise ValueError(f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}")
+            raise ValueError(
+                f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
+            )
         scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
     offset, means = _split_origin(original.means.numpy())
     origin = g.origin + offset
@@ -162,7 +188,10 @@ def write_ply(path: str | os.PathLike[str], gaussians: Gaussians, *, third_scale
     for names, block in parts:
         for i, name in enumerate(names):
             rows[name] = block[:, i]
-    comments = [f"attnwarp kind {g.kind}", "attnwarp origin " + " ".join(repr(float(v)) for v in origin)]
+    comments = [
+        f"attnwarp kind {g.kind}",
+        "attnwarp origin " + " ".join(repr(float(v)) for v in origin),
+    ]
     if g.kind == "2d":
         comments += ["SplatRenderMode: 2dgs", *(["antialiased 1"] if g.antialiased else [])]
     else:
@@ -180,7 +209,8 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
 
     Raises:
         FileNotFoundError: no such file.
-        FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours that are not uchar.
+        FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours
+            that are not uchar.
     """
     path = existing_file(path)
     columns, _ = _read_vertices(path)
@@ -190,13 +220,19 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
         return points, None
     for name in names:
         if name not in columns:
-            raise FileFormatError(path, "missing, though other colours are there; write all three", field=name)
+            raise FileFormatError(
+                path, "missing, though other colours are there; write all three", field=name
+            )
         if columns[name].dtype.kind not in "iu" or columns[name].dtype.itemsize != 1:
-            raise FileFormatError(path, f"got type {columns[name].dtype.name}, expected uchar (0 to 255)", field=name)
+            raise FileFormatError(
+                path, f"got type {columns[name].dtype.name}, expected uchar (0 to 255)", field=name
+            )
     return points, np.stack([columns[name] for name in names], axis=1).astype(np.uint8)
 
 
-def write_points(path: str | os.PathLike[str], points: npt.ArrayLike, colors: npt.ArrayLike | None = None) -> None:
+def write_points(
+    path: str | os.PathLike[str], points: npt.ArrayLike, colors: npt.ArrayLike | None = None
+) -> None:
     """Write a point cloud as binary little-endian PLY with double ``x y z``, atomically.
 
     Args:
@@ -226,7 +262,7 @@ def write_points(path: str | os.PathLike[str], points: npt.ArrayLike, colors: np
     write_atomically(path, PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write)
 
 
-# ----------------------------------------------------------------------------------------------------------------
+# --------------------------------------------------------------------------------------------------
 
 
 def _names(stem: str, count: int) -> tuple[str, ...]:
@@ -240,13 +276,18 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     try:
         data = plyfile.PlyData.read(str(path))
     except plyfile.PlyHeaderParseError as error:
-        raise FileFormatError(path, f"not a PLY file, or its header is damaged ({error})") from error
+        raise FileFormatError(
+            path, f"not a PLY file, or its header is damaged ({error})"
+        ) from error
     except plyfile.PlyElementParseError as error:
         row = error.row
         prop = error.prop.name if error.prop is not None else None
         count = error.element.count if error.element is not None else 0
         if "early end-of-file" in error.message:
-            text = f"the body ends in row {row} of the {count} that the header announces; get the file again, whole"
+            text = (
+                f"the body ends in row {row} of the {count} that the header announces; get the file"
+                " again, whole"
+            )
         else:
             text = f"{error.message} in row {row} of {count}; the row is damaged"
         raise FileFormatError(path, text, field=prop, row=row) from error
@@ -256,10 +297,14 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
         raise FileFormatError(path, f"cannot be read as a PLY file: {error}") from error
     if "vertex" not in data:
         names = [element.name for element in data.elements]
-        raise FileFormatError(path, f"no element 'vertex' (elements: {', '.join(names) or 'none'})", field="vertex")
+        raise FileFormatError(
+            path, f"no element 'vertex' (elements: {', '.join(names) or 'none'})", field="vertex"
+        )
     vertex = data["vertex"]
     scalar = [p.name for p in vertex.properties if not isinstance(p, plyfile.PlyListProperty)]
-    comments = list(data.comments) + [comment for element in data.elements for comment in element.comments]
+    comments = list(data.comments) + [
+        comment for element in data.elements for comment in element.comments
+    ]
     return {name: np.asarray(vertex.data[name]) for name in scalar}, comments
 
 
@@ -267,43 +312,60 @@ def _refuse_other_formats(path: Path, columns: Columns) -> None:
     if "packed_position" in columns:
         raise FileFormatError(
             path,
-            "is a compressed PLY; convert it to a plain one first (for example with PlayCanvas splat-transform)",
+            "is a compressed PLY; convert it to a plain one first (for example with PlayCanvas"
+            " splat-transform)",
             field="packed_position",
         )
     if "x" in columns and not any(name in columns for name in ("opacity", "scale_0", "rot_0")):
         raise FileFormatError(
             path,
-            "missing; this looks like a point cloud and not like splats (read it with attnwarp.io.read_points)",
+            "missing; this looks like a point cloud and not like splats (read it with"
+            " attnwarp.io.read_points)",
             field="opacity",
         )
 
 
 def _column(
-    path: Path, columns: Columns, name: str, dtype: type[np.floating[Any]], *, infinities: bool = False
+    path: Path,
+    columns: Columns,
+    name: str,
+    dtype: type[np.floating[Any]],
+    *,
+    infinities: bool = False,
 ) -> npt.NDArray[Any]:
     """One property, finite in ``dtype``."""
     if name not in columns:
         raise FileFormatError(
-            path, f"missing (the file has: {', '.join(columns)}); export the whole model again", field=name
+            path,
+            f"missing (the file has: {', '.join(columns)}); export the whole model again",
+            field=name,
         )
     raw = columns[name]
     with np.errstate(over="ignore"):
         values = raw.astype(dtype)
     bad = np.isnan(values) if infinities else ~np.isfinite(values)
-    _refuse(path, name, bad, "is not finite", "remove the row, or find out why the fit diverged", raw)
+    _refuse(
+        path, name, bad, "is not finite", "remove the row, or find out why the fit diverged", raw
+    )
     return values
 
 
-def _stack(path: Path, columns: Columns, names: Sequence[str], dtype: type[np.floating[Any]]) -> npt.NDArray[Any]:
+def _stack(
+    path: Path, columns: Columns, names: Sequence[str], dtype: type[np.floating[Any]]
+) -> npt.NDArray[Any]:
     return np.stack([_column(path, columns, name, dtype) for name in names], axis=1)
 
 
-def _refuse(path: Path, name: str, bad: Any, what: str, remedy: str, values: npt.NDArray[Any] | None = None) -> None:
+def _refuse(
+    path: Path, name: str, bad: Any, what: str, remedy: str, values: npt.NDArray[Any] | None = None
+) -> None:
     if bad.any():
         row = int(np.argmax(bad))
         value = "" if values is None else f"{values[row]!s} "
         rows = f"{int(bad.sum())} of {len(bad)} rows, counted from 0"
-        raise FileFormatError(path, f"{value}in row {row} ({rows}): {what}; {remedy}", field=name, row=row)
+        raise FileFormatError(
+            path, f"{value}in row {row} ({rows}): {what}; {remedy}", field=name, row=row
+        )
 
 
 def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
@@ -312,8 +374,8 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
     if count not in (0, 9, 24, 45):
         raise FileFormatError(
             path,
-            f"got {count} coefficients, expected 0, 9, 24 or 45 (spherical harmonics of degree 0 to 3, three "
-            "channels); write the file again with one of these degrees",
+            f"got {count} coefficients, expected 0, 9, 24 or 45 (spherical harmonics of degree 0 to"
+            " 3, three channels); write the file again with one of these degrees",
             field="f_rest_*",
         )
     sh = np.empty((n, 1 + count // 3, 3), np.float32)
@@ -325,7 +387,9 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
 
 
 class _Comments:
-    """What the comments of a header say about the splats; contradictions are kept until someone asks."""
+    """What the comments of a header say about the splats; contradictions are kept until someone
+    asks.
+    """
 
     def __init__(self) -> None:
         self.kinds: dict[Kind, str] = {}
@@ -335,7 +399,9 @@ class _Comments:
     def antialiased(self, path: Path) -> bool:
         if len(self.flags) > 1:
             both = " and ".join(map(repr, self.flags.values()))
-            raise FileFormatError(path, f"comments contradict each other: {both}; pass antialiased=True or False")
+            raise FileFormatError(
+                path, f"comments contradict each other: {both}; pass antialiased=True or False"
+            )
         return next(iter(self.flags), False)
 
 
@@ -353,9 +419,15 @@ def _read_comments(path: Path, comments: list[str]) -> _Comments:
                 except ValueError:
                     says.origin = np.full(1, np.nan)
                 if says.origin.shape != (3,) or not np.isfinite(says.origin).all():
-                    raise FileFormatError(path, f"got {comment!r}, expected three finite numbers", field="origin")
+                    raise FileFormatError(
+                        path, f"got {comment!r}, expected three finite numbers", field="origin"
+                    )
             # The tag follows the colon at once in some files.
-            case ["splatrendermode:" | "splatrendermode", mode] if mode in ("mip", "default", "2dgs"):
+            case ["splatrendermode:" | "splatrendermode", mode] if mode in (
+                "mip",
+                "default",
+                "2dgs",
+            ):
                 if mode == "2dgs":
                     says.kinds["2d"] = comment
                 else:
@@ -365,17 +437,23 @@ def _read_comments(path: Path, comments: list[str]) -> _Comments:
     return says
 
 
-def _recognise(path: Path, columns: Columns, says: _Comments, kind: Kind | None) -> tuple[Kind, tuple[str, ...]]:
+def _recognise(
+    path: Path, columns: Columns, says: _Comments, kind: Kind | None
+) -> tuple[Kind, tuple[str, ...]]:
     """The kind of the splats and the names of the scales that it uses."""
     for name in ("scale_0", "scale_1"):
         if name not in columns:
             raise FileFormatError(
-                path, f"missing (the file has: {', '.join(columns)}); export the whole model again", field=name
+                path,
+                f"missing (the file has: {', '.join(columns)}); export the whole model again",
+                field=name,
             )
     if kind is None:
         if len(says.kinds) > 1:
             both = " and ".join(map(repr, says.kinds.values()))
-            raise FileFormatError(path, f"comments contradict each other: {both}; pass kind='2d' or kind='3d'")
+            raise FileFormatError(
+                path, f"comments contradict each other: {both}; pass kind='2d' or kind='3d'"
+            )
         kind = next(iter(says.kinds), None)
     if kind is None:
         kind = _kind_by_scales(path, columns)
@@ -384,7 +462,8 @@ def _recognise(path: Path, columns: Columns, says: _Comments, kind: Kind | None)
     if "scale_2" not in columns:
         raise FileFormatError(
             path,
-            "missing for splats of kind '3d'; a file with two scales holds 2D splats: pass kind='2d'",
+            "missing for splats of kind '3d'; a file with two scales holds 2D splats: pass"
+            " kind='2d'",
             field="scale_2",
         )
     return "3d", ("scale_0", "scale_1", "scale_2")
@@ -402,8 +481,8 @@ def _kind_by_scales(path: Path, columns: Columns) -> Kind:
     if len(third) > 1 and (third == third[0]).all() and (third <= flattest + np.log(0.01)).all():
         raise FileFormatError(
             path,
-            f"{third[0]} in every row, at most a hundredth of the other scales: flat 3D splats, or 2D ones written for "
-            "a 3D viewer; pass kind='2d' or kind='3d'",
+            f"{third[0]} in every row, at most a hundredth of the other scales: flat 3D splats, or"
+            " 2D ones written for a 3D viewer; pass kind='2d' or kind='3d'",
             field="scale_2",
         )
     return "3d"
@@ -412,10 +491,10 @@ def _kind_by_scales(path: Path, columns: Columns) -> Kind:
 def _split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:
     """float64 (N, 3) points as an origin and float32 means with points = origin + means.
 
-    The origin is zero when float32 holds the points exactly, or when none lies further from zero than twice the
-    longest side of their bounding box, where a move would win at most two bits. Otherwise it is the centre of the box,
-    rounded to a power of ten no larger than half that side so that it reads well in a header; float32 then resolves
-    the scene to 2^-24 of its extent.
+    The origin is zero when float32 holds the points exactly, or when none lies further from zero
+    than twice the longest side of their bounding box, where a move would win at most two bits.
+    Otherwise it is the centre of the box, rounded to a power of ten no larger than half that side
+    so that it reads well in a header; float32 then resolves the scene to 2^-24 of its extent.
     """
     xyz = np.asarray(points, dtype=np.float64)
     with np.errstate(over="ignore"):

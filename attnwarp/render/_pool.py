@@ -1,8 +1,9 @@
 """Memory that is used again: fresh pages cost more than what is done with them.
 
-A picture of 512 x 512 with 50,000 splats takes 30 MB, and each page of it that the system has to find and clear costs a
-microsecond or two: a quarter of the time that the picture takes. A block goes back to the pool when the last array
-that lies in it is gone, whoever holds it: results that the caller keeps are never written again.
+A picture of 512 x 512 with 50,000 splats takes 30 MB, and each page of it that the system has to
+find and clear costs a microsecond or two: a quarter of the time that the picture takes. A block
+goes back to the pool when the last array that lies in it is gone, whoever holds it: results that
+the caller keeps are never written again.
 """
 
 from __future__ import annotations
@@ -31,7 +32,12 @@ class _Lease:
     def __init__(self, raw: np.ndarray, size: int) -> None:
         self.raw = raw
         address = -(-raw.ctypes.data // ALIGNMENT) * ALIGNMENT
-        self.__array_interface__ = {"shape": (size,), "typestr": "|u1", "data": (address, False), "version": 3}
+        self.__array_interface__ = {
+            "shape": (size,),
+            "typestr": "|u1",
+            "data": (address, False),
+            "version": 3,
+        }
 
     def __del__(self, ending: Callable[[], bool] = sys.is_finalizing) -> None:
         if not ending():
@@ -39,8 +45,9 @@ class _Lease:
 
 
 def _give(raw: np.ndarray) -> None:
-    # Dictionaries and lists are safe to use from several threads; the sum may be off by a block, which is no harm.
-    # No lock: the garbage collector may come here at any moment, from inside of this module too.
+    # Dictionaries and lists are safe to use from several threads; the sum may be off by a block,
+    # which is no harm. No lock: the garbage collector may come here at any moment, from inside of
+    # this module too.
     global _held
     if _held + raw.nbytes > MOST:
         clear()

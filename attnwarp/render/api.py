@@ -23,31 +23,36 @@ DEPTHS = {"2d": ("intersection", "center"), "3d": ("center", "peak")}
 
 @dataclass(eq=False)
 class Render:
-    """A picture of splats. Every output means the same whatever the kind, the backend and the depth mode.
+    """A picture of splats. Every output means the same whatever the kind, the backend and the depth
+    mode.
 
-    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there. Backend "cuda" leaves out
-    what gsplat cannot give: there ``median_depth`` and ``distortion_l1`` are NaN everywhere, ``weight`` carries no gradient, and
-    ``counters`` holds only "splats".
+    Per pixel, w_i = alpha_i prod_{j<i} (1 - alpha_j) is the share of splat i, z_i its depth there.
+    Backend "cuda" leaves out what gsplat cannot give: there ``median_depth`` and ``distortion_l1``
+    are NaN everywhere, ``weight`` carries no gradient, and ``counters`` holds only "splats".
 
     Attributes:
-        color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed in.
+        color: (H, W, C) sum w_i c_i + (1 - alpha) background: sRGB colour, or the features passed
+            in.
         alpha: (H, W) sum w_i, coverage in [0, 1].
-        depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units; NaN where nothing
-            was drawn. The background takes no part in it.
-        median_depth: (H, W) depth of the last splat drawn while the transmittance before it is above 1/2; NaN where
-            nothing was drawn. Where alpha stays below 1/2 it is the last splat's. NaN everywhere from backend "cuda".
-        normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length is at most alpha.
-        distortion_l1: (H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper, gsplat), 2 sum_{j<i} w_i w_j
-            (z_i - z_j) in compositing order: the two agree where depth grows along that order. Scene units. NaN everywhere
-            from backend "cuda".
-        distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 - near / z) and the
-            planes ``ndc`` (the original 2DGS code). No unit.
-        weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is not seen. From backend
-            "cuda" it carries no gradient.
-        counters: how much work it was: "splats" (in), "visible" (can show in the picture), "tile_pairs" (splats over
-            16 x 16 tiles), "pairs" (splats over pixels whose intersection was computed), "composited" (those of them in a
-            4 x 4 square that the splat draws to), "contributing" (those drawn), "tiles". These are the "cpu" backend's;
-            "reference" has "splats", "pairs" and "contributing", "cuda" only "splats".
+        depth: (H, W) expected depth sum w_i z_i / sum w_i along the optical axis, in scene units;
+            NaN where nothing was drawn. The background takes no part in it.
+        median_depth: (H, W) depth of the last splat drawn while the transmittance before it is
+            above 1/2; NaN where nothing was drawn. Where alpha stays below 1/2 it is the last
+            splat's. NaN everywhere from backend "cuda".
+        normal: (H, W, 3) sum w_i n_i in world axes, each n_i turned to face the camera; its length
+            is at most alpha.
+        distortion_l1: (H, W) sum over ordered pairs of w_i w_j |z_i - z_j| (2DGS paper, gsplat), 2
+            sum_{j<i} w_i w_j (z_i - z_j) in compositing order: the two agree where depth grows
+            along that order. Scene units. NaN everywhere from backend "cuda".
+        distortion_l2_ndc: (H, W) sum_{j<i} w_i w_j (m_i - m_j)^2 with m = far / (far - near) (1 -
+            near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
+        weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is
+            not seen. From backend "cuda" it carries no gradient.
+        counters: how much work it was: "splats" (in), "visible" (can show in the picture),
+            "tile_pairs" (splats over 16 x 16 tiles), "pairs" (splats over pixels whose intersection
+            was computed), "composited" (those of them in a 4 x 4 square that the splat draws to),
+            "contributing" (those drawn), "tiles". These are the "cpu" backend's; "reference" has
+            "splats", "pairs" and "contributing", "cuda" only "splats".
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
     """
@@ -68,15 +73,19 @@ class Render:
 
     @cached_property
     def valid(self) -> Tensor:
-        """(H, W) bool: something was drawn, so depth, median_depth and the direction of normal are defined."""
+        """(H, W) bool: something was drawn, so depth, median_depth and the direction of normal are
+        defined.
+        """
         return ~torch.isnan(self.depth.detach())
 
     @cached_property
     def normal_from_depth(self) -> Tensor:
-        """(H, W, 3) unit normals, in world axes and facing the camera, of the surface that ``depth`` describes.
+        """(H, W, 3) unit normals, in world axes and facing the camera, of the surface that
+        ``depth`` describes.
 
-        The cross product of central differences of the unprojected points (2DGS); NaN on the image's border and where
-        one of the four neighbours is undefined. Made on first use, differentiable in ``depth`` and the pose.
+        The cross product of central differences of the unprojected points (2DGS); NaN on the
+        image's border and where one of the four neighbours is undefined. Made on first use,
+        differentiable in ``depth`` and the pose.
         """
         return normal_from_depth(self.depth, self.camera, self._pose)
 
@@ -96,9 +105,17 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
     result = torch.full_like(points, torch.nan)
     if camera.width < 3 or camera.height < 3:
         return result
-    around = defined[1:-1, :-2] & defined[1:-1, 2:] & defined[:-2, 1:-1] & defined[2:, 1:-1] & defined[1:-1, 1:-1]
+    around = (
+        defined[1:-1, :-2]
+        & defined[1:-1, 2:]
+        & defined[:-2, 1:-1]
+        & defined[2:, 1:-1]
+        & defined[1:-1, 1:-1]
+    )
     # x right, y down, z forward: d/dy x d/dx points back at the camera for a surface that faces it.
-    across = torch.linalg.cross(points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2])
+    across = torch.linalg.cross(
+        points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
+    )
     length = torch.where(around, (across * across).sum(-1), 1.0)
     around = around & (length > 0)
     unit = across / torch.where(around, length, 1.0).sqrt()[..., None]
@@ -124,25 +141,30 @@ def render(
 ) -> Render:
     """Render Gaussian splats: colour, coverage, depth, normals, distortion; differentiable.
 
-    Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or ``features``), ``pose`` and
-    ``background``, from every output (of ``Render.counters`` and the mask ``valid`` there are none). Backend "cuda" is the
-    exception: none from ``weight``, and ``median_depth`` and ``distortion_l1`` are NaN, so a loss must not use them.
+    Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or
+    ``features``), ``pose`` and ``background``, from every output (of ``Render.counters`` and the
+    mask ``valid`` there are none). Backend "cuda" is the
+    exception: none from ``weight``, and ``median_depth`` and ``distortion_l1`` are NaN, so a loss
+        must not use them.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
         camera: the view; H x W pixels.
-        backend: "cpu" (numba, float32 with float64 set-up), "reference" (brute force in float64, for small scenes),
-            "cuda" (gsplat on a GPU: no "intersection" or "peak" depth, no skew, ``median_depth`` and ``distortion_l1`` NaN,
-            ``weight`` without a gradient, ``counters`` only "splats"; see :mod:`attnwarp.render.cuda`).
-            "auto" is "cuda" where the splats lie on a GPU and "cpu" elsewhere.
-        depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or "center". "3d":
-            "center" (default) or "peak", where the Gaussian is largest along the ray.
+        backend: "cpu" (numba, float32 with float64 set-up), "reference" (brute force in float64,
+            for small scenes), "cuda" (gsplat on a GPU: no "intersection" or "peak" depth, no skew,
+            ``median_depth`` and ``distortion_l1`` NaN, ``weight`` without a gradient, ``counters``
+            only "splats"; see :mod:`attnwarp.render.cuda`). "auto" is "cuda" where the splats lie
+            on a GPU and "cpu" elsewhere.
+        depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or
+            "center". "3d": "center" (default) or "peak", where the Gaussian is largest along the
+            ray.
         background: (C,) colour behind everything; black if left out.
         features: (N, C) values rendered in place of the spherical harmonics' colour.
         sh_degree: use only the harmonics up to this degree.
-        near: nothing nearer than this depth is drawn, in scene units. 2D splats are cut per pixel, 3D splats as a
-            whole by their centre. Scale it with the scene.
-        antialiased: 3D only: compensate the opacity for the 0.3 px^2 blur. Default: what the Gaussians say.
+        near: nothing nearer than this depth is drawn, in scene units. 2D splats are cut per pixel,
+            3D splats as a whole by their centre. Scale it with the scene.
+        antialiased: 3D only: compensate the opacity for the 0.3 px^2 blur. Default: what the
+            Gaussians say.
         pose: (4, 4) world-to-camera transform in place of the camera's; may require gradients.
         ndc: near and far of ``distortion_l2_ndc``, in scene units.
 
@@ -150,17 +172,18 @@ def render(
         A :class:`Render`, float32 from "cpu" and "cuda", float64 from "reference".
 
     Raises:
-        ValueError: an argument out of range or of the wrong shape, or something that backend "cuda" computes differently; the
-            message says which and what was expected.
+        ValueError: an argument out of range or of the wrong shape, or something that backend "cuda"
+            computes differently; the message says which and what was expected.
         RuntimeError: backend "cuda" without a GPU or without gsplat.
 
     Example:
         >>> import torch
         >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> splat = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.2),
-        ...                   torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = render(splat, Camera.look_at([0, 0, 3], [0, 0, 0], width=64, height=48, fov_y=40, up=[0, 1, 0]))
+        >>> splat = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 2), 0.2), ...                   torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = render(splat, Camera.look_at([0, 0, 3], [0, 0, 0], width=64, height=48, fov_y=40,
+        up=[0, 1, 0]))
         >>> view.color.shape, round(float(view.depth[24, 32]), 4)
         (torch.Size([48, 64, 3]), 3.0)
     """
@@ -171,7 +194,17 @@ def render(
     check.one_of(backend, BACKENDS, "backend")
     chosen = ("cuda" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(
-        gaussians, camera, depth, background, features, sh_degree, near, antialiased, pose, ndc, on_cpu=chosen != "cuda"
+        gaussians,
+        camera,
+        depth,
+        background,
+        features,
+        sh_degree,
+        near,
+        antialiased,
+        pose,
+        ndc,
+        on_cpu=chosen != "cuda",
     )
     # A backend is imported when it is first asked for: numba and gsplat each take their time.
     if chosen == "cpu":
@@ -189,12 +222,18 @@ def render(
     return _result(outputs, inputs, camera, pose, chosen)
 
 
-def _result(outputs: Outputs, inputs: Inputs, camera: Camera, pose: Tensor | None, backend: str) -> Render:
+def _result(
+    outputs: Outputs, inputs: Inputs, camera: Camera, pose: Tensor | None, backend: str
+) -> Render:
     used = camera
     if pose is not None:
-        used = Camera(camera.K, inputs.pose.detach().cpu().numpy(), camera.width, camera.height, camera.name)
+        used = Camera(
+            camera.K, inputs.pose.detach().cpu().numpy(), camera.width, camera.height, camera.name
+        )
     values = {name: getattr(outputs, name) for name in Outputs.__dataclass_fields__}
-    return Render(**values, camera=used, depth_mode=inputs.depth, backend=backend, _pose=inputs.pose)
+    return Render(
+        **values, camera=used, depth_mode=inputs.depth, backend=backend, _pose=inputs.pose
+    )
 
 
 def _prepare(
@@ -215,23 +254,33 @@ def _prepare(
     device = gaussians.means.device
     if on_cpu and device.type != "cpu":
         raise ValueError(
-            f"gaussians: lie on {device}, but this backend renders on the CPU; use gaussians.to(device='cpu')"
+            f"gaussians: lie on {device}, but this backend renders on the CPU; use"
+            " gaussians.to(device='cpu')"
         )
     mode = DEPTHS[kind][0] if depth is None else depth
     if kind == "3d" and mode == "intersection":
-        raise ValueError("depth: 'intersection' needs flat splats; for kind '3d' use 'peak', the maximum along the ray")
+        raise ValueError(
+            "depth: 'intersection' needs flat splats; for kind '3d' use 'peak', the maximum along"
+            " the ray"
+        )
     if kind == "2d" and mode == "peak":
-        raise ValueError("depth: 'peak' is for kind '3d'; a 2D splat has an 'intersection' with the ray")
+        raise ValueError(
+            "depth: 'peak' is for kind '3d'; a 2D splat has an 'intersection' with the ray"
+        )
     check.one_of(mode, DEPTHS[kind], "depth")
     if not (np.isfinite(near) and near > 0):
         raise ValueError(f"near: got {near}, expected a positive depth in scene units")
     if len(ndc) != 2 or not (np.isfinite(ndc).all() and 0 < ndc[0] < ndc[1]):
         raise ValueError(f"ndc: got {ndc}, expected (near, far) with 0 < near < far")
     if antialiased and kind == "2d":
-        raise ValueError("antialiased: applies to kind '3d' only; 2D splats have a screen filter instead")
+        raise ValueError(
+            "antialiased: applies to kind '3d' only; 2D splats have a screen filter instead"
+        )
     if features is not None:
         if sh_degree is not None:
-            raise ValueError("sh_degree: has no meaning beside features, which replace the spherical harmonics")
+            raise ValueError(
+                "sh_degree: has no meaning beside features, which replace the spherical harmonics"
+            )
         check.shape(features, (len(gaussians), "C"), "features")
         if features.shape[1] < 1:
             raise ValueError("features: got 0 channels, expected at least 1")
@@ -242,13 +291,20 @@ def _prepare(
         values = gaussians.sh
         if sh_degree is not None:
             if not 0 <= sh_degree <= gaussians.sh_degree:
-                raise ValueError(f"sh_degree: got {sh_degree}, expected 0 to {gaussians.sh_degree}, the splats' degree")
+                raise ValueError(
+                    f"sh_degree: got {sh_degree}, expected 0 to {gaussians.sh_degree}, the splats'"
+                    " degree"
+                )
             values = values[:, : (sh_degree + 1) ** 2]
     channels = 3 if features is None else features.shape[1]
     if background is None:
         behind = torch.zeros(channels, device=device)
     else:
-        behind = background if isinstance(background, Tensor) else torch.tensor(background, device=device)
+        behind = (
+            background
+            if isinstance(background, Tensor)
+            else torch.tensor(background, device=device)
+        )
         if not behind.is_floating_point() and not behind.requires_grad:
             behind = behind.float()
         check.shape(behind, (channels,), "background")
@@ -270,7 +326,8 @@ def _prepare(
         background=behind,
         depth=mode,
         near=float(near),
-        antialiased=kind == "3d" and (gaussians.antialiased if antialiased is None else bool(antialiased)),
+        antialiased=kind == "3d"
+        and (gaussians.antialiased if antialiased is None else bool(antialiased)),
         ndc=(float(ndc[0]), float(ndc[1])),
     )
 
@@ -294,7 +351,9 @@ def _checked_pose(pose: Tensor | None, camera: Camera) -> Tensor:
     values = pose.detach().double().cpu()
     if not torch.equal(values[3], torch.tensor([0.0, 0, 0, 1], dtype=torch.float64)):
         raise ValueError(f"pose: got last row {values[3].tolist()}, expected [0, 0, 0, 1]")
-    error = float((values[:3, :3] @ values[:3, :3].T - torch.eye(3, dtype=torch.float64)).abs().max())
+    error = float(
+        (values[:3, :3] @ values[:3, :3].T - torch.eye(3, dtype=torch.float64)).abs().max()
+    )
     if error > ORTHONORMAL_TOLERANCE or torch.linalg.det(values[:3, :3]) < 0:
         raise ValueError(
             f"pose: its rotation is mirrored or not orthonormal, max |R R^T - I| = {error:.3g} "

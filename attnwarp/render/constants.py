@@ -1,23 +1,29 @@
-"""Every number that decides what a picture of splats is, with its reason. All backends read them from here."""
+"""Every number that decides what a picture of splats is, with its reason. All backends read them
+from here.
+"""
 
 from __future__ import annotations
 
 import math
 
 ALPHA_MIN = 1 / 255
-"""A splat that adds less than one step of an 8-bit image to a pixel is left out there, as in every published renderer.
+"""A splat that adds less than one step of an 8-bit image to a pixel is left out there, as in every
+published renderer.
 
 It is the only footprint cut-off: no box of so many sigmas, so nothing is truncated that would show.
 """
 
 ALPHA_MAX = 0.99
-"""Largest opacity of one splat at one pixel (original 2DGS and 3DGS, gsplat): keeps 1 / (1 - alpha) finite."""
+"""Largest opacity of one splat at one pixel (original 2DGS and 3DGS, gsplat): keeps 1 / (1 - alpha)
+finite.
+"""
 
 TRANSMITTANCE_STOP = 1e-4
 """A ray ends behind the splat that brings its transmittance to or below this (the published value).
 
-That splat is still drawn. The published kernels leave it out, which loses up to 1 % of the light and makes two
-opaque splats in a row (0.01 * 0.01 = 1e-4) a matter of rounding; here what is lost is at most 1e-4.
+That splat is still drawn. The published kernels leave it out, which loses up to 1 % of the light
+and makes two opaque splats in a row (0.01 * 0.01 = 1e-4) a matter of rounding; here what is lost is
+at most 1e-4.
 """
 
 NEAR = 0.01
@@ -27,34 +33,45 @@ FILTER_SIGMA_2D = math.sqrt(0.5)
 """Sigma in pixels of the 2DGS screen filter: rho = min(u^2 + v^2, |x - c|^2 / sigma^2)."""
 
 BLUR_3D = 0.3
-"""Variance in square pixels added to a projected 3D splat (3DGS): no splat is thinner than about a pixel."""
+"""Variance in square pixels added to a projected 3D splat (3DGS): no splat is thinner than about a
+pixel.
+"""
 
 JACOBIAN_MARGIN = 0.3
-"""3DGS linearises the projection at x/z clamped to the image's edge plus this times half of the field of view.
+"""3DGS linearises the projection at x/z clamped to the image's edge plus this times half of the
+field of view.
 
-Beyond it the linearisation grows without bound. The two sides are clamped apart, so an off-centre principal point is
-treated right.
+Beyond it the linearisation grows without bound. The two sides are clamped apart, so an off-centre
+principal point is treated right.
 """
 
 EXTENT_SIGMAS = math.sqrt(2 * math.log(255.0))
-"""3.33: where an opaque splat falls to ALPHA_MIN. Depth within a splat is bounded to this many sigmas of its extent."""
+"""3.33: where an opaque splat falls to ALPHA_MIN. Depth within a splat is bounded to this many
+sigmas of its extent.
+"""
 
 EDGE_ON = 1e-6
-"""Smallest |n . c| / |c| of a 2D splat's plane: closer to edge-on than this, the plane is tilted to this angle.
+"""Smallest |n . c| / |c| of a 2D splat's plane: closer to edge-on than this, the plane is tilted to
+this angle.
 
 The screen filter draws such a splat anyway; the bound keeps its numbers finite in float32.
 """
 
 COMPENSATION_MIN = 1e-6
-"""Smallest squared opacity factor det S / det (S + 0.3 I) of the antialiased 3DGS mode; keeps its square root's slope
-finite for a splat seen exactly edge-on."""
+"""Smallest squared opacity factor det S / det (S + 0.3 I) of the antialiased 3DGS mode; keeps its
+square root's slope finite for a splat seen exactly edge-on."""
 
 MEDIAN_TRANSMITTANCE = 0.5
-"""The median depth is that of the last splat drawn while the transmittance in front of it is above this."""
+"""The median depth is that of the last splat drawn while the transmittance in front of it is above
+this.
+"""
 
 NDC_NEAR = 0.2
 NDC_FAR = 100.0
-"""Planes of the original 2DGS distortion, m = far / (far - near) * (1 - near / z), in scene units."""
+"""Planes of the original 2DGS distortion, m = far / (far - near) * (1 - near / z), in scene
+units."""
 
 TILE = 16
-"""Edge of a tile in pixels, as in the published renderers: 16 squares of 4 x 4 pixels, each an AVX-512 register."""
+"""Edge of a tile in pixels, as in the published renderers: 16 squares of 4 x 4 pixels, each an
+AVX-512 register.
+"""

@@ -1,14 +1,17 @@
 """The CPU backend: numba kernels over tiles of 16 x 16 pixels, float32 with a float64 set-up.
 
-1. ``depths``, ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back. From here on a splat is known
-   by its place in this order.
-2. ``project``: each splat's outline, depth and colour as seen by the camera, in float64. In deep scenes of the nearest
-   ones only; the others follow if a tile is not opaque by then, and only those that can show in such a tile.
-3. ``outline`` and ``scatter``: the splats of each tile, and of its squares of 4 x 4 pixels; exact outlines, no
-   bounding circles. Lists that would be too long together are made for some of the tiles after the others.
+1. ``depths``, ``radix_order`` and :func:`attnwarp.render.order.break_ties`: front to back. From
+   here on a splat is known by its place in this order.
+2. ``project``: each splat's outline, depth and colour as seen by the camera, in float64. In deep
+   scenes of the nearest ones only; the others follow if a tile is not opaque by then, and only
+   those that can show in such a tile.
+3. ``outline`` and ``scatter``: the splats of each tile, and of its squares of 4 x 4 pixels; exact
+   outlines, no bounding circles. Lists that would be too long together are made for some of the
+   tiles after the others.
 4. ``forward``: composite tile by tile, square by square, until every pixel is opaque.
-5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile; ``reduce_rows`` sums the
-   rows of each splat, and ``project_backward`` takes them to the parameters and the pose.
+5. ``backward``: the same tiles back to front, a row of gradients for each splat of a tile;
+   ``reduce_rows`` sums the rows of each splat, and ``project_backward`` takes them to the
+   parameters and the pose.
 
 Threads follow ``torch.set_num_threads``; the result has the same bits for any number of them.
 """
@@ -40,7 +43,9 @@ NEIGHBOURS = 4
 FRONT = 512
 """Splats a tile to begin with in a deep scene: more than most pixels need to become opaque."""
 ENTRIES = 4
-"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 12 bytes each."""
+"""Entries of tiles' lists held at once, for each pixel and splat; with their weights 12 bytes each.
+
+"""
 ROWS_AT_ONCE = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
 
@@ -50,7 +55,9 @@ def _array(tensor: torch.Tensor, dtype: type) -> np.ndarray:
 
 
 def _tensor(array: np.ndarray, shape: torch.Size, dtype: torch.dtype) -> torch.Tensor:
-    """Converted by numpy: torch starts its thread pool for it, which on a busy machine takes longer than a picture."""
+    """Converted by numpy: torch starts its thread pool for it, which on a busy machine takes longer
+    than a picture.
+    """
     wanted = np.float32 if dtype == torch.float32 else np.float64
     return torch.from_numpy(array.astype(wanted, copy=False).reshape(tuple(shape)))
 
@@ -68,22 +75,28 @@ def _join(parts: list[np.ndarray]) -> np.ndarray:
 
 @functools.lru_cache(maxsize=64)
 def _visit(tiles_x: int, tiles_y: int) -> np.ndarray:
-    """All tiles, block by block: neighbours list the same splats, which then are still in the cache."""
+    """All tiles, block by block: neighbours list the same splats, which then are still in the
+    cache.
+    """
     y, x = np.divmod(np.arange(tiles_x * tiles_y), tiles_x)
     return np.lexsort([x, y, x // NEIGHBOURS, y // NEIGHBOURS])
 
 
 class _Scene:
-    """One view's splats, ordered, projected and binned: what the forward pass leaves to the backward pass.
+    """One view's splats, ordered, projected and binned: what the forward pass leaves to the
+    backward pass.
 
-    Splats are known by their place in the order of depth; only as many of them are projected as may be seen.
+    Splats are known by their place in the order of depth; only as many of them are projected as may
+    be seen.
     """
 
     def __init__(self, inputs: Inputs) -> None:
         parts = (inputs.means, inputs.quats, inputs.scales, inputs.opacities)
         # Kernels are compiled for both, but not for all mixtures.
         exact = np.float32 if all(part.dtype == torch.float32 for part in parts) else np.float64
-        self.means, self.quats, self.scales, self.opacities = (_array(part, exact) for part in parts)
+        self.means, self.quats, self.scales, self.opacities = (
+            _array(part, exact) for part in parts
+        )
         self.values = _array(inputs.values.flatten(1), np.float32)
         self.background = _array(inputs.background, np.float32)
         self.channels = inputs.channels
@@ -91,7 +104,9 @@ class _Scene:
         pose, K = _array(inputs.pose, np.float64), _array(inputs.K, np.float64)
         view = np.zeros(layout.VIEW)
         view[:9] = pose[:3, :3].reshape(-1)
-        view[layout.TX : layout.TX + 3] = pose[:3, :3] @ _array(inputs.origin, np.float64) + pose[:3, 3]
+        view[layout.TX : layout.TX + 3] = (
+            pose[:3, :3] @ _array(inputs.origin, np.float64) + pose[:3, 3]
+        )
         view[layout.FX :] = (
             K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2], inputs.width, inputs.height, inputs.near,
             inputs.kind == "2d", inputs.depth == "center", inputs.antialiased, inputs.harmonic,
@@ -101,7 +116,8 @@ class _Scene:
         self.tiles_y = -(-inputs.height // layout.TILE)
         if self.tiles_x > WIDEST // layout.TILE:
             raise ValueError(
-                f"camera: {inputs.width} pixels wide; the CPU backend draws up to {WIDEST}: render it in parts"
+                f"camera: {inputs.width} pixels wide; the CPU backend draws up to {WIDEST}: render"
+                " it in parts"
             )
         self.tiles = self.tiles_x * self.tiles_y
         self.visit = _visit(self.tiles_x, self.tiles_y)
@@ -120,7 +136,12 @@ class _Scene:
             key, *(_pool.empty(n, kind) for kind in [np.int32] * 2 + [np.uint32] * 2)
         )
         if len(ties):
-            order.break_ties(self.order, key, [self.means, self.scales, self.quats, self.opacities, self.values], ties)
+            order.break_ties(
+                self.order,
+                key,
+                [self.means, self.scales, self.quats, self.opacities, self.values],
+                ties,
+            )
         m = len(self.order)
         self.thin = _pool.empty((m, 2 * layout.COLUMNS), np.float32)
         self.table = self.thin.view(np.float64)
@@ -136,19 +157,23 @@ class _Scene:
         self.entries = np.empty(0, np.int64)
 
     def front(self) -> int:
-        """How many of the nearest splats to begin with: all, unless they would make lists far longer than needed."""
+        """How many of the nearest splats to begin with: all, unless they would make lists far
+        longer than needed.
+        """
         length = self.listed / self.tiles
         return len(self.order) if length < 4 * FRONT else -(-len(self.order) * FRONT // int(length))
 
     def set_up(self, count: int, live: np.ndarray) -> None:
-        """Project the nearest ``count`` splats, and find the tiles that they may show in: splats that were not set up
-        before need only be right in those that are ``live``."""
+        """Project the nearest ``count`` splats, and find the tiles that they may show in: splats
+        that were not set up before need only be right in those that are ``live``."""
         wanted = np.zeros((self.tiles_y + 1, self.tiles_x + 1), np.int32)
         wanted[1:, 1:] = live.reshape(self.tiles_y, self.tiles_x).cumsum(0).cumsum(1)
         before = np.concatenate([[0], np.cumsum(live)])
         groups = [
             (self.ready + first, self.ready + last)
-            for first, last in ranges(count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS)))
+            for first, last in ranges(
+                count - self.ready, max(GROUP, -(-(count - self.ready) // GROUPS))
+            )
         ]
         spans: list[np.ndarray] = [np.empty((0, layout.RUN), np.int32)] * len(groups)
         changes = _pool.zeros((len(groups), self.tiles + 1), np.int32)
@@ -157,19 +182,50 @@ class _Scene:
             begin, end = groups[index]
             shapes = _pool.empty((end - begin, 16), np.float32)
             projection.project(
-                begin, end, self.order, self.view, self.means, self.quats, self.scales, self.opacities, self.values,
-                self.channels, wanted, self.table, self.thin, self.features, shapes,
-                _aligned(2 * projection.SETUP).view(np.float64), _aligned(projection.SETUP_NARROW), np.empty(16),
-            )  # fmt: skip
-            codes, pieces = _aligned(48 * binning.NOTES).view(np.int32), _aligned(16 * binning.NOTES)
+                begin,
+                end,
+                self.order,
+                self.view,
+                self.means,
+                self.quats,
+                self.scales,
+                self.opacities,
+                self.values,
+                self.channels,
+                wanted,
+                self.table,
+                self.thin,
+                self.features,
+                shapes,
+                _aligned(2 * projection.SETUP).view(np.float64),
+                _aligned(projection.SETUP_NARROW),
+                np.empty(16),
+            )
+            codes, pieces = (
+                _aligned(48 * binning.NOTES).view(np.int32),
+                _aligned(16 * binning.NOTES),
+            )
             notes = np.empty((binning.NOTES, 3), np.int64)
             room = int(self.rows * (end - begin)) + 256
             while True:
                 runs = _pool.empty((room, layout.RUN), np.int32)
                 used = binning.outline(
-                    begin, end, self.table, self.thin, self.view, self.tiles_x, self.tiles_y, before, shapes, runs,
-                    self.counts, changes[index], codes, pieces, notes,
-                )  # fmt: skip
+                    begin,
+                    end,
+                    self.table,
+                    self.thin,
+                    self.view,
+                    self.tiles_x,
+                    self.tiles_y,
+                    before,
+                    shapes,
+                    runs,
+                    self.counts,
+                    changes[index],
+                    codes,
+                    pieces,
+                    notes,
+                )
                 if used <= room:
                     break
                 room = used
@@ -185,11 +241,14 @@ class _Scene:
         self.changes.append(changes)
 
     def bands(self, live: np.ndarray) -> list[np.ndarray]:
-        """The tiles that are ``live``, in parts whose lists are not longer together than the picture and the splats
+        """The tiles that are ``live``, in parts whose lists are not longer together than the
+        picture and the splats
         allow: memory stays proportional to these, whatever the splats cover."""
         if not self.changes:
             return []
-        lengths = np.cumsum(sum(changes.sum(axis=0, dtype=np.int64) for changes in self.changes)[:-1])
+        lengths = np.cumsum(
+            sum(changes.sum(axis=0, dtype=np.int64) for changes in self.changes)[:-1]
+        )
         upto = np.cumsum((lengths * live)[self.visit])
         most = ENTRIES * (self.tiles * layout.PIXELS + len(self.order))
         if upto[-1] <= most:
@@ -199,7 +258,9 @@ class _Scene:
         return [live & (band == k) for k in np.unique(band[live])]
 
     def bin(self, live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lists of the splats that are set up, in the tiles that are ``live``: (tiles + 1) starts, and entries."""
+        """Lists of the splats that are set up, in the tiles that are ``live``: (tiles + 1) starts,
+        and entries.
+        """
         starts = np.zeros(self.tiles + 1, np.int64)
         changes = _join(self.changes) if self.changes else np.zeros((0, self.tiles + 1), np.int32)
         cursors = _pool.empty(changes.shape, np.int64)
@@ -225,10 +286,14 @@ class _Scene:
 
 
 class _Composite(torch.autograd.Function):
-    """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs`` out."""
+    """The kernels as one differentiable step: the tensors of ``Inputs`` in, those of ``Outputs``
+    out.
+    """
 
     @staticmethod
-    def forward(ctx: Any, inputs: Inputs, counters: dict[str, int], *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(
+        ctx: Any, inputs: Inputs, counters: dict[str, int], *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
         scene = _Scene(inputs)
         h, w = inputs.height, inputs.width
         near, far = inputs.ndc
@@ -244,7 +309,8 @@ class _Composite(torch.autograd.Function):
         count, worked_off, pairs, composited = scene.front(), 0, 0, 0
         lists: list[np.ndarray] = []
         weight_of = _pool.zeros(len(scene.order), np.int64)
-        # In deep scenes most tiles are opaque long before the last splat; those that are not start again with all.
+        # In deep scenes most tiles are opaque long before the last splat; those that are not start
+        # again with all.
         while True:
             scene.set_up(count, live)
             last = count == len(scene.order)
@@ -254,21 +320,57 @@ class _Composite(torch.autograd.Function):
                 run_jobs(
                     rasterization.forward,
                     [
-                        (*job, scene.visit, scene.view, scene.tiles_x, band, starts, entries, scene.table, scene.thin,
-                         scene.features, scene.background, scale, color, alpha, depth, median, normal, l1, l2, state,
-                         done, tested, shaded, drawn, full, seen, _aligned(slots * layout.PIXELS),
-                         _aligned(rasterization.WORK), _aligned(2 * rasterization.BLOCK * layout.EXACT).view(np.float64),
-                         *np.empty((2, rasterization.BLOCK), np.int64), np.empty(rasterization.BLOCK, np.int32))
+                        (
+                            *job,
+                            scene.visit,
+                            scene.view,
+                            scene.tiles_x,
+                            band,
+                            starts,
+                            entries,
+                            scene.table,
+                            scene.thin,
+                            scene.features,
+                            scene.background,
+                            scale,
+                            color,
+                            alpha,
+                            depth,
+                            median,
+                            normal,
+                            l1,
+                            l2,
+                            state,
+                            done,
+                            tested,
+                            shaded,
+                            drawn,
+                            full,
+                            seen,
+                            _aligned(slots * layout.PIXELS),
+                            _aligned(rasterization.WORK),
+                            _aligned(2 * rasterization.BLOCK * layout.EXACT).view(np.float64),
+                            *np.empty((2, rasterization.BLOCK), np.int64),
+                            np.empty(rasterization.BLOCK, np.int32),
+                        )
                         for job in scene.visits(starts)
                     ],
-                )  # fmt: skip
+                )
                 worked_off += int(done[band].sum())
                 pairs += int(tested[band].sum())
                 composited += int(shaded[band].sum())
                 ended = band if last else band & full
                 kept = _pool.empty(int(done[ended].sum()) if state.shape[1] else 0, np.int64)
                 rasterization.settle(
-                    ended, starts, done, entries, seen, weight_of, sum(map(len, lists)), scene.starts, kept
+                    ended,
+                    starts,
+                    done,
+                    entries,
+                    seen,
+                    weight_of,
+                    sum(map(len, lists)),
+                    scene.starts,
+                    kept,
                 )
                 lists.append(kept)
             live = live & ~full
@@ -287,13 +389,22 @@ class _Composite(torch.autograd.Function):
             composited=composited,
             contributing=int(drawn.sum()),
         )
-        ctx.scene, ctx.state, ctx.alpha, ctx.depth, ctx.done, ctx.scale = scene, state, alpha, depth, done, scale
+        ctx.scene, ctx.state, ctx.alpha, ctx.depth, ctx.done, ctx.scale = (
+            scene,
+            state,
+            alpha,
+            depth,
+            done,
+            scale,
+        )
         ctx.origin = _array(inputs.origin, np.float64)
         ctx.shapes = [(t.shape, t.dtype) for t in tensors]
         # Kept so that torch notices when one of them is changed in place before the backward pass.
         ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        return tuple(torch.from_numpy(a) for a in (color, alpha, depth, median, normal, l1, l2, weight))
+        return tuple(
+            torch.from_numpy(a) for a in (color, alpha, depth, median, normal, l1, l2, weight)
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -309,7 +420,16 @@ class _Composite(torch.autograd.Function):
         ]
         g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight = g
         total = _gather_rows(
-            scene, ctx, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight[scene.order]
+            scene,
+            ctx,
+            g_color,
+            g_alpha,
+            g_depth,
+            g_median,
+            g_normal,
+            g_l1,
+            g_l2,
+            g_weight[scene.order],
         )
         parameters = (scene.means, scene.quats, scene.scales, scene.opacities, scene.values)
         gm, gq, gs, go, gv = (_pool.zeros(part.shape, part.dtype) for part in parameters)
@@ -318,11 +438,28 @@ class _Composite(torch.autograd.Function):
         run_jobs(
             backward.project_backward,
             [
-                (*piece, scene.order, scene.view, scene.means, scene.quats, scene.scales, scene.opacities,
-                 scene.values, scene.channels, scene.table, total, gm, gq, gs, go, gv, g_view[k])
+                (
+                    *piece,
+                    scene.order,
+                    scene.view,
+                    scene.means,
+                    scene.quats,
+                    scene.scales,
+                    scene.opacities,
+                    scene.values,
+                    scene.channels,
+                    scene.table,
+                    total,
+                    gm,
+                    gq,
+                    gs,
+                    go,
+                    gv,
+                    g_view[k],
+                )
                 for k, piece in enumerate(pieces)
             ],
-        )  # fmt: skip
+        )
         moved = g_view.sum(axis=0)
         g_pose = np.zeros((4, 4))
         g_pose[:3, :3] = moved[:9].reshape(3, 3) + np.outer(moved[9:], ctx.origin)
@@ -336,7 +473,9 @@ class _Composite(torch.autograd.Function):
             None,
             *(
                 _tensor(grad, shape, dtype) if needed else None
-                for grad, (shape, dtype), needed in zip(grads, ctx.shapes, ctx.needs_input_grad[2:], strict=True)
+                for grad, (shape, dtype), needed in zip(
+                    grads, ctx.shapes, ctx.needs_input_grad[2:], strict=True
+                )
             ),
         )
 
@@ -344,7 +483,8 @@ class _Composite(torch.autograd.Function):
 def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
     """(N, columns) gradients in the projected splats, summed over tiles in their order.
 
-    One row for each splat of each tile would be more than should be held at once, so groups of tiles take turns.
+    One row for each splat of each tile would be more than should be held at once, so groups of
+    tiles take turns.
     """
     n = scene.ready
     columns = layout.GRADIENTS + 3 + max(3, scene.channels)
@@ -370,19 +510,52 @@ def _gather_rows(scene: _Scene, ctx: Any, *upstream: np.ndarray) -> np.ndarray:
         run_jobs(
             backward.backward,
             [
-                (begin, end, visit, scene.view, scene.tiles_x, scene.starts, done, scene.entries, scene.table,
-                 scene.thin, scene.features, scene.background, ctx.scale, ctx.alpha, ctx.depth, ctx.state, *upstream,
-                 place, rows, _aligned(slots * layout.PIXELS), _aligned(backward.BACK_WORK),
-                 _aligned(2 * layout.EXACT).view(np.float64))
+                (
+                    begin,
+                    end,
+                    visit,
+                    scene.view,
+                    scene.tiles_x,
+                    scene.starts,
+                    done,
+                    scene.entries,
+                    scene.table,
+                    scene.thin,
+                    scene.features,
+                    scene.background,
+                    ctx.scale,
+                    ctx.alpha,
+                    ctx.depth,
+                    ctx.state,
+                    *upstream,
+                    place,
+                    rows,
+                    _aligned(slots * layout.PIXELS),
+                    _aligned(backward.BACK_WORK),
+                    _aligned(2 * layout.EXACT).view(np.float64),
+                )
                 for begin, end in itertools.pairwise(edges)
             ],
-        )  # fmt: skip
-        # Each thread takes some of the splats and all of the rows: whoever adds, the order is that of the tiles.
+        )
+        # Each thread takes some of the splats and all of the rows: whoever adds, the order is that
+        # of the tiles.
         share = -(-n // thread_count())
         run_jobs(
             backward.reduce_rows,
             [
-                (low, high, first, last, visit, scene.starts, done, scene.entries, place, rows, total)
+                (
+                    low,
+                    high,
+                    first,
+                    last,
+                    visit,
+                    scene.starts,
+                    done,
+                    scene.entries,
+                    place,
+                    rows,
+                    total,
+                )
                 for low, high in ranges(n, max(1, share))
             ],
         )
@@ -394,8 +567,24 @@ def render(inputs: Inputs) -> Outputs:
     """Render on the CPU; see :func:`attnwarp.render.render`."""
     counters: dict[str, int] = {}
     tensors = _Composite.apply(
-        inputs, counters, inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.values, inputs.pose,
+        inputs,
+        counters,
+        inputs.means,
+        inputs.quats,
+        inputs.scales,
+        inputs.opacities,
+        inputs.values,
+        inputs.pose,
         inputs.background,
-    )  # fmt: skip
-    names = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
+    )
+    names = (
+        "color",
+        "alpha",
+        "depth",
+        "median_depth",
+        "normal",
+        "distortion_l1",
+        "distortion_l2_ndc",
+        "weight",
+    )
     return Outputs(**dict(zip(names, tensors, strict=True)), counters=counters)

@@ -1,17 +1,20 @@
 """The GPU backend: gsplat, where it and CUDA are present.
 
-Colour, alpha, depth, normal, distortion_l2_ndc and weight mean what they mean everywhere: each splat's colour, normal,
-depth z, 1/z and 1/z^2 are composited as features, and the outputs are made from the sums. What gsplat (1.5.3) does
-differently:
+Colour, alpha, depth, normal, distortion_l2_ndc and weight mean what they mean everywhere: each
+splat's colour, normal, depth z, 1/z and 1/z^2 are composited as features, and the outputs are made
+from the sums. What gsplat (1.5.3) does differently:
 
-- Depth is that of the splat's centre. "intersection" and "peak" are refused; ask for depth="center".
-- A 2D splat is cut off by a box of 3.33 times its one-sigma extent, which is too small in perspective (colour errors
-  up to 1.6e-2), its screen filter sits in the middle of that box, and only centres are tested against ``near``, so that
-  a splat that crosses the camera plane is drawn wrong. These cannot be emulated from outside: kind "2d" is refused unless
-  ``ATTNWARP_GSPLAT_2D=1`` is set in the environment, which says that they are accepted.
+- Depth is that of the splat's centre. "intersection" and "peak" are refused; ask for
+  depth="center".
+- A 2D splat is cut off by a box of 3.33 times its one-sigma extent, which is too small in
+  perspective (colour errors up to 1.6e-2), its screen filter sits in the middle of that box, and
+  only centres are tested against ``near``, so that a splat that crosses the camera plane is drawn
+  wrong. These cannot be emulated from outside: kind "2d" is refused unless ``ATTNWARP_GSPLAT_2D=1``
+  is set in the environment, which says that they are accepted.
 - Of the camera's K only fx, fy, cx and cy are read: a camera with skew (K[0, 1] not 0) is refused.
-- alpha is clamped at 0.999 or 0.99 depending on the version, and the splat that brings the transmittance below 1e-4 is
-  left out. Both differ by less than 1 % of a pixel, behind opaque splats.
+- alpha is clamped at 0.999 or 0.99 depending on the version, and the splat that brings the
+  transmittance below 1e-4 is left out. Both differ by less than 1 % of a pixel, behind opaque
+  splats.
 - There is no median depth and no distortion_l1 of a feature: both are NaN everywhere.
 - Splats of equal depth are drawn in the order of the input.
 - ``weight`` carries no gradient.
@@ -51,13 +54,14 @@ def refuse(inputs: Inputs) -> None:
     skew = float(inputs.K[0, 1])
     if skew != 0:
         raise ValueError(
-            f"camera: K[0, 1], its skew, is {skew:.6g}, but gsplat reads only fx, fy, cx and cy of K; use backend 'cpu', or "
-            "a camera with K[0, 1] = 0 if the skew is rounding"
+            f"camera: K[0, 1], its skew, is {skew:.6g}, but gsplat reads only fx, fy, cx and cy of"
+            " K; use backend 'cpu', or a camera with K[0, 1] = 0 if the skew is rounding"
         )
     if inputs.kind == "2d" and os.environ.get(ACCEPT_2D) != "1":
         raise ValueError(
-            "backend: gsplat cuts 2D splats off by a box that is too small in perspective; use backend 'cpu', or set "
-            f"{ACCEPT_2D}=1 to accept it (attnwarp.render.cuda says what it costs)"
+            "backend: gsplat cuts 2D splats off by a box that is too small in perspective; use"
+            f" backend 'cpu', or set {ACCEPT_2D}=1 to accept it (attnwarp.render.cuda says what it"
+            " costs)"
         )
 
 
@@ -76,16 +80,22 @@ def render(inputs: Inputs) -> Outputs:
 
 
 def composite(inputs: Inputs, rasterizer: object) -> Outputs:
-    """The outputs, from a rasterizer that composites features: (inputs, (N, F) features) -> (H, W, F) sums, (H, W)
-    alpha."""
+    """The outputs, from a rasterizer that composites features: (inputs, (N, F) features) -> (H, W,
+    F) sums, (H, W) alpha."""
     assert callable(rasterizer)
     means = inputs.means
     R, t = inputs.pose[:3, :3], inputs.pose[:3, 3]
     # The camera is subtracted in float64, whatever the splats' own precision.
     centers = means.double() @ R.T.to(means.device) + (R @ inputs.origin + t).to(means.device)
     z = centers[:, 2].clamp(min=inputs.near)
-    axis = torch.full((len(means),), 2, device=means.device) if inputs.kind == "2d" else inputs.scales.argmin(dim=-1)
-    world = reference.rotation_matrices(inputs.quats).gather(2, axis[:, None, None].expand(-1, 3, 1))[..., 0]
+    axis = (
+        torch.full((len(means),), 2, device=means.device)
+        if inputs.kind == "2d"
+        else inputs.scales.argmin(dim=-1)
+    )
+    world = reference.rotation_matrices(inputs.quats).gather(
+        2, axis[:, None, None].expand(-1, 3, 1)
+    )[..., 0]
     facing = (world.double() * (centers @ R.to(means.device))).sum(-1)
     normals = world * torch.where(facing > 0, -1.0, 1.0).to(world.dtype)[:, None]
     if inputs.harmonic:
@@ -145,8 +155,12 @@ def rasterize(inputs: Inputs, features: Tensor) -> tuple[Tensor, Tensor]:
     }
     if inputs.kind == "3d":
         mode = "antialiased" if inputs.antialiased else "classic"
-        pictures, alphas, _ = rasterization(scales=inputs.scales.float(), rasterize_mode=mode, **common)
+        pictures, alphas, _ = rasterization(
+            scales=inputs.scales.float(), rasterize_mode=mode, **common
+        )
     else:
-        flat = torch.cat([inputs.scales.float(), torch.ones_like(inputs.scales[:, :1]).float()], dim=1)
+        flat = torch.cat(
+            [inputs.scales.float(), torch.ones_like(inputs.scales[:, :1]).float()], dim=1
+        )
         pictures, alphas, *_ = rasterization_2dgs(scales=flat, **common)
     return pictures[0], alphas[0, ..., 0]

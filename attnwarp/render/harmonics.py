@@ -6,7 +6,13 @@ import torch
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
-C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+C2 = (
+    1.0925484305920792,
+    -1.0925484305920792,
+    0.31539156525252005,
+    -1.0925484305920792,
+    0.5462742152960396,
+)
 C3 = (
     -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
     -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
@@ -29,8 +35,12 @@ def basis(direction: torch.Tensor, degree: int) -> torch.Tensor:
         values += [-C1 * y, C1 * z, -C1 * x]
     if degree > 1:
         values += [
-            C2[0] * x * y, C2[1] * y * z, C2[2] * (2 * z * z - x * x - y * y), C2[3] * x * z, C2[4] * (x * x - y * y),
-        ]  # fmt: skip
+            C2[0] * x * y,
+            C2[1] * y * z,
+            C2[2] * (2 * z * z - x * x - y * y),
+            C2[3] * x * z,
+            C2[4] * (x * x - y * y),
+        ]
     if degree > 2:
         values += [
             C3[0] * y * (3 * x * x - y * y),
@@ -45,6 +55,8 @@ def basis(direction: torch.Tensor, degree: int) -> torch.Tensor:
 
 
 def color(sh: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
-    """(N, 3) colours max(0, sum_k sh_k Y_k + 0.5) of (N, K, 3) coefficients seen along (N, 3) unit directions."""
+    """(N, 3) colours max(0, sum_k sh_k Y_k + 0.5) of (N, K, 3) coefficients seen along (N, 3) unit
+    directions.
+    """
     degree = round(sh.shape[1] ** 0.5) - 1
     return (torch.einsum("nk,nkc->nc", basis(direction, degree), sh) + 0.5).clamp_min(0)

@@ -1,4 +1,6 @@
-"""The order in which splats are composited: front to back by centre depth, and never by their place in the input."""
+"""The order in which splats are composited: front to back by centre depth, and never by their place
+in the input.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,9 @@ def break_ties(
 ) -> None:
     """Put splats of equal depth into an order that depends on what they are, in place.
 
-    Depths count as equal when they round to the same float32: a plane of splats seen by a rotated camera differs in
-    the last bits of float64 only, and those are noise. Splats equal in everything are interchangeable.
+    Depths count as equal when they round to the same float32: a plane of splats seen by a rotated
+    camera differs in the last bits of float64 only, and those are noise. Splats equal in everything
+    are interchangeable.
 
     Args:
         order: (M,) indices of splats, sorted by ``depth``; changed in place.
@@ -31,14 +34,19 @@ def break_ties(
     splats = order[places]
     # Most ties are broken by what comes first: the rest is only looked at if it has to be.
     for arrays in (content[:1], content):
-        keys = [depth[splats], *(row for array in arrays for row in array[splats].reshape(len(splats), -1).T)]
+        keys = [
+            depth[splats],
+            *(row for array in arrays for row in array[splats].reshape(len(splats), -1).T),
+        ]
         by = np.lexsort(keys[::-1])
         if not np.all([key[by[1:]] == key[by[:-1]] for key in keys], axis=0).any():
             break
     order[places] = splats[by]
 
 
-def front_to_back(depth: npt.NDArray[np.float32], content: list[np.ndarray]) -> npt.NDArray[np.int64]:
+def front_to_back(
+    depth: npt.NDArray[np.float32], content: list[np.ndarray]
+) -> npt.NDArray[np.int64]:
     """(N,) indices from the nearest to the farthest splat; see :func:`break_ties`."""
     order = np.argsort(depth, kind="stable").astype(np.int64)
     break_ties(order, depth, content)

@@ -1,20 +1,23 @@
-"""The definition of every output, by brute force: each splat against each pixel in float64 torch, through autograd.
+"""The definition of every output, by brute force: each splat against each pixel in float64 torch,
+through autograd.
 
-No tiles, no boxes, no cut-offs but those of ``constants.py``. Written as the papers write it (ray-plane intersection,
-EWA projection), not as the fast backend computes it, so that agreement between the two means something. Small scenes
-and small images only: memory is splats x pixels.
+No tiles, no boxes, no cut-offs but those of ``constants.py``. Written as the papers write it
+(ray-plane intersection, EWA projection), not as the fast backend computes it, so that agreement
+between the two means something. Small scenes and small images only: memory is splats x pixels.
 
-Notation. c = R m + t is a splat's centre in camera axes, d = K^-1 (x, y, 1) the ray of a pixel with d_z = 1, so that a
-depth z is the point z d. w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j), front to back by c_z.
+Notation. c = R m + t is a splat's centre in camera axes, d = K^-1 (x, y, 1) the ray of a pixel with
+d_z = 1, so that a depth z is the point z d. w_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j),
+front to back by c_z.
 
-2D splats: the ray meets the plane at z = n.c / n.d in the splat's coordinates (u, v); rho = min(u^2 + v^2, 2 |x -
-x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z, the second only where near < c_z. Where
-the second decides, z of the plane may lie anywhere: it is bounded to the splat's own extent, c_z +- 3.33 sigma_z, and
-to near. Since |u, v| <= 3.33 wherever the first decides, the bound changes nothing there and z is continuous.
+2D splats: the ray meets the plane at z = n.c / n.d in the splat's coordinates (u, v); rho = min(u^2
++ v^2, 2 |x - x_c|^2) and alpha = o exp(-rho / 2). The first term holds only where near <= z, the
+second only where near < c_z. Where the second decides, z of the plane may lie anywhere: it is
+bounded to the splat's own extent, c_z +- 3.33 sigma_z, and to near. Since |u, v| <= 3.33 wherever
+the first decides, the bound changes nothing there and z is continuous.
 
-3D splats: EWA, Sigma' = J Sigma_c J^T + 0.3 I with J at x/z clamped on each side of the image; centres at or before
-the near plane are not drawn. "peak" depth is where the 3D Gaussian is largest along the ray, z = d.P.c / d.P.d with P
-= Sigma_c^-1, bounded to the splat's extent in the same way.
+3D splats: EWA, Sigma' = J Sigma_c J^T + 0.3 I with J at x/z clamped on each side of the image;
+centres at or before the near plane are not drawn. "peak" depth is where the 3D Gaussian is largest
+along the ray, z = d.P.c / d.P.d with P = Sigma_c^-1, bounded to the splat's extent in the same way.
 """
 
 from __future__ import annotations
@@ -30,7 +33,9 @@ Tensor = torch.Tensor
 
 @dataclass(frozen=True)
 class Thresholds:
-    """The cut-offs of ``constants.py``. Tests move them a little to bracket what rounding may decide either way."""
+    """The cut-offs of ``constants.py``. Tests move them a little to bracket what rounding may
+    decide either way.
+    """
 
     alpha_min: float = constants.ALPHA_MIN
     stop: float = constants.TRANSMITTANCE_STOP
@@ -41,8 +46,9 @@ class Thresholds:
 class Inputs:
     """What a backend gets from the door: checked, and free of defaults. N splats, C channels.
 
-    ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3, 3) and ``pose`` the
-    (4, 4) world-to-camera transform, both float64; ``pose`` and ``background`` (C,) may require gradients.
+    ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3,
+    3) and ``pose`` the (4, 4) world-to-camera transform, both float64; ``pose`` and ``background``
+    (C,) may require gradients.
     """
 
     kind: str
@@ -95,15 +101,22 @@ def rotation_matrices(quats: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
-def render(inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int = 1 << 22) -> Outputs:
+def render(
+    inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int = 1 << 22
+) -> Outputs:
     """Render by brute force in float64; differentiable in every tensor of ``inputs``.
 
     Args:
-        chunk: splat-pixel pairs held at once; rows of pixels are worked off in groups of about this size.
+        chunk: splat-pixel pairs held at once; rows of pixels are worked off in groups of about this
+            size.
     """
     limits = thresholds or Thresholds()
     means, quats, scales = inputs.means.double(), inputs.quats.double(), inputs.scales.double()
-    opacities, values, background = inputs.opacities.double(), inputs.values.double(), inputs.background.double()
+    opacities, values, background = (
+        inputs.opacities.double(),
+        inputs.values.double(),
+        inputs.background.double(),
+    )
     K, pose, origin = inputs.K.double(), inputs.pose.double(), inputs.origin.double()
     R = pose[:3, :3]
     # The world's origin is moved to the splats' in float64 before any splat is touched.
@@ -121,9 +134,19 @@ def render(inputs: Inputs, thresholds: Thresholds | None = None, *, chunk: int =
     normals = world_axes.gather(2, pick)[..., 0] * torch.where(facing > 0, -1.0, 1.0)[:, None]
 
     content = [t.detach().numpy() for t in (means, scales, quats, opacities, values.flatten(1))]
-    index = torch.from_numpy(order.front_to_back(centers[:, 2].detach().numpy().astype("float32"), content))
+    index = torch.from_numpy(
+        order.front_to_back(centers[:, 2].detach().numpy().astype("float32"), content)
+    )
     splats = _Splats(
-        centers[index], axes[index], scales[index], opacities[index], features[index], normals[index], inputs, K, limits
+        centers[index],
+        axes[index],
+        scales[index],
+        opacities[index],
+        features[index],
+        normals[index],
+        inputs,
+        K,
+        limits,
     )
 
     rows_at_once = max(1, chunk // max(1, len(means) * inputs.width))
@@ -167,13 +190,17 @@ class _Splats:
     limits: Thresholds
 
     def composite(self, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
-        """Colour over black, alpha, depth, median, normal, l1, l2 per pixel, weight per splat, contributing pairs."""
+        """Colour over black, alpha, depth, median, normal, l1, l2 per pixel, weight per splat,
+        contributing pairs.
+        """
         inputs, limits = self.inputs, self.limits
         rays = torch.stack(_unproject(x, y, self.K), dim=-1)
         raw, z, drawn = (self._disc if inputs.kind == "2d" else self._ellipsoid)(x, y, rays)
         drawn = drawn & (raw >= limits.alpha_min)
         alpha = torch.where(drawn, raw.clamp(max=constants.ALPHA_MAX), 0.0)
-        before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]
+        before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[
+            :, :-1
+        ]
         alpha = torch.where(before > limits.stop, alpha, 0.0)
         drawn = alpha > 0
         w = alpha * before
@@ -181,7 +208,8 @@ class _Splats:
         color = w @ self.features
         normal = w @ self.normals
         total = w.sum(dim=1)
-        # The first splat drawn has w >= ALPHA_MIN: a pixel is either clearly covered or not covered at all.
+        # The first splat drawn has w >= ALPHA_MIN: a pixel is either clearly covered or not covered
+        # at all.
         covered = drawn.any(dim=1)
         safe = torch.where(covered, total, 1.0)
         nan = torch.full_like(total, torch.nan)
@@ -200,8 +228,8 @@ class _Splats:
 
     def _extent(self, variance_z: Tensor) -> tuple[Tensor, Tensor]:
         near = self.inputs.near
-        # Bounded from below: the slope of a square root at zero is infinite, and a disc may lie exactly across the
-        # axis.
+        # Bounded from below: the slope of a square root at zero is infinite, and a disc may lie
+        # exactly across the axis.
         reach = constants.EXTENT_SIGMAS * variance_z.clamp(min=1e-300).sqrt()
         z = self.centers[:, 2]
         return (z - reach).clamp(min=near), (z + reach).clamp(min=near)
@@ -213,10 +241,13 @@ class _Splats:
         floor = constants.EDGE_ON * c.norm(dim=-1)
         tilted = torch.where(nc.abs() < floor, torch.where(nc < 0, -floor, floor), nc)
         in_front = c[:, 2] > near
-        # Tilting an edge-on plane leaves it through the centre, so n.d changes by as much as n.c does.
-        nd = rays @ n.T + torch.where(in_front, (tilted - nc) / torch.where(in_front, c[:, 2], 1.0), 0.0)
-        # 1 / z is the linear quantity along a row of pixels; it passes through zero where the plane is parallel to the
-        # ray.
+        # Tilting an edge-on plane leaves it through the centre, so n.d changes by as much as n.c
+        # does.
+        nd = rays @ n.T + torch.where(
+            in_front, (tilted - nc) / torch.where(in_front, c[:, 2], 1.0), 0.0
+        )
+        # 1 / z is the linear quantity along a row of pixels; it passes through zero where the plane
+        # is parallel to the ray.
         inverse = nd / tilted
         ahead = inverse > 0
         z = 1 / torch.where(ahead, inverse, 1.0)
@@ -252,9 +283,9 @@ class _Splats:
             low, high = -K[k, 2] / K[k, k] - margin, (size - K[k, 2]) / K[k, k] + margin
             limit.append(torch.minimum(torch.maximum(slope, low), high))
         zero, inverse = torch.zeros_like(depth), 1 / depth
-        J = torch.stack([inverse, zero, -limit[0] * inverse, zero, inverse, -limit[1] * inverse], dim=-1).reshape(
-            -1, 2, 3
-        )
+        J = torch.stack(
+            [inverse, zero, -limit[0] * inverse, zero, inverse, -limit[1] * inverse], dim=-1
+        ).reshape(-1, 2, 3)
         J = K[:2, :2] @ J
         cov = J @ sigma @ J.transpose(1, 2)
         blurred = cov + constants.BLUR_3D * torch.eye(2, dtype=torch.float64)
@@ -265,7 +296,9 @@ class _Splats:
             opacity = opacity * (sharp / det).clamp(min=constants.COMPENSATION_MIN).sqrt()
         xc, yc = _project(c, in_front, K)
         dx, dy = x[:, None] - xc, y[:, None] - yc
-        power = (blurred[:, 1, 1] * dx * dx - 2 * blurred[:, 0, 1] * dx * dy + blurred[:, 0, 0] * dy * dy) / det
+        power = (
+            blurred[:, 1, 1] * dx * dx - 2 * blurred[:, 0, 1] * dx * dy + blurred[:, 0, 0] * dy * dy
+        ) / det
         alpha = opacity * torch.exp(-0.5 * power)
         drawn = in_front.expand_as(alpha)
         if inputs.depth == "center":

@@ -1,8 +1,8 @@
 """Threads for kernels that release the GIL.
 
-Python's own threads, not numba's parallel loops: numba's "workqueue" layer aborts when two threads enter it at once,
-its OpenMP layer aborts after a fork, and both multiply the time it takes to compile. These may be called from any
-thread of any process, forked or not.
+Python's own threads, not numba's parallel loops: numba's "workqueue" layer aborts when two threads
+enter it at once, its OpenMP layer aborts after a fork, and both multiply the time it takes to
+compile. These may be called from any thread of any process, forked or not.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _chosen: int | None = None
 def set_thread_count(threads: int | None) -> None:
     """Use so many threads from now on, whatever torch is set to; None: torch's setting again.
 
-    A fit spends the rest of its time in tensor operations too small to gain from torch's threads, which then only
-    wait, and wait by spinning.
+    A fit spends the rest of its time in tensor operations too small to gain from torch's threads,
+    which then only wait, and wait by spinning.
     """
     global _chosen
     if threads is not None and threads < 1:
@@ -49,14 +49,18 @@ def thread_count() -> int:
 
 
 def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
-    """Call work(*job) for every job, on up to :func:`thread_count` threads; jobs must not write to the same place."""
+    """Call work(*job) for every job, on up to :func:`thread_count` threads; jobs must not write to
+    the same place.
+    """
     threads = min(thread_count(), len(jobs))
     if threads <= 1:
         for job in jobs:
             work(*job)
         return
     with _lock:
-        pool = _pools.setdefault(threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="attnwarp-render"))
+        pool = _pools.setdefault(
+            threads, ThreadPoolExecutor(threads - 1, thread_name_prefix="attnwarp-render")
+        )
     pending = list(jobs)[::-1]
 
     def drain() -> None:

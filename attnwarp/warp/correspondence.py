@@ -1,8 +1,9 @@
 """Correspondences between two views, and sampling along them.
 
-Coordinates are pixels with centres at +0.5, so an image spans [0, W] x [0, H], and a coordinate u of an image becomes
-exactly u * s in the image resized by s. A correspondence is worked out once for a pair of views, in float64; any number
-of feature maps, of any channel count, is then sampled along it.
+Coordinates are pixels with centres at +0.5, so an image spans [0, W] x [0, H], and a coordinate u
+of an image becomes exactly u * s in the image resized by s. A correspondence is worked out once for
+a pair of views, in float64; any number of feature maps, of any channel count, is then sampled along
+it.
 """
 
 from __future__ import annotations
@@ -25,13 +26,17 @@ PixelCenters = Literal["half", "integer"]
 DepthInterpolation = Literal["inverse", "bilinear", "nearest"]
 
 TAP_SPREAD = 0.02
-"""Depth taps whose largest exceeds the smallest by more than this fraction straddle an edge and are not blended.
+"""Depth taps whose largest exceeds the smallest by more than this fraction straddle an edge and are
+not blended.
 
-Rejecting at 2 % left 0 wrong labels of the 0.1 % to 10.8 % that a z-buffer gave without it, in a survey of scenes at
-512 to 32 px; a surface that recedes faster than 2 % a pixel is rejected with the edges."""
+Rejecting at 2 % left 0 wrong labels of the 0.1 % to 10.8 % that a z-buffer gave without it, in a
+survey of scenes at 512 to 32 px; a surface that recedes faster than 2 % a pixel is rejected with
+the edges."""
 
 SNAP = 1e-7
-"""Coordinates this close (in px) to a tap are put on it, so that a view warped onto itself returns its own bits."""
+"""Coordinates this close (in px) to a tap are put on it, so that a view warped onto itself returns
+its own bits.
+"""
 
 _HALF_PRECISION = (torch.float16, torch.bfloat16)
 
@@ -44,8 +49,10 @@ class Correspondence:
 
     Args:
         source, target: the cameras; their sizes are the sizes of the two grids.
-        xy: (H, W, 2) source pixels (centres at +0.5, whatever ``pixel_centers`` is); NaN where undefined.
-        points: (H, W, 3) the surface points in the source camera's axes; NaN where the target's depth is undefined.
+        xy: (H, W, 2) source pixels (centres at +0.5, whatever ``pixel_centers`` is); NaN where
+            undefined.
+        points: (H, W, 3) the surface points in the source camera's axes; NaN where the target's
+            depth is undefined.
         target_depth: (H, W) depth along the target's optical axis; NaN where undefined.
         pixel_centers: the convention it was computed with, see :func:`correspond`.
         in_front: points at and behind the source camera have no ``xy``.
@@ -71,7 +78,9 @@ class Correspondence:
 
     @property
     def z(self) -> Tensor:
-        """(H, W) depth of the points in the source camera, of either sign; NaN without a target depth."""
+        """(H, W) depth of the points in the source camera, of either sign; NaN without a target
+        depth.
+        """
         return self.points[..., 2]
 
     @property
@@ -95,18 +104,20 @@ def correspond(
 ) -> Correspondence:
     """Where each target pixel's surface point lies in the source image.
 
-    The pixel is unprojected with its depth, moved by the relative pose of the cameras (formed from the difference of
-    their centres, so that far-away worlds and tiny baselines keep their digits) and projected.
+    The pixel is unprojected with its depth, moved by the relative pose of the cameras (formed from
+    the difference of their centres, so that far-away worlds and tiny baselines keep their digits)
+    and projected.
 
     Args:
         source, target: cameras in one world.
-        target_depth: (H, W) depth along the target's optical axis, of the target's size. Zero, negative, infinite and
-            NaN depths are undefined: they are masked, never filled.
-        pixel_centers: "half" puts the centre of pixel j at j + 0.5. "integer" reproduces a slip of the published code:
-            pixel j, whose depth was sampled at j + 0.5, is unprojected at j, and the projection u is read as the index
-            u, which is the position u + 0.5. The error is a fraction of a pixel of the grid the cameras have.
-        in_front: leave points at and behind the source camera without a position. False reproduces warps that lack
-            the test: such points project through the centre, upside down.
+        target_depth: (H, W) depth along the target's optical axis, of the target's size. Zero,
+            negative, infinite and NaN depths are undefined: they are masked, never filled.
+        pixel_centers: "half" puts the centre of pixel j at j + 0.5. "integer" reproduces a slip of
+            the published code: pixel j, whose depth was sampled at j + 0.5, is unprojected at j,
+            and the projection u is read as the index u, which is the position u + 0.5. The error is
+            a fraction of a pixel of the grid the cameras have.
+        in_front: leave points at and behind the source camera without a position. False reproduces
+            warps that lack the test: such points project through the centre, upside down.
 
     Raises:
         ValueError: the depth has another size than ``target``, or is not of a floating type.
@@ -115,8 +126,9 @@ def correspond(
     depth = _depth(target_depth, "target_depth")
     if tuple(depth.shape) != (target.height, target.width):
         raise ValueError(
-            f"target_depth: got shape {tuple(depth.shape)}, expected ({target.height}, {target.width}), the target "
-            "camera's size; resize the camera, or use correspond_at for a feature grid"
+            f"target_depth: got shape {tuple(depth.shape)}, expected ({target.height},"
+            f" {target.width}), the target camera's size; resize the camera, or use correspond_at"
+            " for a feature grid"
         )
     pose = torch.from_numpy(source.relative_to(target))
     camera_points = _directions(target, pixel_centers) * depth[..., None]
@@ -144,10 +156,12 @@ def correspond_at(
     interpolation: DepthInterpolation = "inverse",
     spread: float | None = TAP_SPREAD,
 ) -> Correspondence:
-    """The correspondence of a feature grid: cameras resized, depth taken to the centres of the grid's pixels.
+    """The correspondence of a feature grid: cameras resized, depth taken to the centres of the
+    grid's pixels.
 
     Args:
-        source, target, target_depth, pixel_centers, in_front: as in :func:`correspond`, at image size.
+        source, target, target_depth, pixel_centers, in_front: as in :func:`correspond`, at image
+            size.
         size: (h, w) of the target's feature grid.
         source_size: (h, w) of the source's; by default the source image scaled as the target's is.
         interpolation, spread: as in :func:`resize_depth`.
@@ -165,7 +179,8 @@ def correspond_at(
 
 
 def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[int, int]:
-    """(h, w) of the source's feature grid when the target's is ``size``, at the same fraction of the image.
+    """(h, w) of the source's feature grid when the target's is ``size``, at the same fraction of
+    the image.
 
     Raises:
         ValueError: the fraction does not give whole numbers.
@@ -173,8 +188,8 @@ def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[i
     h, w = size[0] * source.height / target.height, size[1] * source.width / target.width
     if h != round(h) or w != round(w):
         raise ValueError(
-            f"size: {size} of a {target.height} x {target.width} target makes the source's feature grid {h:g} x {w:g}; "
-            "give source_size"
+            f"size: {size} of a {target.height} x {target.width} target makes the source's feature"
+            f" grid {h:g} x {w:g}; give source_size"
         )
     return round(h), round(w)
 
@@ -190,10 +205,12 @@ def resize_depth(
 
     Args:
         depth: (H, W) depth along the optical axis.
-        size: (h, w) of the grid; its pixel (i, j) has its centre at ((j + 0.5) W / w, (i + 0.5) H / h).
-        interpolation: "inverse" is bilinear in 1 / z, exact on a plane at any slant; "bilinear" is bilinear in z;
-            "nearest" takes the pixel that holds the centre.
-        spread: reject (NaN) taps of which the largest exceeds the smallest by more than this fraction; None blends.
+        size: (h, w) of the grid; its pixel (i, j) has its centre at ((j + 0.5) W / w, (i + 0.5) H /
+            h).
+        interpolation: "inverse" is bilinear in 1 / z, exact on a plane at any slant; "bilinear" is
+            bilinear in z; "nearest" takes the pixel that holds the centre.
+        spread: reject (NaN) taps of which the largest exceeds the smallest by more than this
+            fraction; None blends.
 
     Returns:
         (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
@@ -235,8 +252,8 @@ def sample_depth(
 def in_bounds(correspondence: Correspondence, size: tuple[int, int] | None = None) -> Tensor:
     """(H, W) bool: the position lies inside an image of ``size`` (h, w), by default the source's.
 
-    With half centres that is 0 <= x <= W. With integer centres the method takes the index for the position, so it is
-    the index that is held against 0 <= u < W.
+    With half centres that is 0 <= x <= W. With integer centres the method takes the index for the
+    position, so it is the index that is held against 0 <= u < W.
     """
     h, w = size if size is not None else (correspondence.source.height, correspondence.source.width)
     x, y = correspondence.xy.unbind(-1)
@@ -247,38 +264,47 @@ def in_bounds(correspondence: Correspondence, size: tuple[int, int] | None = Non
 
 
 def sample(
-    features: Tensor, correspondence: Correspondence, *, mode: Literal["bilinear", "nearest"] = "bilinear"
+    features: Tensor,
+    correspondence: Correspondence,
+    *,
+    mode: Literal["bilinear", "nearest"] = "bilinear",
 ) -> tuple[Tensor, Tensor]:
     """A source feature map, warped to the target's grid.
 
     Args:
-        features: (C, h, w) or (B, C, h, w) on the source's image, of any size: a position u becomes u * w / W (for
-            integer centres u * (w - 1) / (W - 1) on indices, which is what align_corners=True does). Its gradient
-            flows back through the result.
+        features: (C, h, w) or (B, C, h, w) on the source's image, of any size: a position u becomes
+            u * w / W (for integer centres u * (w - 1) / (W - 1) on indices, which is what
+            align_corners=True does). Its gradient flows back through the result.
         correspondence: H x W positions, float64; moved to the features' device.
-        mode: "bilinear" for floating types: weights and sums in float32 for half precision, in the features' own type
-            otherwise. "nearest" for any type, labels included.
+        mode: "bilinear" for floating types: weights and sums in float32 for half precision, in the
+            features' own type otherwise. "nearest" for any type, labels included.
 
     Returns:
-        warped: (C, H, W) or (B, C, H, W) in the features' type. A position outside the image takes the border's value;
-            a pixel without a position is 0, so that it cannot spread NaN into a network. Use the mask.
+        warped: (C, H, W) or (B, C, H, W) in the features' type. A position outside the image takes
+            the border's value; a pixel without a position is 0, so that it cannot spread NaN into a
+            network. Use the mask.
         mask: (H, W) bool, the position lies inside the source image (:func:`in_bounds`).
 
     Raises:
         ValueError: another number of axes, a type that cannot be blended, an unknown mode.
     """
     if features.ndim not in (3, 4):
-        raise ValueError(f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)")
+        raise ValueError(
+            f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)"
+        )
     xy = _grid(correspondence, features.shape[-1], features.shape[-2])
     return sample_at(features, xy, mode=mode), in_bounds(correspondence).to(features.device)
 
 
-def sample_at(features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "nearest"] = "bilinear") -> Tensor:
+def sample_at(
+    features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "nearest"] = "bilinear"
+) -> Tensor:
     """Features at positions of their own image.
 
     Args:
         features: (..., h, w).
-        xy: (H, W, 2) positions in pixels of the feature map (centres at +0.5), float32 or float64. NaN gives 0.
+        xy: (H, W, 2) positions in pixels of the feature map (centres at +0.5), float32 or float64.
+            NaN gives 0.
         mode: as in :func:`sample`.
 
     Returns:
@@ -290,12 +316,14 @@ def sample_at(features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "neares
     check.one_of(mode, ("bilinear", "nearest"), "mode")
     if xy.dtype not in (torch.float32, torch.float64):
         raise ValueError(
-            f"xy: got {xy.dtype}, expected float32 or float64; half precision moves positions by up to pixels"
+            f"xy: got {xy.dtype}, expected float32 or float64; half precision moves positions by up"
+            " to pixels"
         )
     check.shape(xy, ("H", "W", 2), "xy")
     if mode == "bilinear" and not features.dtype.is_floating_point:
         raise ValueError(
-            f"features: got {features.dtype}, expected a floating type; labels and masks take mode='nearest'"
+            f"features: got {features.dtype}, expected a floating type; labels and masks take"
+            " mode='nearest'"
         )
     h, w = features.shape[-2:]
     xy = xy.to(device=features.device, dtype=torch.float64)
@@ -307,7 +335,9 @@ def sample_at(features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "neares
         j = _clamp_index(torch.floor(xy[..., 0]), w)
         i = _clamp_index(torch.floor(xy[..., 1]), h)
         warped = flat[..., (i * w + j).reshape(-1)].unflatten(-1, defined.shape)
-        return torch.where(defined, warped, torch.zeros((), dtype=features.dtype, device=features.device))
+        return torch.where(
+            defined, warped, torch.zeros((), dtype=features.dtype, device=features.device)
+        )
     index, weight = _taps(xy, h, w)
     work = torch.float32 if features.dtype in _HALF_PRECISION else features.dtype
     total = torch.zeros((), dtype=work, device=features.device)
@@ -348,10 +378,13 @@ def _grid(correspondence: Correspondence, width: int, height: int) -> Tensor:
     source = correspondence.source
     if correspondence.pixel_centers == "integer":
         scale = torch.tensor(
-            [(width - 1) / max(source.width - 1, 1), (height - 1) / max(source.height - 1, 1)], dtype=torch.float64
+            [(width - 1) / max(source.width - 1, 1), (height - 1) / max(source.height - 1, 1)],
+            dtype=torch.float64,
         )
         return (correspondence.xy - 0.5) * scale + 0.5
-    return correspondence.xy * torch.tensor([width / source.width, height / source.height], dtype=torch.float64)
+    return correspondence.xy * torch.tensor(
+        [width / source.width, height / source.height], dtype=torch.float64
+    )
 
 
 def _clamp_index(value: Tensor, length: int) -> Tensor:
@@ -359,7 +392,9 @@ def _clamp_index(value: Tensor, length: int) -> Tensor:
 
 
 def _taps(xy: Tensor, h: int, w: int) -> tuple[list[Tensor], Tensor]:
-    """Flat indices (four of (H, W)) and weights (4, H, W) of bilinear sampling at finite positions, borders clamped."""
+    """Flat indices (four of (H, W)) and weights (4, H, W) of bilinear sampling at finite positions,
+    borders clamped.
+    """
     low: list[Tensor] = []
     share: list[Tensor] = []
     for position, length in ((xy[..., 0], w), (xy[..., 1], h)):
@@ -378,7 +413,9 @@ def _taps(xy: Tensor, h: int, w: int) -> tuple[list[Tensor], Tensor]:
 
 
 def _blend_depth(depth: Tensor, xy: Tensor, interpolation: str, spread: float | None) -> Tensor:
-    """Depth (NaN where undefined) at finite positions; NaN where taps are undefined or spread too far."""
+    """Depth (NaN where undefined) at finite positions; NaN where taps are undefined or spread too
+    far.
+    """
     check.one_of(interpolation, get_args(DepthInterpolation), "interpolation")
     h, w = depth.shape
     flat = depth.reshape(-1)

@@ -1,4 +1,6 @@
-"""The choices a warp is made of, and three presets: the paper's text, its released code, and what measures right."""
+"""The choices a warp is made of, and three presets: the paper's text, its released code, and what
+measures right.
+"""
 
 from __future__ import annotations
 
@@ -31,35 +33,43 @@ _CHOICES: dict[str, Any] = {
 class WarpSettings:
     """Everything about a warp and its mask that papers and codes decide differently.
 
-    Each field can be varied alone with ``dataclasses.replace``; the defaults are the ``corrected`` preset.
+    Each field can be varied alone with ``dataclasses.replace``; the defaults are the ``corrected``
+    preset.
 
     Args:
         pixel_centers: "half" or "integer", see :func:`attnwarp.warp.correspondence.correspond`.
-        bounds: the image whose size the positions are held against. They lie in the source image, so "target" is only
-            right where the two have one size.
-        in_front: the point lies in front of the source camera. Without it, points behind project through the centre.
-        opaque: smallest alpha that counts as surface, in the target and, where its alpha is given, in the source; None
-            asks for a defined depth alone.
-        depth_agreement: the point's depth in the source camera is the depth the source itself sees there.
-        depth_relative, depth_slope: tolerance of that test, ``depth_relative * z + depth_slope * slope``, the slope
-            being the depth's change per pixel (:func:`attnwarp.warp.view.depth_slope`).
-        photometric: largest mean over channels of abs(warped source image - target image), sRGB in [0, 1], on the
-            images before the edit; None leaves the test out.
+        bounds: the image whose size the positions are held against. They lie in the source image,
+            so "target" is only right where the two have one size.
+        in_front: the point lies in front of the source camera. Without it, points behind project
+            through the centre.
+        opaque: smallest alpha that counts as surface, in the target and, where its alpha is given,
+            in the source; None asks for a defined depth alone.
+        depth_agreement: the point's depth in the source camera is the depth the source itself sees
+            there.
+        depth_relative, depth_slope: tolerance of that test, ``depth_relative * z + depth_slope *
+            slope``, the slope being the depth's change per pixel
+            (:func:`attnwarp.warp.view.depth_slope`).
+        photometric: largest mean over channels of abs(warped source image - target image), sRGB in
+            [0, 1], on the images before the edit; None leaves the test out.
         segment: only pixels of the target's segment, where one is given.
-        normal_test: test on the pixels' normals: "facing" keeps surface of which source and target see the same side;
-            "source_incidence" what the source sees within ``normal_angle`` of the normal; "camera_frame" reproduces the
-            published code, which flips camera-space normals to each camera and compares them although the two frames
-            differ.
-        gaussian_filter: the same tests on Gaussians, before the target's depth is rendered, and "printed": the paper's
-            rule as its text has it, which drops those whose normals are within the angle.
+        normal_test: test on the pixels' normals: "facing" keeps surface of which source and target
+            see the same side; "source_incidence" what the source sees within ``normal_angle`` of
+            the normal; "camera_frame" reproduces the published code, which flips camera-space
+            normals to each camera and compares them although the two frames differ.
+        gaussian_filter: the same tests on Gaussians, before the target's depth is rendered, and
+            "printed": the paper's rule as its text has it, which drops those whose normals are
+            within the angle.
         normal_angle: degrees, for every test that has an angle.
-        depth: where a ray meets a splat: "intersection" (the plane of a 2D splat, the density's peak along the ray for
-            a 3D one) or "center" (the z of the splat's centre, as in gsplat).
+        depth: where a ray meets a splat: "intersection" (the plane of a 2D splat, the density's
+            peak along the ray for a 3D one) or "center" (the z of the splat's centre, as in
+            gsplat).
         depth_statistic: "expected" or "median" depth along the ray.
-        depth_interpolation: how depth reaches the centres of a feature grid, see :func:`attnwarp.warp.resize_depth`.
-        depth_spread: taps that differ by more than this fraction are not blended; None blends across edges.
-        mask_resize: how the mask reaches a feature grid: "area" means over each feature pixel, "bilinear" between the 4
-            mask pixels around its centre; above 0.5 counts.
+        depth_interpolation: how depth reaches the centres of a feature grid, see
+            :func:`attnwarp.warp.resize_depth`.
+        depth_spread: taps that differ by more than this fraction are not blended; None blends
+            across edges.
+        mask_resize: how the mask reaches a feature grid: "area" means over each feature pixel,
+            "bilinear" between the 4 mask pixels around its centre; above 0.5 counts.
 
     Raises:
         ValueError: an unknown choice or a number out of range; the message names the field.
@@ -90,7 +100,14 @@ class WarpSettings:
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
         limits = {"opaque": 1.0, "photometric": 1.0, "normal_angle": 180.0}
-        for name in ("opaque", "photometric", "normal_angle", "depth_relative", "depth_slope", "depth_spread"):
+        for name in (
+            "opaque",
+            "photometric",
+            "normal_angle",
+            "depth_relative",
+            "depth_slope",
+            "depth_spread",
+        ):
             value = getattr(self, name)
             if value is None and name in ("opaque", "photometric", "depth_spread"):
                 continue
@@ -147,25 +164,28 @@ PRESETS: dict[str, WarpSettings] = {
 }
 """Three sets of choices.
 
-``paper``: the text. The mask is "inside the image", with the target's size; nothing asks whether a point lies in front
-of the source camera or is hidden from it. Gaussians are left out before the target's depth is rendered by the rule as
-printed, "excluded if n_s . n_t >= cos 60", which drops the similar ones: with source and target the same view nothing
-is left. What the text leaves open (pixel centres, resizing) is as it has to be right, and "as seen from" a view is
-read as in that camera's axes, so that this preset fails only where the text does.
+``paper``: the text. The mask is "inside the image", with the target's size; nothing asks whether a
+point lies in front of the source camera or is hidden from it. Gaussians are left out before the
+target's depth is rendered by the rule as printed, "excluded if n_s . n_t >= cos 60", which drops
+the similar ones: with source and target the same view nothing is left. What the text leaves open
+(pixel centres, resizing) is as it has to be right, and "as seen from" a view is read as in that
+camera's axes, so that this preset fails only where the text does.
 
-``released``: the authors' code. Integer pixel centres with align_corners=True on the LAYER's grid, where the rasteriser
-samples at +0.5; no test of the sign of z; the source's size in the bounds test; a photometric test of 0.2 on the
-unedited images and the target's segment in the mask; camera-space normals, flipped to the camera and compared across
-two different camera frames, of which pairs within 60 degrees are kept; depth of the splats' centres; the mask made at
-image size and resized bilinearly, which looks at 4 of its pixels.
+``released``: the authors' code. Integer pixel centres with align_corners=True on the LAYER's grid,
+where the rasteriser samples at +0.5; no test of the sign of z; the source's size in the bounds
+test; a photometric test of 0.2 on the unedited images and the target's segment in the mask;
+camera-space normals, flipped to the camera and compared across two different camera frames, of
+which pairs within 60 degrees are kept; depth of the splats' centres; the mask made at image size
+and resized bilinearly, which looks at 4 of its pixels.
 
-``corrected``: what measurement against truth says is right, and the default. Half-pixel centres; inside the source
-image, in front of its camera, opaque, the point's depth agreeing with the source's own, and the same side of the
-surface seen, tested on the pixels: a filter on the Gaussians would open holes through which the target's depth shows
-the far side. Depth by ray-splat intersection, its median along the ray, carried to a feature grid in 1 / z without
-blending across edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered splats
-and come from the measurements in docs/warping.md; exact depth takes ``attnwarp.warp.view.EXACT_DEPTH_TOLERANCE`` and
-``attnwarp.warp.correspondence.TAP_SPREAD``.
+``corrected``: what measurement against truth says is right, and the default. Half-pixel centres;
+inside the source image, in front of its camera, opaque, the point's depth agreeing with the
+source's own, and the same side of the surface seen, tested on the pixels: a filter on the Gaussians
+would open holes through which the target's depth shows the far side. Depth by ray-splat
+intersection, its median along the ray, carried to a feature grid in 1 / z without blending across
+edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered
+splats and come from the measurements in docs/warping.md; exact depth takes
+``attnwarp.warp.view.EXACT_DEPTH_TOLERANCE`` and ``attnwarp.warp.correspondence.TAP_SPREAD``.
 """
 
 

@@ -1,7 +1,7 @@
 """What the source saw: rules that each make a mask, and the masks they make together.
 
-A rule is a pure function that returns an (H, W) bool tensor on the target's grid, True where the pixel passes. A pixel
-whose answer is undefined does not pass.
+A rule is a pure function that returns an (H, W) bool tensor on the target's grid, True where the
+pixel passes. A pixel whose answer is undefined does not pass.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ __all__ = [
 ]
 
 EXACT_DEPTH_TOLERANCE = 1e-4
-"""Relative depth tolerance for depth that is exact (ray cast). With half a pixel's slope it missed none of the hidden
-pixels of a card 5 mm above its ground, which every fixed threshold above 5 mm misses whole."""
+"""Relative depth tolerance for depth that is exact (ray cast). With half a pixel's slope it missed
+none of the hidden pixels of a card 5 mm above its ground, which every fixed threshold above 5 mm
+misses whole."""
 
 
 # Rules
@@ -78,7 +79,8 @@ def opaque(
     Args:
         minimum: smallest alpha that counts.
         target_alpha: (H, W) in [0, 1]; left out, every pixel passes.
-        source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every pixel passes.
+        source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every
+            pixel passes.
     """
     mask = torch.ones(correspondence.z.shape, dtype=torch.bool)
     if target_alpha is not None:
@@ -111,7 +113,9 @@ def depth_slope(depth: Array) -> Tensor:
         step = z.diff(dim=axis).abs()
         step = torch.where(torch.isfinite(step), step, torch.inf)
         edge = torch.full_like(z.narrow(axis, 0, 1), torch.inf)
-        smaller = torch.minimum(torch.cat([edge, step], dim=axis), torch.cat([step, edge], dim=axis))
+        smaller = torch.minimum(
+            torch.cat([edge, step], dim=axis), torch.cat([step, edge], dim=axis)
+        )
         slope = slope + torch.where(torch.isfinite(smaller), smaller, 0)
     return torch.where(torch.isfinite(z), slope, torch.nan)
 
@@ -126,8 +130,8 @@ def depth_agrees(
 ) -> Tensor:
     """The point's depth in the source camera is the depth the source itself sees there.
 
-    ``|z - d| <= relative * z + slope * (depth_slope at the nearest source pixel)``, with d interpolated in 1 / z and
-    taps that straddle an edge rejected.
+    ``|z - d| <= relative * z + slope * (depth_slope at the nearest source pixel)``, with d
+    interpolated in 1 / z and taps that straddle an edge rejected.
 
     Args:
         source_depth: (h, w) depth along the source's optical axis, NaN where undefined.
@@ -148,7 +152,8 @@ def photometric(
     target_image: Array,
     limit: float = 0.2,
 ) -> Tensor:
-    """The warped source image looks like the target's: mean over channels of the absolute difference <= ``limit``.
+    """The warped source image looks like the target's: mean over channels of the absolute
+    difference <= ``limit``.
 
     Args:
         source_image: (h, w, C) and target_image: (H, W, C), before any edit, sRGB in [0, 1].
@@ -165,17 +170,22 @@ def photometric(
 def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
     """Source and target see the same side of the surface.
 
-    World-space normals, flipped to each camera: they agree exactly where both cameras lie on one side of the tangent
-    plane.
+    World-space normals, flipped to each camera: they agree exactly where both cameras lie on one
+    side of the tangent plane.
 
     Args:
-        target_normal: (H, W, 3) world normals of either sign and any length; zero and NaN are undefined.
+        target_normal: (H, W, 3) world normals of either sign and any length; zero and NaN are
+            undefined.
     """
     normal, defined = _normals(correspondence, target_normal)
-    return defined & (_side(correspondence.source, normal, correspondence.points, correspondence.target) > 0)
+    return defined & (
+        _side(correspondence.source, normal, correspondence.points, correspondence.target) > 0
+    )
 
 
-def source_incidence(correspondence: Correspondence, target_normal: Array, angle: float = 60.0) -> Tensor:
+def source_incidence(
+    correspondence: Correspondence, target_normal: Array, angle: float = 60.0
+) -> Tensor:
     """:func:`facing`, and the source sees the surface within ``angle`` degrees of its normal."""
     normal, defined = _normals(correspondence, target_normal)
     points = correspondence.points
@@ -185,11 +195,14 @@ def source_incidence(correspondence: Correspondence, target_normal: Array, angle
     return defined & same & (angle_between(flipped, toward) < angle)
 
 
-def camera_frame(correspondence: Correspondence, target_normal: Array, angle: float = 60.0) -> Tensor:
-    """The published code's test: camera-space normals, flipped to each camera, within ``angle`` degrees of each other.
+def camera_frame(
+    correspondence: Correspondence, target_normal: Array, angle: float = 60.0
+) -> Tensor:
+    """The published code's test: camera-space normals, flipped to each camera, within ``angle``
+    degrees of each other.
 
-    The two normals stand in the axes of two different cameras, so that the angle between them holds the cameras'
-    relative rotation: the same surface seen by a rolled camera fails.
+    The two normals stand in the axes of two different cameras, so that the angle between them holds
+    the cameras' relative rotation: the same surface seen by a rolled camera fails.
     """
     normal, defined = _normals(correspondence, target_normal)
     source = _flip(_rotate(correspondence.source, normal), correspondence.points)
@@ -203,10 +216,11 @@ def gaussian_filter(
     """Which Gaussians are left in before the target's depth is rendered.
 
     Args:
-        rule: "none" keeps all. "facing" keeps those of which both cameras see the same side, "source_incidence" those
-            the source also sees within ``angle`` of the normal. "camera_frame" keeps those whose camera-space normals,
-            each flipped to its camera, are within ``angle`` degrees across the two frames (the published code).
-            "printed" drops exactly those (the paper's text: "excluded if n_s . n_t >= cos 60").
+        rule: "none" keeps all. "facing" keeps those of which both cameras see the same side,
+            "source_incidence" those the source also sees within ``angle`` of the normal.
+            "camera_frame" keeps those whose camera-space normals, each flipped to its camera, are
+            within ``angle`` degrees across the two frames (the published code). "printed" drops
+            exactly those (the paper's text: "excluded if n_s . n_t >= cos 60").
         angle: degrees.
 
     Returns:
@@ -221,12 +235,18 @@ def gaussian_filter(
         torch.from_numpy(centres - camera.position) @ torch.from_numpy(camera.rotation.T.copy())
         for camera in (source, target)
     ]
-    seen = [_flip(_rotate(camera, normal), point) for camera, point in zip((source, target), points, strict=True)]
+    seen = [
+        _flip(_rotate(camera, normal), point)
+        for camera, point in zip((source, target), points, strict=True)
+    ]
     if rule in ("camera_frame", "printed"):
         within = angle_between(seen[0], seen[1]) < angle
         # The printed rule takes the angle itself with it.
         return within if rule == "camera_frame" else ~(angle_between(seen[0], seen[1]) <= angle)
-    world = [s @ torch.from_numpy(camera.rotation.copy()) for s, camera in zip(seen, (source, target), strict=True)]
+    world = [
+        s @ torch.from_numpy(camera.rotation.copy())
+        for s, camera in zip(seen, (source, target), strict=True)
+    ]
     same = (world[0] * world[1]).sum(dim=-1) > 0
     return same if rule == "facing" else same & (angle_between(seen[0], -points[0]) < angle)
 
@@ -234,12 +254,14 @@ def gaussian_filter(
 def angle_between(a: Tensor, b: Tensor) -> Tensor:
     """(...) angle in degrees between vectors (..., 3) of any length; NaN for a zero vector.
 
-    2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless assessments of roundoff", 2006), which
-    keeps its digits near 0 and 180 where an arccosine loses half of them.
+    2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless assessments of
+    roundoff", 2006), which keeps its digits near 0 and 180 where an arccosine loses half of them.
     """
     a = a / torch.linalg.vector_norm(a, dim=-1, keepdim=True)
     b = b / torch.linalg.vector_norm(b, dim=-1, keepdim=True)
-    half = torch.atan2(torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1))
+    half = torch.atan2(
+        torch.linalg.vector_norm(a - b, dim=-1), torch.linalg.vector_norm(a + b, dim=-1)
+    )
     return torch.rad2deg(2 * half)
 
 
@@ -249,8 +271,8 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
     Args:
         mask: (H, W) bool.
         size: (h, w) of the other grid.
-        mode: "area" weighs every mask pixel by its overlap with the new pixel; "bilinear" reads the 4 pixels around the
-            new centre; "nearest" the one that holds it.
+        mode: "area" weighs every mask pixel by its overlap with the new pixel; "bilinear" reads the
+            4 pixels around the new centre; "nearest" the one that holds it.
 
     Returns:
         (h, w) bool.
@@ -259,9 +281,11 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
     if mask.dtype != torch.bool:
         raise ValueError(f"mask: got {mask.dtype}, expected bool")
     check.shape(mask, ("H", "W"), "mask")
-    weigh: Callable[[int, int], Tensor] = {"area": _area_weights, "bilinear": _linear_weights, "nearest": _nearest}[
-        mode
-    ]
+    weigh: Callable[[int, int], Tensor] = {
+        "area": _area_weights,
+        "bilinear": _linear_weights,
+        "nearest": _nearest,
+    }[mode]
     share = weigh(size[0], mask.shape[0]) @ mask.double().cpu() @ weigh(size[1], mask.shape[1]).T
     # Half of a pixel is not more than half, whatever the last bit of the sum says.
     return (share > 0.5 + 1e-9).to(mask.device)
@@ -302,7 +326,9 @@ class FeatureWarp:
     mask: Tensor
 
     def warp(self, features: Tensor) -> Tensor:
-        """Target features (..., h, w) from (C, h, w) or (B, C, h, w) source ones; :func:`attnwarp.warp.sample`."""
+        """Target features (..., h, w) from (C, h, w) or (B, C, h, w) source ones;
+        :func:`attnwarp.warp.sample`.
+        """
         return sample(features, self.correspondence)[0]
 
 
@@ -314,7 +340,8 @@ class WarpedView:
         settings: the choices it was made with.
         correspondence: of the H x W target image.
         mask: (H, W) bool, all rules together.
-        rules: each rule's own (H, W) mask, by name, in the order they were applied. ``defined`` is always among them.
+        rules: each rule's own (H, W) mask, by name, in the order they were applied. ``defined`` is
+            always among them.
         target, source: the surfaces it was made from; ``source`` is None where no rule needed it.
     """
 
@@ -326,10 +353,14 @@ class WarpedView:
     source: Surface | None = None
     _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, repr=False)
 
-    def at(self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None) -> FeatureWarp:
-        """The warp of an (h, w) feature grid: its own correspondence, and the mask resized as the settings say.
+    def at(
+        self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
+    ) -> FeatureWarp:
+        """The warp of an (h, w) feature grid: its own correspondence, and the mask resized as the
+        settings say.
 
-        Worked out once per size. The mask drops pixels whose correspondence is undefined at this size.
+        Worked out once per size. The mask drops pixels whose correspondence is undefined at this
+        size.
 
         Args:
             size: (h, w) of the target's features.
@@ -353,7 +384,9 @@ class WarpedView:
                 interpolation=settings.depth_interpolation,
                 spread=settings.depth_spread,
             )
-            self._at[key] = FeatureWarp(layer, resize_mask(self.mask, size, settings.mask_resize) & layer.defined)
+            self._at[key] = FeatureWarp(
+                layer, resize_mask(self.mask, size, settings.mask_resize) & layer.defined
+            )
         return self._at[key]
 
 
@@ -366,21 +399,29 @@ def warp_surfaces(
     *,
     target_segment: Tensor | None = None,
 ) -> WarpedView:
-    """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or exact.
+    """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or
+    exact.
 
     Args:
         source, target: the cameras.
-        target_surface: what the target sees; its normals are needed by the normal tests, its image by the photometric.
-        source_surface: what the source sees; needed by depth agreement (depth) and the photometric test (image).
-        settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic`` concern the rendering of
-            the surfaces and play no part here.
+        target_surface: what the target sees; its normals are needed by the normal tests, its image
+            by the photometric.
+        source_surface: what the source sees; needed by depth agreement (depth) and the photometric
+            test (image).
+        settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
+            concern the rendering of the surfaces and play no part here.
         target_segment: (H, W) bool, the part of the target that is edited.
 
     Raises:
-        ValueError: a rule needs something that is not given; the message names the rule and what it needs.
+        ValueError: a rule needs something that is not given; the message names the rule and what it
+            needs.
     """
     correspondence = correspond(
-        source, target, target_surface.depth, pixel_centers=settings.pixel_centers, in_front=settings.in_front
+        source,
+        target,
+        target_surface.depth,
+        pixel_centers=settings.pixel_centers,
+        in_front=settings.in_front,
     )
     bounds = source if settings.bounds == "source" else target
     rules = {
@@ -412,8 +453,12 @@ def warp_surfaces(
             settings.photometric,
         )
     if settings.normal_test != "none":
-        normal = _needed(target_surface, "target_surface", "normal", f"normal_test={settings.normal_test!r}")
-        rules[settings.normal_test] = _normal_rule(correspondence, normal, settings.normal_test, settings.normal_angle)
+        normal = _needed(
+            target_surface, "target_surface", "normal", f"normal_test={settings.normal_test!r}"
+        )
+        rules[settings.normal_test] = _normal_rule(
+            correspondence, normal, settings.normal_test, settings.normal_angle
+        )
     if settings.segment and target_segment is not None:
         check.shape(target_segment, (target.height, target.width), "target_segment")
         rules["segment"] = target_segment.to(device="cpu", dtype=torch.bool)
@@ -435,20 +480,24 @@ def warp_view(
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from splats.
 
-    Renders what the settings' rules ask for and hands it to :func:`warp_surfaces`. The Gaussian filter concerns the
-    target's render; the source's own depth is that of the whole model.
+    Renders what the settings' rules ask for and hands it to :func:`warp_surfaces`. The Gaussian
+    filter concerns the target's render; the source's own depth is that of the whole model.
 
     Args:
-        gaussians: the model before the edit. Hand in the current one to reproduce codes that warp with it.
+        gaussians: the model before the edit. Hand in the current one to reproduce codes that warp
+            with it.
         source, target: the cameras.
         settings: which rules, and how.
-        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test; by default the
-            renders of ``gaussians``.
+        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test;
+            by default the renders of ``gaussians``.
         target_segment: (H, W) bool, the part of the target that is edited.
-        source_surface: the source's render if it is at hand, :func:`render_surface`; one source serves many targets.
+        source_surface: the source's render if it is at hand, :func:`render_surface`; one source
+            serves many targets.
         backend: as in :func:`attnwarp.render.render`.
     """
-    keep = gaussian_filter(gaussians, source, target, settings.gaussian_filter, settings.normal_angle)
+    keep = gaussian_filter(
+        gaussians, source, target, settings.gaussian_filter, settings.normal_angle
+    )
     filtered = gaussians if bool(keep.all()) else gaussians.select(keep.to(gaussians.means.device))
     seen = render_surface(filtered, target, settings, backend=backend)
     if settings.photometric is not None:
@@ -456,18 +505,27 @@ def warp_view(
             target_image = render_surface(gaussians, target, settings, backend=backend).image
         if target_image is not None:
             seen = replace(seen, image=target_image)
-    needs_source = settings.depth_agreement or settings.photometric is not None or settings.opaque is not None
+    needs_source = (
+        settings.depth_agreement or settings.photometric is not None or settings.opaque is not None
+    )
     if source_surface is None and needs_source:
         source_surface = render_surface(gaussians, source, settings, backend=backend)
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
-    return warp_surfaces(source, target, seen, source_surface, settings, target_segment=target_segment)
+    return warp_surfaces(
+        source, target, seen, source_surface, settings, target_segment=target_segment
+    )
 
 
 def render_surface(
-    gaussians: Gaussians, camera: Camera, settings: WarpSettings = PRESETS["corrected"], *, backend: str = "auto"
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: WarpSettings = PRESETS["corrected"],
+    *,
+    backend: str = "auto",
 ) -> Surface:
-    """Depth, normals, alpha and colour of splats as ``settings`` wants them rendered, on the CPU."""
+    """Depth, normals, alpha and colour of splats as ``settings`` wants them rendered, on the
+    CPU."""
     from attnwarp.render import render
 
     depth = settings.depth
@@ -475,19 +533,27 @@ def render_surface(
     with torch.no_grad():
         seen = render(gaussians, camera, backend=backend, depth=how)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
-    return Surface(z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters))
+    return Surface(
+        z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)
+    )
 
 
-def _normal_rule(correspondence: Correspondence, normal: Array, rule: NormalTest, angle: float) -> Tensor:
+def _normal_rule(
+    correspondence: Correspondence, normal: Array, rule: NormalTest, angle: float
+) -> Tensor:
     if rule == "facing":
         return facing(correspondence, normal)
-    return (source_incidence if rule == "source_incidence" else camera_frame)(correspondence, normal, angle)
+    return (source_incidence if rule == "source_incidence" else camera_frame)(
+        correspondence, normal, angle
+    )
 
 
 def _needed(surface: Surface | None, view: str, part: str, rule: str) -> Array:
     value: Array | None = getattr(surface, part, None)
     if value is None:
-        raise ValueError(f"{view}.{part}: got None, but the rule {rule} needs it; give it or turn the rule off")
+        raise ValueError(
+            f"{view}.{part}: got None, but the rule {rule} needs it; give it or turn the rule off"
+        )
     return value
 
 
@@ -511,7 +577,8 @@ def _flip(normal: Tensor, points: Tensor) -> Tensor:
 def _side(source: Camera, normal: Tensor, points: Tensor, target: Camera) -> Tensor:
     """Positive where both camera centres lie on one side of the tangent planes.
 
-    n . (C - X) for each camera, in the source's axes, where the target's centre comes from the relative pose.
+    n . (C - X) for each camera, in the source's axes, where the target's centre comes from the
+    relative pose.
     """
     n = _rotate(source, normal)
     centre = torch.from_numpy(source.relative_to(target)[:3, 3].copy())
@@ -533,5 +600,9 @@ def _linear_weights(new: int, old: int) -> Tensor:
 
 
 def _nearest(new: int, old: int) -> Tensor:
-    index = torch.floor((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new)).long().clamp(0, old - 1)
+    index = (
+        torch.floor((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new))
+        .long()
+        .clamp(0, old - 1)
+    )
     return torch.nn.functional.one_hot(index, old).double()

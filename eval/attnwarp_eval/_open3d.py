@@ -12,9 +12,10 @@ from typing import Any
 def open3d() -> Any:
     """The open3d module.
 
-    Its shared library needs libusb-1.0.so.0 (for depth sensors that nothing here uses), which a bare machine lacks.
-    The wheel libusb-package carries that library under the same SONAME: loaded first and globally, it is the one the
-    dynamic linker finds. A machine where it cannot be loaded may still have its own.
+    Its shared library needs libusb-1.0.so.0 (for depth sensors that nothing here uses), which a
+    bare machine lacks. The wheel libusb-package carries that library under the same SONAME: loaded
+    first and globally, it is the one the dynamic linker finds. A machine where it cannot be loaded
+    may still have its own.
     """
     with contextlib.suppress(ImportError, OSError):
         import libusb_package

@@ -18,7 +18,8 @@ from attnwarp_eval.files import digest
 
 
 def cache_dir() -> Path:
-    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else ``~/.cache/attnwarp``.
+    """The folder of derived files: ``$ATTNWARP_CACHE``, else ``$XDG_CACHE_HOME/attnwarp``, else
+    ``~/.cache/attnwarp``.
 
     Everything in it can be recomputed and may be deleted at any time.
     """
@@ -35,7 +36,8 @@ def content_key(*parts: Any) -> str:
 
 
 def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
-    """The arrays stored under ``kind``/``key``, or None when there are none or the file is damaged."""
+    """The arrays stored under ``kind``/``key``, or None when there are none or the file is
+    damaged."""
     path = cache_dir() / kind / f"{key}.npz"
     try:
         # Opened here, since np.load leaves a damaged file open.
@@ -48,9 +50,9 @@ def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
 def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
     """Store ``arrays`` under ``kind``/``key``.
 
-    The file appears under its name only when it is whole (written beside it, then renamed), so a reader never sees
-    half of one and the last of several writers wins. A folder that cannot be written is no error: the value is
-    simply computed again next time.
+    The file appears under its name only when it is whole (written beside it, then renamed), so a
+    reader never sees half of one and the last of several writers wins. A folder that cannot be
+    written is no error: the value is simply computed again next time.
     """
     folder = cache_dir() / kind
     temporary: Path | None = None
@@ -70,13 +72,16 @@ def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
 
 
 _unseen: float = float("inf")
-"""Bytes that this process has written since it last looked at the whole folder; it looks at its first write."""
+"""Bytes that this process has written since it last looked at the whole folder; it looks at its
+first write.
+"""
 
 
 def _keep_within_limit(written: int) -> None:
     """Trim the folder, but look at all of it only after every hundredth of the limit.
 
-    To look costs a call for each file: done at every write, keeping thousands of small meshes took longer than making them.
+    To look costs a call for each file: done at every write, keeping thousands of small meshes took
+    longer than making them.
     """
     global _unseen
     _unseen += written
@@ -102,7 +107,9 @@ def limit_bytes() -> int:
     except ValueError:
         limit = -1.0
     if not limit >= 0:
-        raise InputError(f"ATTNWARP_CACHE_GB: got {said!r}, expected a number of gigabytes such as 10")
+        raise InputError(
+            f"ATTNWARP_CACHE_GB: got {said!r}, expected a number of gigabytes such as 10"
+        )
     return int(limit * 1e9)
 
 
@@ -125,9 +132,11 @@ def usage() -> dict[str, tuple[int, int]]:
 
 
 def trim(limit: int) -> int:
-    """Remove the files written longest ago until at most ``limit`` bytes are left; how many bytes went.
+    """Remove the files written longest ago until at most ``limit`` bytes are left; how many bytes
+    went.
 
-    Safe beside other processes: a reader that has a file open keeps it, and one that comes later computes it again.
+    Safe beside other processes: a reader that has a file open keeps it, and one that comes later
+    computes it again.
     """
     files = sorted(_files(), key=lambda item: item[1].st_mtime)
     excess = sum(state.st_size for _, state in files) - limit

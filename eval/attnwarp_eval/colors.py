@@ -9,14 +9,22 @@ import numpy.typing as npt
 
 
 def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[Any]:
-    """Linear values to sRGB-encoded ones in [0, 1]; what lies outside [0, 1] is clipped. The float dtype is kept."""
+    """Linear values to sRGB-encoded ones in [0, 1]; what lies outside [0, 1] is clipped. The float
+    dtype is kept.
+    """
     value = np.asarray(linear)
     value = np.clip(value if value.dtype.kind == "f" else value.astype(np.float64), 0, 1)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(value.dtype)
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(
+        value.dtype
+    )
 
 
 def to_linear(srgb: npt.ArrayLike) -> npt.NDArray[Any]:
-    """sRGB-encoded values in [0, 1] to linear ones; the inverse of :func:`to_srgb`. The float dtype is kept."""
+    """sRGB-encoded values in [0, 1] to linear ones; the inverse of :func:`to_srgb`. The float dtype
+    is kept.
+    """
     value = np.asarray(srgb)
     value = np.clip(value if value.dtype.kind == "f" else value.astype(np.float64), 0, 1)
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(value.dtype)
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(
+        value.dtype
+    )

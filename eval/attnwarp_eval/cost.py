@@ -1,4 +1,6 @@
-"""What a figure cost: seconds by stage, work counters, peak memory, and the machine it was measured on."""
+"""What a figure cost: seconds by stage, work counters, peak memory, and the machine it was measured
+on.
+"""
 
 from __future__ import annotations
 
@@ -32,9 +34,9 @@ PACKAGES = (
 class Meter:
     """Seconds and counters of one cell.
 
-    The method's own work is timed view by view: the first view pays for compilation and cold caches ("warm"), the
-    others give the steady figure. Everything else (truth, splats, the checks themselves) is set-up and checking, and
-    never mixed into what a method costs.
+    The method's own work is timed view by view: the first view pays for compilation and cold caches
+    ("warm"), the others give the steady figure. Everything else (truth, splats, the checks
+    themselves) is set-up and checking, and never mixed into what a method costs.
     """
 
     def __init__(self) -> None:
@@ -65,14 +67,17 @@ class Meter:
         self.counters.update({k: int(v) for k, v in counters.items()})
 
     def seconds(self) -> dict[str, float | None]:
-        """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others' (None without them)."""
+        """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others'
+        (None without them).
+        """
         steady = statistics.median(self._views[1:]) if len(self._views) > 1 else None
         warm = self._views[0] if self._views else None
         return {**self._stages, "warm": warm, "steady": steady, "method": sum(self._views)}
 
 
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process so far, in MiB; earlier cells of the process are in it."""
+    """Peak resident memory of this process so far, in MiB; earlier cells of the process are in
+    it."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
 
@@ -88,7 +93,11 @@ def environment() -> dict[str, Any]:
             versions[name] = "not installed"
     return {
         "versions": versions,
-        "machine": {"system": platform.system(), "arch": platform.machine(), "cores": len(os.sched_getaffinity(0))},
+        "machine": {
+            "system": platform.system(),
+            "arch": platform.machine(),
+            "cores": len(os.sched_getaffinity(0)),
+        },
         "git": _git(Path(__file__).resolve().parent),
     }
 
@@ -96,12 +105,15 @@ def environment() -> dict[str, Any]:
 def _git(folder: Path) -> dict[str, Any]:
     def ask(*arguments: str) -> str | None:
         try:
-            done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10)
+            done = subprocess.run(
+                ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=10
+            )
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    # An installed copy may lie inside somebody else's repository, whose revision says nothing about this code.
+    # An installed copy may lie inside somebody else's repository, whose revision says nothing about
+    # this code.
     if ask("ls-files", "--error-unmatch", str(Path(__file__).resolve())) is None:
         return {"sha": None, "dirty": None}
     sha = ask("rev-parse", "HEAD")

@@ -53,7 +53,8 @@ class World:
             camera.name: abs((view.yaw - scene.spec.cameras.source.yaw + 180) % 360 - 180)
             for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
         }
-        # Cells of a scene ask for the same pairs again and again; a world lives as long as its scene is at work.
+        # Cells of a scene ask for the same pairs again and again; a world lives as long as its
+        # scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
         self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
@@ -72,7 +73,9 @@ class World:
 
     def _pair(self, target: str, size: int) -> TwoView:
         """What is exactly known about the source and a target, on a grid of ``size`` x ``size``."""
-        return two_view(self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size))
+        return two_view(
+            self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size)
+        )
 
     def _edge(self, name: str) -> npt.NDArray[np.bool_]:
         """(H, W) the band around the depth and object edges of a view."""
@@ -83,7 +86,9 @@ class World:
         return to_srgb(appearance(self.scene, self.camera(name), spp=spp, seed=0))
 
     def _features(self, name: str, size: int, channels: int, seed: int) -> Features:
-        """(C, h, w) the feature field on a view's grid; 0 on the source's background, NaN on a target's."""
+        """(C, h, w) the feature field on a view's grid; 0 on the source's background, NaN on a
+        target's.
+        """
         points = self.geometry.trace(self.camera(name).resize(size, size)).point
         background = 0.0 if name == self.source.name else np.nan
         return self._field(channels, seed).on_grid(points, background=background)
@@ -103,7 +108,8 @@ def world(scene: str, size: int) -> World:
 
 @lru_cache(maxsize=8)
 def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
-    """Gaussians on a scene's surfaces; the last few are kept, and all of them in the cache on disk."""
+    """Gaussians on a scene's surfaces; the last few are kept, and all of them in the cache on
+    disk."""
     from attnwarp import Gaussians
     from attnwarp_eval.splats.surface import surface_splats
 
@@ -113,7 +119,11 @@ def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
         made = surface_splats(at.scene, seed=seed, geometry=at.geometry, **spec.model_dump())
-        write_arrays("splats", key, {**{name: getattr(made, name).numpy() for name in names}, "origin": made.origin})
+        write_arrays(
+            "splats",
+            key,
+            {**{name: getattr(made, name).numpy() for name in names}, "origin": made.origin},
+        )
         return made
     means, quats, scales, opacities, sh = (torch.from_numpy(stored[name]) for name in names)
     return Gaussians(spec.kind, means, quats, scales, opacities, sh, origin=stored["origin"])

@@ -8,9 +8,14 @@ from typing import Annotated, Any
 
 import typer
 
-app = typer.Typer(help="Recipes of the bundled encoders. Run from eval/: python -m training all", no_args_is_help=True)
+app = typer.Typer(
+    help="Recipes of the bundled encoders. Run from eval/: python -m training all",
+    no_args_is_help=True,
+)
 
-Data = Annotated[Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")]
+Data = Annotated[
+    Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")
+]
 Out = Annotated[Path, typer.Option(help="Folder of checkpoints; training goes on from them.")]
 Weights = Annotated[Path, typer.Option(help="Folder that gets weights and cards.")]
 Threads = Annotated[int, typer.Option(min=1, help="Of training and rendering.")]
@@ -49,13 +54,17 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
     state = torch.load(out / f"{name}.pt", weights_only=True)
     if name == "dino-small":  # the teacher is the better one, as in DINO
         prefix = "net."
-        net = {k.removeprefix(prefix): v for k, v in state["teacher"].items() if k.startswith(prefix)}
+        net = {
+            k.removeprefix(prefix): v for k, v in state["teacher"].items() if k.startswith(prefix)
+        }
     else:
         net = state["model"]
     weights.mkdir(parents=True, exist_ok=True)
     half = {k: v.half().contiguous() if v.is_floating_point() else v for k, v in net.items()}
     save_file(half, weights / f"{name}.safetensors")
-    (weights / f"{name}.safetensors").chmod(0o644)  # safetensors makes files that only their owner can read
+    (weights / f"{name}.safetensors").chmod(
+        0o644
+    )  # safetensors makes files that only their owner can read
     words = out / f"{name}.tokenizer.json"
     if words.exists():
         shutil.copyfile(words, weights / words.name)
@@ -63,8 +72,12 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
 
 
 @app.command()
-def assess(name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
-    """Measure an encoder on what it has never seen, and write its card; the checkpoint, if there is one, says how long training took."""
+def assess(
+    name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2
+) -> None:
+    """Measure an encoder on what it has never seen, and write its card; the checkpoint, if there is
+    one, says how long training took.
+    """
     import torch
 
     from attnwarp.encoders.bundled import load
@@ -87,21 +100,31 @@ def assess(name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIG
     trained = figures()
     facts = _facts(name, encoder, out) | {"seconds": _seconds(encoder), "threads": threads}
     torch.manual_seed(0)
-    encoder.net = type(encoder.net)(encoder.tokenizer.get_vocab_size()) if name == "clip-small" else type(encoder.net)()
+    encoder.net = (
+        type(encoder.net)(encoder.tokenizer.get_vocab_size())
+        if name == "clip-small"
+        else type(encoder.net)()
+    )
     encoder.net.eval().requires_grad_(False)
     control = figures()
     for f in trained:
         typer.echo(f"{100 * f['value']:6.1f} %  {f['what']}")
     typer.echo(f"{facts['seconds']:.3f} s for 32 pictures on {threads} threads")
     files = sorted(
-        p for p in weights.glob(f"{name}.*") if p.suffix in (".safetensors", ".json") and "figures" not in p.name
+        p
+        for p in weights.glob(f"{name}.*")
+        if p.suffix in (".safetensors", ".json") and "figures" not in p.name
     )
     (weights / f"{name}.md").write_text(card(name, trained, control, facts, files))
-    (weights / f"{name}.figures.json").write_text(json.dumps({"trained": trained, "random": control}, indent=1) + "\n")
+    (weights / f"{name}.figures.json").write_text(
+        json.dumps({"trained": trained, "random": control}, indent=1) + "\n"
+    )
 
 
 @app.command("all")
-def everything(data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2) -> None:
+def everything(
+    data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2
+) -> None:
     """All of it: pictures, training, weights, cards."""
     for name in NAMES:
         train(name, data, out, threads)
@@ -128,7 +151,9 @@ def _seconds(encoder: Any, rounds: int = 7) -> float:
     taken = []
     for _ in range(rounds + 1):
         start = time.perf_counter()
-        encoder.images(pictures) if hasattr(encoder, "images") else encoder.distance(pictures, pictures[::-1])
+        encoder.images(pictures) if hasattr(encoder, "images") else encoder.distance(
+            pictures, pictures[::-1]
+        )
         taken.append(time.perf_counter() - start)
     return statistics.median(taken[1:])
 
@@ -147,13 +172,18 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
         return sum(p.numel() for p in net.parameters()) / 1e6
 
     net, recipe = encoder.net, _recipe(name)
-    cast = 6 * SPLITS["train"].worlds + 4 * (SPLITS["train-moved"].worlds + SPLITS["train-shapes"].worlds)
+    cast = 6 * SPLITS["train"].worlds + 4 * (
+        SPLITS["train-moved"].worlds + SPLITS["train-shapes"].worlds
+    )
     facts = {
         "dim": encoder.about.dim, "size": millions(net), "torch": torch.__version__.partition("+")[0], "epochs": recipe.EPOCHS, "seed": recipe.SEED,
         "pictures": f"{cast} by ray casting", "objects": len(OBJECTS),
         "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
     }  # fmt: skip
-    checkpoints = [out / f"{name}.pt", *([out / f"{name}-naming.pt"] if name == "clip-small" else [])]
+    checkpoints = [
+        out / f"{name}.pt",
+        *([out / f"{name}-naming.pt"] if name == "clip-small" else []),
+    ]
     facts["minutes"] = minutes(*checkpoints)
     if name == "clip-small":
         facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}

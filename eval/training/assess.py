@@ -1,7 +1,8 @@
-"""What the encoders can do on what they have never seen: the figures of the model cards, each with an interval.
+"""What the encoders can do on what they have never seen: the figures of the model cards, each with
+an interval.
 
-Every figure is given for the trained network and for one of the same shape with random weights; where it says
-something, for raw pixels and colour histograms too.
+Every figure is given for the trained network and for one of the same shape with random weights;
+where it says something, for raw pixels and colour histograms too.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class Figure:
     Attributes:
         what: the question.
         value: the share.
-        low, high: 95 % interval, bootstrapped over worlds: pictures of one world are not independent.
+        low, high: 95 % interval, bootstrapped over worlds: pictures of one world are not
+            independent.
         count: answers.
         chance: what guessing would give; None where that says nothing.
         asked: the share that was asked for; None where none was.
@@ -94,7 +96,8 @@ def _unit(x: npt.ArrayLike) -> Array:
     return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
 
 
-# clip-small ----------------------------------------------------------------------------------------------------------
+# clip-small
+# --------------------------------------------------------------------------------------------------
 
 TEMPLATES = ("a photo of {}", "a picture of {}", "an image of {}", "{}")
 
@@ -103,7 +106,9 @@ def word_embeddings(encoder: TextImageEncoder, phrases: Sequence[Sequence[str]])
     """(K, D) unit embeddings of K meanings, each the mean over its phrases in several sentences."""
     rows = []
     for choices in phrases:
-        rows.append(_unit(encoder.texts([t.format(c) for t in TEMPLATES for c in choices])).mean(axis=0))
+        rows.append(
+            _unit(encoder.texts([t.format(c) for t in TEMPLATES for c in choices])).mean(axis=0)
+        )
     return _unit(rows)
 
 
@@ -132,14 +137,20 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
 
     Args:
         encoder: to be judged.
-        sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered" (by Mitsuba).
+        sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered"
+            (by Mitsuba).
     """
     found = []
-    titles = {"test": "new shapes", "test-new-pairs": "new pairs of colour and object", "test-rendered": "path-traced"}
+    titles = {
+        "test": "new shapes",
+        "test-new-pairs": "new pairs of colour and object",
+        "test-rendered": "path-traced",
+    }
     sets = {name: sets[name] for name in titles}
     embedded = {name: _unit(encoder.images(as_float(p.images))) for name, p in sets.items()}
     labels = {
-        what: word_embeddings(encoder, _phrases(what)) for what in ("object", "color", "material", "ground", "time")
+        what: word_embeddings(encoder, _phrases(what))
+        for what in ("object", "color", "material", "ground", "time")
     }
     for name, pictures in sets.items():
         images, shown = embedded[name], pictures.attributes
@@ -168,14 +179,18 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
                 )
             )
         if len(np.unique(pictures.world)) >= 64:
-            found.append(_retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}"))
+            found.append(
+                _retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}")
+            )
     found.append(_direction(encoder, embedded["test"], sets["test"]))
     found.append(_viewpoint(embedded["test"], sets["test"], labels))
     return found
 
 
 def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, what: str) -> Figure:
-    """Rank 1 of a picture's own caption among those of 63 others of other worlds; one that is true too is no error."""
+    """Rank 1 of a picture's own caption among those of 63 others of other worlds; one that is true
+    too is no error.
+    """
     rng = np.random.default_rng(1)
     first = np.flatnonzero((pictures.view == 0) & (pictures.look == 0))
     said = pictures.attributes
@@ -183,16 +198,25 @@ def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, wha
     right = []
     for place, k in enumerate(first):
         others = rng.choice(np.delete(np.arange(len(first)), place), 63, replace=False)
-        choice = np.array([*others, place])  # the right one last: the first of equals wins, so a tie is no find
+        choice = np.array(
+            [*others, place]
+        )  # the right one last: the first of equals wins, so a tie is no find
         best = choice[(images[k] @ texts[choice].T).argmax()]
         right.append(bool(true_of(said[first[best]][None], said[k][None])[0, 0]))
     return figure(what, right, pictures.world[first], chance=1 / 64, asked=0.6)
 
 
 def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> Figure:
-    """Which of 8 edits was made: cos of the change of pictures and the change of captions, as the field's metric has it."""
+    """Which of 8 edits was made: cos of the change of pictures and the change of captions, as the
+    field's metric has it.
+    """
     rng = np.random.default_rng(2)
-    index = {(w, v, k): i for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))}
+    index = {
+        (w, v, k): i
+        for i, (w, v, k) in enumerate(
+            zip(pictures.world, pictures.view, pictures.look, strict=True)
+        )
+    }
     right, worlds = [], []
     for (world, view, look), before in index.items():
         if look != 0:
@@ -211,33 +235,49 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
                 if part == 1
                 else (*old[:5], drawn[5])
             )
-            if other != old and other not in targets and not true_of(np.array([other]), np.array([new]))[0, 0]:
+            if (
+                other != old
+                and other not in targets
+                and not true_of(np.array([other]), np.array([new]))[0, 0]
+            ):
                 targets.append(other)
         seed = int(rng.integers(2**31))
         # One seed for all sentences: they differ in what they say, not in how.
-        texts = encoder.texts([sentence(said, np.random.default_rng(seed)) for said in (old, *targets)])
+        texts = encoder.texts(
+            [sentence(said, np.random.default_rng(seed)) for said in (old, *targets)]
+        )
         away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
         if np.array_equal(pictures.images[after], pictures.images[before]):
             continue  # what was changed is not in the picture: there is no direction
         likeness = away @ _unit(images[after] - images[before])
         right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
         worlds.append(world)
-    return figure("the edit among 8, by directional similarity", right, worlds, chance=1 / 8, asked=0.8)
+    return figure(
+        "the edit among 8, by directional similarity", right, worlds, chance=1 / 8, asked=0.8
+    )
 
 
 def _viewpoint(images: Array, pictures: Pictures, labels: dict[str, Array]) -> Figure:
     """Whether both views of a thing get the same name."""
     guess = (images @ labels["object"].T).argmax(axis=1)
-    index = {(w, v, k): i for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))}
+    index = {
+        (w, v, k): i
+        for i, (w, v, k) in enumerate(
+            zip(pictures.world, pictures.view, pictures.look, strict=True)
+        )
+    }
     pairs = [(i, index[w, 1, k], w) for (w, v, k), i in index.items() if v == 0]
     same = [guess[i] == guess[j] for i, j, _ in pairs]
     return figure("the same name for two views of a thing", same, [w for *_, w in pairs])
 
 
-# dino-small ----------------------------------------------------------------------------------------------------------
+# dino-small
+# --------------------------------------------------------------------------------------------------
 
 
-def nearest(features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3) -> tuple[list[bool], list[int]]:
+def nearest(
+    features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3
+) -> tuple[list[bool], list[int]]:
     """Nearest neighbour among one view each of 64 things, for the other view of one of them.
 
     Args:
@@ -253,7 +293,9 @@ def nearest(features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3
     unit = _unit(features)
     index = {
         (int(w), int(v), int(k)): i
-        for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))
+        for i, (w, v, k) in enumerate(
+            zip(pictures.world, pictures.view, pictures.look, strict=True)
+        )
     }
     worlds = sorted({w for w, _, _ in index})
     right = []
@@ -266,7 +308,9 @@ def nearest(features: Array, pictures: Pictures, *, look: int = 0, seed: int = 3
 
 
 def histograms(images: npt.NDArray[np.uint8]) -> Array:
-    """(N, 512) colour histograms of 8 x 8 x 8 bins, the square root of which makes cosines Bhattacharyya's."""
+    """(N, 512) colour histograms of 8 x 8 x 8 bins, the square root of which makes cosines
+    Bhattacharyya's.
+    """
     bins = images.astype(np.int64) // 32
     flat = (bins[..., 0] * 64 + bins[..., 1] * 8 + bins[..., 2]).reshape(len(images), -1)
     return np.sqrt(np.stack([np.bincount(row, minlength=512) for row in flat]) / flat.shape[1])
@@ -276,17 +320,21 @@ def raw_pixels(images: npt.NDArray[np.uint8]) -> Array:
     """(N, 3072) pictures of 32 x 32, centred."""
     import cv2
 
-    small = np.stack([cv2.resize(i, (32, 32), interpolation=cv2.INTER_AREA) for i in images]).reshape(len(images), -1)
+    small = np.stack(
+        [cv2.resize(i, (32, 32), interpolation=cv2.INTER_AREA) for i in images]
+    ).reshape(len(images), -1)
     return small - small.mean(axis=1, keepdims=True, dtype=np.float64)
 
 
-def dino_figures(encoder: TokenEncoder, sets: dict[str, Pictures], *, parts: int = 60) -> list[Figure]:
+def dino_figures(
+    encoder: TokenEncoder, sets: dict[str, Pictures], *, parts: int = 60
+) -> list[Figure]:
     """Finding a thing from another side, and parts of it; beside raw pixels and colour histograms.
 
     Args:
         encoder: to be judged.
-        sets: "test-bare" (things alone, all on the same grass in the same light), "test" (each in its own place) and
-            "test-moved" (each on another ground at another time).
+        sets: "test-bare" (things alone, all on the same grass in the same light), "test" (each in
+            its own place) and "test-moved" (each on another ground at another time).
         parts: worlds for the correspondence of parts.
     """
     found = []
@@ -296,7 +344,10 @@ def dino_figures(encoder: TokenEncoder, sets: dict[str, Pictures], *, parts: int
     for name, words in where.items():
         pictures = sets[name]
         features = {"class token": encoder.images(as_float(pictures.images))}
-        features |= {"raw pixels": raw_pixels(pictures.images), "colour histogram": histograms(pictures.images)}
+        features |= {
+            "raw pixels": raw_pixels(pictures.images),
+            "colour histogram": histograms(pictures.images),
+        }
         for what, values in features.items():
             right, worlds = nearest(values, pictures, look=1 if name == "test-moved" else 0)
             asked = 0.85 if what == "class token" and name == "test-bare" else None
@@ -306,10 +357,12 @@ def dino_figures(encoder: TokenEncoder, sets: dict[str, Pictures], *, parts: int
 
 
 def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -> list[Figure]:
-    """PCK: a patch of the thing in one view, its best match in the other, right within a tenth of the picture of where it is.
+    """PCK: a patch of the thing in one view, its best match in the other, right within a tenth of
+    the picture of where it is.
 
-    Exact correspondences come from rays: a surface point of one view, projected into the other, where it must be the
-    point seen. Only patches of the thing itself count, and only ones that both views show.
+    Exact correspondences come from rays: a surface point of one view, projected into the other,
+    where it must be the point seen. Only patches of the thing itself count, and only ones that both
+    views show.
     """
     from training.render import pictures as render
 
@@ -336,13 +389,18 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
         if not good.any():
             continue
         tokens = encoder.tokens(as_float(np.stack([one, two])))
-        means = np.stack([one, two]).reshape(2, side, SIZE // side, side, SIZE // side, 3).transpose(0, 1, 3, 2, 4, 5)
+        means = (
+            np.stack([one, two])
+            .reshape(2, side, SIZE // side, side, SIZE // side, 3)
+            .transpose(0, 1, 3, 2, 4, 5)
+        )
         patches = means.reshape(2, side, side, -1).astype(np.float64)
         centers = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.0
         truth = xy[good]
         for name, grid in (("patch tokens", tokens), ("raw patches", patches)):
             flat = _unit(
-                grid.reshape(2, side * side, -1) - grid.reshape(2, side * side, -1).mean(axis=1, keepdims=True)
+                grid.reshape(2, side * side, -1)
+                - grid.reshape(2, side * side, -1).mean(axis=1, keepdims=True)
             )
             match = (flat[0][on][good] @ flat[1].T).argmax(axis=1)
             rows[name] += list(np.linalg.norm(centers[match] - truth, axis=1) < 0.1 * SIZE)
@@ -355,7 +413,8 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
     ]
 
 
-# perceptual-small ----------------------------------------------------------------------------------------------------
+# perceptual-small
+# --------------------------------------------------------------------------------------------------
 
 Distance = Callable[[Image, Image], float]
 
@@ -369,14 +428,20 @@ def ssim_distance(a: Image, b: Image) -> float:
     """1 - SSIM, by scikit-image."""
     from skimage.metrics import structural_similarity
 
-    how: dict[str, Any] = {"channel_axis": 2, "data_range": 1.0, "gaussian_weights": True, "sigma": 1.5}
+    how: dict[str, Any] = {
+        "channel_axis": 2,
+        "data_range": 1.0,
+        "gaussian_weights": True,
+        "sigma": 1.5,
+    }
     return 1 - float(structural_similarity(a, b, use_sample_covariance=False, **how))
 
 
 def perceptual_figures(
     encoder: PerceptualDistance, renders: npt.NDArray[np.uint8], *, pairs: int = 600
 ) -> list[Figure]:
-    """Which of two distortions is the stronger: on photographs and worlds that training never saw."""
+    """Which of two distortions is the stronger: on photographs and worlds that training never
+    saw."""
     sources = Sources(photographs(HELD_OUT_PHOTOS), renders)
     distances: dict[str, Distance] = {
         "perceptual": lambda a, b: float(encoder.distance([a], [b])[0]), "PSNR": psnr_distance, "SSIM": ssim_distance,

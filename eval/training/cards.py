@@ -1,4 +1,6 @@
-"""Model cards: what each bundled encoder was made from, what it can and cannot do, and the figures behind that."""
+"""Model cards: what each bundled encoder was made from, what it can and cannot do, and the figures
+behind that.
+"""
 
 from __future__ import annotations
 
@@ -99,9 +101,14 @@ def card(
     trained = "" if facts.get("minutes") is None else f", trained in {facts['minutes']:.0f} minutes"
     lines += ["", "## Files", "", "| file | bytes | SHA-256 |", "|---|---|---|"]
     for path in files:
-        lines.append(f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |")
+        lines.append(
+            f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |"
+        )
     if len(files) > 1:
-        lines += ["", f"SHA-256 of all, one after the other, by which results name the encoder: `{sha256_of(files)}`."]
+        lines += [
+            "",
+            f"SHA-256 of all, one after the other, by which results name the encoder: `{sha256_of(files)}`.",
+        ]
     lines += [
         "",
         f"32 pictures of 128 x 128 px take {facts['seconds']:.2f} s on {facts['threads']} thread(s) of the machine that made "

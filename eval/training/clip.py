@@ -1,8 +1,9 @@
 """Recipe of clip-small: pictures and sentences in one space, by contrast.
 
-A batch holds the looks of a world side by side, which differ in one attribute, and for every sentence another with one
-attribute wrong. A sentence that happens to be true of another picture of the batch is no negative: both know what
-they show, so such pairs are left out of the sum. The image tower comes from :mod:`training.naming`, which taught it shapes.
+A batch holds the looks of a world side by side, which differ in one attribute, and for every
+sentence another with one attribute wrong. A sentence that happens to be true of another picture of
+the batch is no negative: both know what they show, so such pairs are left out of the sum. The image
+tower comes from :mod:`training.naming`, which taught it shapes.
 """
 
 from __future__ import annotations
@@ -13,25 +14,45 @@ import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
-from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
+from tokenizers import (
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
 
 from attnwarp.encoders.nets import ClipSmall
 from training import naming
 from training.common import Run, channels_last, crops, groups, rate, settings
 from training.naming import Heads, pictures_of, scrambled, warm_start
-from training.worlds import COLORED, COLORS, FINISHES, GROUNDS, OBJECTS, TIMES, TWO_COLORED, sentence, told
+from training.worlds import (
+    COLORED,
+    COLORS,
+    FINISHES,
+    GROUNDS,
+    OBJECTS,
+    TIMES,
+    TWO_COLORED,
+    sentence,
+    told,
+)
 
 SEED = 1
 EPOCHS = 8
 BATCH = 128
 CROP = 96
 SCALE = (0.6, 0.95)
-"""Shares of a picture's side that a crop of 96 px shows: things are as large in it, on average, as in the whole picture at the
-encoder's size, of which the crop leaves out background that costs time."""
+"""Shares of a picture's side that a crop of 96 px shows: things are as large in it, on average, as
+in the whole picture at the encoder's size, of which the crop leaves out background that costs
+time."""
 PEAK = 1e-3
 SCRAMBLED = 0.25
-"""Share of pictures whose colours are scrambled: they have no part in the contrast, and their thing alone is asked by name. Without them
-things in colours that training never showed them in were named in 88.8 %, and 95.7 % over all."""
+"""Share of pictures whose colours are scrambled: they have no part in the contrast, and their thing
+alone is asked by name. Without them things in colours that training never showed them in were named
+in 88.8 %, and 95.7 % over all."""
 VISION = 0.4
 """Share of the learning rate for the image tower, which has learned much already."""
 VOCABULARY = 1024
@@ -40,7 +61,9 @@ Ints = npt.NDArray[np.int64]
 
 
 def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
-    """Byte-level byte pairs learned from captions: any text can be written with it, known words in a token or two."""
+    """Byte-level byte pairs learned from captions: any text can be written with it, known words in
+    a token or two.
+    """
     rng = np.random.default_rng([SEED, 10])
     corpus = []
     for _ in range(sentences):
@@ -55,7 +78,9 @@ def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
         show_progress=False,
     )  # fmt: skip
     tokenizer.train_from_iterator(corpus, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(single="$A <end>", special_tokens=[("<end>", 1)])
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single="$A <end>", special_tokens=[("<end>", 1)]
+    )
     tokenizer.enable_padding(pad_id=0, pad_token="<pad>")
     tokenizer.enable_truncation(ClipSmall.length)
     return tokenizer
@@ -76,14 +101,18 @@ def tokens(tokenizer: Tokenizer, sentences: list[str]) -> torch.Tensor:
 
 
 def true_of(said: Ints, shown: Ints) -> npt.NDArray[np.bool_]:
-    """(N images, M captions) whether each caption is true of each picture; colours of a pair have no order."""
+    """(N images, M captions) whether each caption is true of each picture; colours of a pair have
+    no order.
+    """
     a, b = shown[:, None], said[None]
     same = (b == -1) | (a == b)
     swapped = (a[..., 2] == b[..., 3]) & (a[..., 3] == b[..., 2])
     colors = (same[..., 2] & same[..., 3]) | swapped
     # "a red ball" is said of a single colour; a red and white one is another thing.
     single = (b[..., 1] == -1) & (b[..., 2] >= 0)
-    finish = np.where(single, np.isin(a[..., 1], [FINISHES.index("plain"), FINISHES.index("shiny")]), same[..., 1])
+    finish = np.where(
+        single, np.isin(a[..., 1], [FINISHES.index("plain"), FINISHES.index("shiny")]), same[..., 1]
+    )
     return same[..., 0] & finish & colors & same[..., 4] & same[..., 5]
 
 
@@ -119,14 +148,17 @@ def wrong(said: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
 
 
 def pseudo_word(rng: np.random.Generator) -> str:
-    """A word that nobody knows, so that the text tower learns to read past those it does not know."""
+    """A word that nobody knows, so that the text tower learns to read past those it does not
+    know."""
     starts, ends = (
         ("b", "br", "cl", "d", "fl", "gr", "k", "l", "m", "pr", "s", "st", "t", "v", "z"),
         ("ck", "l", "m", "n", "rd", "sh", "t", "x", ""),
     )
     vowels = "aeiou"
     return "".join(
-        starts[int(rng.integers(len(starts)))] + vowels[int(rng.integers(5))] + ends[int(rng.integers(len(ends)))]
+        starts[int(rng.integers(len(starts)))]
+        + vowels[int(rng.integers(5))]
+        + ends[int(rng.integers(len(ends)))]
         for _ in range(int(rng.integers(1, 4)))
     )
 
@@ -139,7 +171,9 @@ def _scattered(text: str, rng: np.random.Generator) -> str:
     return " ".join(words)
 
 
-def contrast(model: ClipSmall, i: torch.Tensor, texts: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+def contrast(
+    model: ClipSmall, i: torch.Tensor, texts: torch.Tensor, truth: torch.Tensor
+) -> torch.Tensor:
     """Symmetric contrast of N pictures and 2 N texts, the first N of which are theirs.
 
     Args:
@@ -163,12 +197,17 @@ def contrast(model: ClipSmall, i: torch.Tensor, texts: torch.Tensor, truth: torc
 
 
 def naming_loss(
-    model: ClipSmall, images: torch.Tensor, shown: Ints, tokenizer: Tokenizer, rng: np.random.Generator
+    model: ClipSmall,
+    images: torch.Tensor,
+    shown: Ints,
+    tokenizer: Tokenizer,
+    rng: np.random.Generator,
 ) -> torch.Tensor:
-    """Contrast of pictures with the words for one attribute at a time: each thing, each colour, each ground, ...
+    """Contrast of pictures with the words for one attribute at a time: each thing, each colour,
+    each ground, ...
 
-    In whole sentences a colour and a ground nearly tell a batch's pictures apart, and shapes, which are harder, go
-    unlearned for long.
+    In whole sentences a colour and a ground nearly tell a batch's pictures apart, and shapes, which
+    are harder, go unlearned for long.
 
     Args:
         model: the two towers.
@@ -179,7 +218,13 @@ def naming_loss(
     """
     texts: list[str] = []
     spans: list[tuple[int, int, int]] = []
-    for column, count in ((0, len(OBJECTS)), (1, len(FINISHES)), (2, len(COLORS)), (4, len(GROUNDS)), (5, len(TIMES))):
+    for column, count in (
+        (0, len(OBJECTS)),
+        (1, len(FINISHES)),
+        (2, len(COLORS)),
+        (4, len(GROUNDS)),
+        (5, len(TIMES)),
+    ):
         spans.append((column, len(texts), len(texts) + count))
         for value in range(count):
             said = [-1] * 6
@@ -195,7 +240,9 @@ def naming_loss(
     total = torch.zeros(())
     for column, low, high in spans:
         asked = shown[:, column] >= 0
-        if column == 1:  # what a colour is said of is told from its pattern or its shine alone only by chance
+        if (
+            column == 1
+        ):  # what a colour is said of is told from its pattern or its shine alone only by chance
             asked &= ~np.isin(shown[:, 1], [FINISHES.index(f) for f in COLORED])
         if column == 2:
             asked &= np.isin(shown[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
@@ -220,11 +267,18 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     model.vision.load_state_dict(stored["vision"])
     model.pool.norm.load_state_dict(stored["norm"])
     heads.load_state_dict(stored["heads"])
-    units = [(k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)]
+    units = [
+        (k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)
+    ]
     each = sum(len(rows) for _, rows in units) // BATCH
     seen = [*groups(model.vision, 0.05), *groups(heads, 0.05)]
     optimizer = torch.optim.AdamW(
-        [*seen, *groups(model.pool, 0.05), *groups(model.text, 0.05), {"params": [model.scale], "weight_decay": 0.0}],
+        [
+            *seen,
+            *groups(model.pool, 0.05),
+            *groups(model.text, 0.05),
+            {"params": [model.scale], "weight_decay": 0.0},
+        ],
         betas=(0.9, 0.98),
     )
     peaks = [PEAK * VISION] * len(seen) + [PEAK] * (len(optimizer.param_groups) - len(seen))
@@ -239,7 +293,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for group, peak in zip(optimizer.param_groups, peaks, strict=True):
                 group["lr"] = rate(number * each + step, epochs * each, peak, 200)
             rows = flat[step * BATCH : (step + 1) * BATCH]
-            images = crops(np.stack([sets[k].pictures.images[r] for k, r in rows]), CROP, rng, scale=SCALE)
+            images = crops(
+                np.stack([sets[k].pictures.images[r] for k, r in rows]), CROP, rng, scale=SCALE
+            )
             shown = np.stack([sets[k].pictures.attributes[r] for k, r in rows])
             which = rng.uniform(size=BATCH) < SCRAMBLED
             images = scrambled(images, which, rng)
@@ -254,7 +310,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 embedded = model.pool.project(features)
                 guessed = heads(features, shown)
             embedded = F.normalize(embedded.float(), dim=-1)
-            apart = contrast(model, embedded[torch.from_numpy(kept)], tokens(tokenizer, texts), truth)
+            apart = contrast(
+                model, embedded[torch.from_numpy(kept)], tokens(tokenizer, texts), truth
+            )
             named = naming_loss(model, embedded, shown, tokenizer, rng)
             loss = apart + named + guessed
             optimizer.zero_grad(set_to_none=True)
@@ -267,5 +325,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     checkpoint = out / "clip-small.pt"
     # The image tower's start is part of what this comes from.
     recipe = settings(globals()) | {"naming": naming.recipe()}
-    Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs, recipe).train(epoch)
+    Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs, recipe).train(
+        epoch
+    )
     return checkpoint

@@ -47,7 +47,9 @@ def placed_crops(
     images: npt.NDArray[np.uint8], out: int, rng: np.random.Generator, *, scale: tuple[float, float],
     turn: float = 8.0, tone: float = 0.12, flip: bool = True,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """As :func:`crops`, and where each came from: (N, 2, 3) maps from the crop's [-1, 1] to the picture's."""
+    """As :func:`crops`, and where each came from: (N, 2, 3) maps from the crop's [-1, 1] to the
+    picture's.
+    """
     n = len(images)
     side = rng.uniform(*scale, n)
     angle = np.radians(rng.uniform(-turn, turn, n))
@@ -96,14 +98,19 @@ def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
     """What a recipe says: its constants, by their upper-case names, and which pictures it takes.
 
     Args:
-        module: the recipe's ``globals()``; what it imports in upper case, such as the words for colours, is part of it.
+        module: the recipe's ``globals()``; what it imports in upper case, such as the words for
+            colours, is part of it.
         splits: names of the pictures that it is trained on, in :data:`training.data.SPLITS`.
     """
     from training.data import DATA_PROTOCOL, SPLITS
 
     plain = (bool, int, float, str, tuple, list, dict)
-    found = {name: value for name, value in module.items() if name.isupper() and isinstance(value, plain)}
-    return found | {"data": {"protocol": DATA_PROTOCOL, **{name: asdict(SPLITS[name]) for name in splits}}}
+    found = {
+        name: value for name, value in module.items() if name.isupper() and isinstance(value, plain)
+    }
+    return found | {
+        "data": {"protocol": DATA_PROTOCOL, **{name: asdict(SPLITS[name]) for name in splits}}
+    }
 
 
 @dataclass
@@ -114,8 +121,8 @@ class Run:
         path: of the checkpoint.
         state: everything that has a ``state_dict``, by name.
         epochs: how many in all.
-        recipe: what else the result depends on, see :func:`settings`; written into the checkpoint, which goes on with no
-            other.
+        recipe: what else the result depends on, see :func:`settings`; written into the checkpoint,
+            which goes on with no other.
     """
 
     path: Path
@@ -124,10 +131,12 @@ class Run:
     recipe: Mapping[str, Any]
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
-        """Run the epochs that are left; each draws from generators seeded by its number, so a resumed run is the same.
+        """Run the epochs that are left; each draws from generators seeded by its number, so a
+        resumed run is the same.
 
         Raises:
-            InputError: the checkpoint is of another recipe, or from before recipes were written into them.
+            InputError: the checkpoint is of another recipe, or from before recipes were written
+                into them.
         """
         first, seconds = 0, 0.0
         recipe = {"epochs": self.epochs, **self.recipe}
@@ -146,7 +155,10 @@ class Run:
             print(f"epoch {number + 1}/{self.epochs}: {words}, {taken:.0f} s", flush=True)
             temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
             kept = {name: thing.state_dict() for name, thing in self.state.items()}
-            torch.save({**kept, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)}, temporary)
+            torch.save(
+                {**kept, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)},
+                temporary,
+            )
             temporary.replace(self.path)
 
     def _same_recipe(self, stored: str | None, recipe: Mapping[str, Any]) -> None:
@@ -158,14 +170,18 @@ class Run:
         was, now = json.loads(stored), json.loads(json.dumps(recipe))  # tuples are lists there
         for name in (*now, *was):
             if (name in was) != (name in now) or was.get(name) != now.get(name):
-                made, asked = (_short(one[name]) if name in one else "nothing" for one in (was, now))
+                made, asked = (
+                    _short(one[name]) if name in one else "nothing" for one in (was, now)
+                )
                 raise InputError(
                     f"{self.path}: was made with {name} = {made}, got {asked}; {remedy}, or restore the setting"
                 )
 
 
 def minutes(*paths: Path) -> float | None:
-    """How long the trainings behind some checkpoints took together; None where one is not at hand or does not say."""
+    """How long the trainings behind some checkpoints took together; None where one is not at hand
+    or does not say.
+    """
     total = 0.0
     for path in paths:
         seconds = torch.load(path, weights_only=True).get("seconds") if path.exists() else None

@@ -1,4 +1,6 @@
-"""Pictures of random worlds on disk, in shards: seeded, resumable, the same whatever the number of workers."""
+"""Pictures of random worlds on disk, in shards: seeded, resumable, the same whatever the number of
+workers.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,14 @@ class Split:
         shard: worlds in a file.
         pairs: colours of the objects: "seen" in training, "new", or "any".
         new_shapes: whether the shapes are ones that training never sees.
-        own_shapes: whether every world has a shape of its own, which training may see; else worlds share
-            :data:`training.worlds.TRAIN_SHAPES` of each thing.
-        path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the ray caster (two
-            views of each look).
-        moved: whether all looks of a world have its surface, on other grounds at other times; else there are three, of
-            which the second differs from the first in one attribute.
-        bare: whether every thing stands alone on the same grass by day, so that nothing but the thing tells it apart.
+        own_shapes: whether every world has a shape of its own, which training may see; else worlds
+            share :data:`training.worlds.TRAIN_SHAPES` of each thing.
+        path_traced: whether Mitsuba makes the pictures (one look and one view of each world) or the
+            ray caster (two views of each look).
+        moved: whether all looks of a world have its surface, on other grounds at other times; else
+            there are three, of which the second differs from the first in one attribute.
+        bare: whether every thing stands alone on the same grass by day, so that nothing but the
+            thing tells it apart.
     """
 
     first: int
@@ -87,7 +90,8 @@ class Pictures:
         attributes: (N, 6) as :data:`training.worlds.ATTRIBUTES`.
         world: (N,) seed of the world.
         view: (N,) which of its cameras.
-        look: (N,) which of its looks; 1 differs from 0 in one attribute, 2 in everything that was drawn.
+        look: (N,) which of its looks; 1 differs from 0 in one attribute, 2 in everything that was
+            drawn.
     """
 
     images: npt.NDArray[np.uint8]
@@ -118,7 +122,11 @@ def looks_of(seed: int, thing: int, split: Split) -> list[Look]:
         return [first, replace(first, ground=other.ground, time=other.time)]
     # What the test for directions changes is drawn like everything else.
     what = ("surface", "surface", "ground", "time")[int(rng.integers(4))]
-    return [first, change(first, what, thing, rng, pairs=split.pairs), draw_look(thing, rng, pairs=split.pairs)]
+    return [
+        first,
+        change(first, what, thing, rng, pairs=split.pairs),
+        draw_look(thing, rng, pairs=split.pairs),
+    ]
 
 
 def render_world(
@@ -128,7 +136,9 @@ def render_world(
     from training.render import pictures
 
     # Objects come in turn, so that every word is seen as often.
-    world = draw_world(seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS), bare=split.bare)
+    world = draw_world(
+        seed, new_shapes=split.new_shapes, thing=seed % len(OBJECTS), bare=split.bare
+    )
     if split.own_shapes:
         world = replace(world, instance=TRAIN_SHAPES + seed - split.first)
     looks = looks_of(seed, world.thing, split)
@@ -137,7 +147,8 @@ def render_world(
         from attnwarp_eval.truth import mitsuba
         from attnwarp_eval.truth.plan import plan
 
-        # Baking textures as finely as truth wants them takes ten times as long as the small picture itself.
+        # Baking textures as finely as truth wants them takes ten times as long as the small picture
+        # itself.
         mitsuba.TEXELS = TEXELS
         scene = world.scene(looks[0], size)
         image = to_srgb(mitsuba.render_plan(scene, scene.source, plan(scene, SPP), seed))
@@ -152,11 +163,21 @@ def render_world(
 def _make_shard(path: Path, split: Split, start: int) -> Path:
     rows = []
     for seed in range(start, min(start + split.shard, split.first + split.worlds)):
-        rows += [(image, shown, seed, view, look) for image, shown, view, look in render_world(seed, split)]
+        rows += [
+            (image, shown, seed, view, look)
+            for image, shown, view, look in render_world(seed, split)
+        ]
     images, shown, world, view, look = zip(*rows, strict=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
-        np.savez(file, images=np.stack(images), attributes=np.array(shown), world=world, view=view, look=look)
+        np.savez(
+            file,
+            images=np.stack(images),
+            attributes=np.array(shown),
+            world=world,
+            view=view,
+            look=look,
+        )
     temporary.replace(path)
     return path
 
@@ -169,11 +190,17 @@ def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     starts = range(split.first, split.first + split.worlds, split.shard)
     files = [folder / f"{name}-v{DATA_PROTOCOL}-{start}.npz" for start in starts]
-    missing = [(path, start) for path, start in zip(files, starts, strict=True) if not path.exists()]
+    missing = [
+        (path, start) for path, start in zip(files, starts, strict=True) if not path.exists()
+    ]
     if missing:
         with Progress() as bar, ProcessPoolExecutor(workers) as pool:
-            task = bar.add_task(f"pictures: {name}", total=len(files), completed=len(files) - len(missing))
-            for done in as_completed([pool.submit(_make_shard, path, split, start) for path, start in missing]):
+            task = bar.add_task(
+                f"pictures: {name}", total=len(files), completed=len(files) - len(missing)
+            )
+            for done in as_completed(
+                [pool.submit(_make_shard, path, split, start) for path, start in missing]
+            ):
                 done.result()
                 bar.advance(task)
     return files

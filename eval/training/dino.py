@@ -1,9 +1,10 @@
 """Recipe of dino-small: self-distillation with multi-crop (Caron et al. 2021), without labels.
 
-A student sees small crops and has to say what a teacher, its own moving average, says of large ones. Both large crops show
-one thing from two sides, so that what stays the same from side to side is what is learned. Patches are
-taught too: a small crop's patches say what the teacher's patches at the same place of the same picture say (a dense
-form of the same loss, as in Zhou et al. 2022 without masks).
+A student sees small crops and has to say what a teacher, its own moving average, says of large
+ones. Both large crops show one thing from two sides, so that what stays the same from side to side
+is what is learned. Patches are taught too: a small crop's patches say what the teacher's patches at
+the same place of the same picture say (a dense form of the same loss, as in Zhou et al. 2022
+without masks).
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ PROTOTYPES = 768
 DENSE_PROTOTYPES = 192
 STUDENT_TEMPERATURE, TEACHER_TEMPERATURE = 0.1, 0.04
 CONTRAST = 1.0
-"""Weight of telling two views of a thing from those of the batch's others: the targets alone soon stopped helping (48 % of
-things found among 64 after two epochs, 49 % after five)."""
+"""Weight of telling two views of a thing from those of the batch's others: the targets alone soon
+stopped helping (48 % of things found among 64 after two epochs, 49 % after five)."""
 SPREAD = 0.1
 """Weight of the term that keeps class tokens apart."""
 DENSE = 0.5
@@ -70,10 +71,11 @@ class Distiller(nn.Module):
 
 
 def balanced(scores: Tensor, rounds: int = 3) -> Tensor:
-    """Centred and sharpened targets: every prototype is used alike over the batch, every row sums to one.
+    """Centred and sharpened targets: every prototype is used alike over the batch, every row sums
+    to one.
 
-    Sinkhorn and Knopp's normalisation in place of a running centre (Caron et al. 2020, section 3.1; Oquab et al. 2023): in
-    batches this small a running centre lags behind.
+    Sinkhorn and Knopp's normalisation in place of a running centre (Caron et al. 2020, section 3.1;
+    Oquab et al. 2023): in batches this small a running centre lags behind.
 
     Args:
         scores: (N, P) of the teacher.
@@ -90,18 +92,25 @@ def balanced(scores: Tensor, rounds: int = 3) -> Tensor:
 
 
 def contrast(one: Tensor, other: Tensor) -> Tensor:
-    """Cross-entropy of finding each thing's other view in the batch (van den Oord et al. 2018), both ways.
+    """Cross-entropy of finding each thing's other view in the batch (van den Oord et al. 2018),
+    both ways.
 
     Args:
         one, other: (N, D) class tokens of the first and the second view.
     """
-    logits = F.normalize(one.float(), dim=-1) @ F.normalize(other.float(), dim=-1).T / STUDENT_TEMPERATURE
+    logits = (
+        F.normalize(one.float(), dim=-1)
+        @ F.normalize(other.float(), dim=-1).T
+        / STUDENT_TEMPERATURE
+    )
     mine = torch.arange(len(one))
     return 0.5 * (F.cross_entropy(logits, mine) + F.cross_entropy(logits.T, mine))
 
 
 def spread(tokens: Tensor) -> Tensor:
-    """Minus the mean logarithm of the distance to the nearest neighbour (Sablayrolles et al. 2019, KoLeo)."""
+    """Minus the mean logarithm of the distance to the nearest neighbour (Sablayrolles et al. 2019,
+    KoLeo).
+    """
     unit = F.normalize(tokens.float(), dim=-1)
     near = (unit @ unit.T).fill_diagonal_(-1).max(dim=1).values
     return -torch.log((2 - 2 * near).clamp(min=1e-6).sqrt()).mean()
@@ -136,7 +145,8 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     """Train dino-small; the checkpoint's path."""
     torch.manual_seed(SEED)
     out.mkdir(parents=True, exist_ok=True)
-    # Things that move from ground to ground teach that the ground is not the thing; they are the larger half.
+    # Things that move from ground to ground teach that the ground is not the thing; they are the
+    # larger half.
     sets = [load(data, "train-moved"), load(data, "train-shapes"), load(data, "train")]
     things = [(k, *views) for k, pictures in enumerate(sets) for views in _views(pictures)]
     student = channels_last(Distiller())
@@ -156,13 +166,17 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for group in optimizer.param_groups:
                 group["lr"] = rate(now, epochs * each, PEAK, 200)
             chosen = [things[k] for k in order[step * BATCH : (step + 1) * BATCH]]
-            # Never the same look from both sides, where there are two: ground and light must not tell things apart.
+            # Never the same look from both sides, where there are two: ground and light must not
+            # tell things apart.
             drawn = [
                 (sets[k].images, a[n % len(a)], b[(n + 1) % len(b)])
                 for k, a, b in chosen
                 for n in [int(rng.integers(2))]
             ]
-            sides = [np.stack([images[a] for images, a, _ in drawn]), np.stack([images[b] for images, _, b in drawn])]
+            sides = [
+                np.stack([images[a] for images, a, _ in drawn]),
+                np.stack([images[b] for images, _, b in drawn]),
+            ]
             large = [placed_crops(side, LARGE, rng, scale=(0.6, 1.0), tone=0.2) for side in sides]
             small = [placed_crops(side, SMALL, rng, scale=(0.25, 0.5), tone=0.2) for side in sides]
             with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
@@ -175,8 +189,16 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             n, p, h, w = t_patch.shape
             flat = balanced(t_patch.float().permute(0, 2, 3, 1).reshape(-1, p))
             dense_target = flat.view(n, h, w, p).permute(0, 3, 1, 2).chunk(2)
-            by_crop = [F.log_softmax(s / STUDENT_TEMPERATURE, dim=1) for s in (*s_large.chunk(2), *s_small.chunk(2))]
-            terms = [-(t * s).sum(1).mean() for k, t in enumerate(target) for j, s in enumerate(by_crop) if j != k]
+            by_crop = [
+                F.log_softmax(s / STUDENT_TEMPERATURE, dim=1)
+                for s in (*s_large.chunk(2), *s_small.chunk(2))
+            ]
+            terms = [
+                -(t * s).sum(1).mean()
+                for k, t in enumerate(target)
+                for j, s in enumerate(by_crop)
+                if j != k
+            ]
             cls = torch.stack(terms).mean()
             dense_terms = []
             for side, scores in enumerate(s_small_patch.chunk(2)):
@@ -192,7 +214,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(student.parameters(), 2.0)
-            if number == 0:  # the prototypes stand still at first, which keeps the start from collapsing
+            if (
+                number == 0
+            ):  # the prototypes stand still at first, which keeps the start from collapsing
                 student.head.prototypes.grad = student.dense.prototypes.grad = None
             optimizer.step()
             keep = 1 - 0.02 * (0.5 + 0.5 * math.cos(math.pi * now / (epochs * each)))
@@ -200,10 +224,19 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 for mine, theirs in zip(teacher.parameters(), student.parameters(), strict=True):
                     mine.lerp_(theirs, 1 - keep)
             same = (target[0].argmax(1) == target[1].argmax(1)).float().mean()
-            sums += [float(cls.detach()), float(dense.detach()), float(told_apart.detach()), float(same)]
-        return dict(zip(("class", "patches", "contrast", "same prototype"), sums / each, strict=True))
+            sums += [
+                float(cls.detach()),
+                float(dense.detach()),
+                float(told_apart.detach()),
+                float(same),
+            ]
+        return dict(
+            zip(("class", "patches", "contrast", "same prototype"), sums / each, strict=True)
+        )
 
     checkpoint = out / "dino-small.pt"
     recipe = settings(globals(), "train-moved", "train-shapes", "train")
-    Run(checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer}, epochs, recipe).train(epoch)
+    Run(
+        checkpoint, {"student": student, "teacher": teacher, "optimizer": optimizer}, epochs, recipe
+    ).train(epoch)
     return checkpoint

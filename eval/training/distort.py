@@ -1,8 +1,9 @@
 """Distortions of known strength, on one scale from 0 (unseen) to 5 (ruined).
 
-The scale is ours, not people's: within a kind it follows the parameter, which nobody would order otherwise. Between
-kinds it says little more than what is plain to see, such as that a shift by a pixel is weaker than a blur of two; pairs of
-different kinds are therefore only used a full step apart.
+The scale is ours, not people's: within a kind it follows the parameter, which nobody would order
+otherwise. Between kinds it says little more than what is plain to see, such as that a shift by a
+pixel is weaker than a blur of two; pairs of different kinds are therefore only used a full step
+apart.
 """
 
 from __future__ import annotations
@@ -30,14 +31,18 @@ def _shift(image: Image, strength: float, rng: np.random.Generator) -> Image:
     far, angle = _between(strength, (0, 2.0, 5.0)), rng.uniform(0, 2 * np.pi)
     move = np.array([[1, 0, far * np.cos(angle)], [0, 1, far * np.sin(angle)]])
     # Cubic taps keep the detail that linear ones would blur away at half a pixel.
-    return cv2.warpAffine(image, move, image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+    return cv2.warpAffine(
+        image, move, image.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101
+    )
 
 
 def _turn(image: Image, strength: float, rng: np.random.Generator) -> Image:
     angle = _between(strength, (0, 2.0, 5.0)) * (1 if rng.uniform() < 0.5 else -1)
     h, w = image.shape[:2]
     move = cv2.getRotationMatrix2D((w / 2 - 0.5, h / 2 - 0.5), angle, 1)
-    return cv2.warpAffine(image, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101)
+    return cv2.warpAffine(
+        image, move, (w, h), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT_101
+    )
 
 
 def _blur(image: Image, strength: float, rng: np.random.Generator) -> Image:
@@ -52,19 +57,27 @@ def _motion(image: Image, strength: float, rng: np.random.Generator) -> Image:
     for s in steps:
         move = np.array([[1, 0, s * np.cos(angle)], [0, 1, s * np.sin(angle)]])
         total += cv2.warpAffine(
-            image, move, image.shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+            image,
+            move,
+            image.shape[1::-1],
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT_101,
         )
     return total / len(steps)
 
 
 def _noise(image: Image, strength: float, rng: np.random.Generator) -> Image:
-    return image + rng.normal(0, _between(strength, (0, 0.02, 0.045, 0.09, 0.16, 0.28)), image.shape).astype(np.float32)
+    return image + rng.normal(
+        0, _between(strength, (0, 0.02, 0.045, 0.09, 0.16, 0.28)), image.shape
+    ).astype(np.float32)
 
 
 def _jpeg(image: Image, strength: float, rng: np.random.Generator) -> Image:
     quality = round(_between(strength, (95, 60, 30, 15, 7, 3)))
     ok, code = cv2.imencode(
-        ".jpg", np.clip(image * 255, 0, 255).astype(np.uint8)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality]
+        ".jpg",
+        np.clip(image * 255, 0, 255).astype(np.uint8)[..., ::-1],
+        [cv2.IMWRITE_JPEG_QUALITY, quality],
     )
     back = cv2.imdecode(code, cv2.IMREAD_COLOR)
     assert ok and back is not None
@@ -97,7 +110,9 @@ def _cast(image: Image, strength: float, rng: np.random.Generator) -> Image:
 def _pixels(image: Image, strength: float, rng: np.random.Generator) -> Image:
     size = _between(strength, (1, 1.5, 2.2, 3.5, 6, 10))
     h, w = image.shape[:2]
-    small = cv2.resize(image, (max(1, round(w / size)), max(1, round(h / size))), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        image, (max(1, round(w / size)), max(1, round(h / size))), interpolation=cv2.INTER_AREA
+    )
     return cv2.resize(small, (w, h), interpolation=cv2.INTER_NEAREST)
 
 
@@ -115,7 +130,9 @@ KINDS: dict[str, tuple[Apply, float]] = {
     "jpeg": (_jpeg, 5.0), "brightness": (_brightness, 5.0), "contrast": (_contrast, 5.0), "saturation": (_saturation, 2.9),
     "cast": (_cast, 5.0), "pixels": (_pixels, 5.0), "speckle": (_speckle, 5.0),
 }  # fmt: skip
-"""Every kind: how it is done, and the greatest strength it reaches (a shift alone never ruins a picture)."""
+"""Every kind: how it is done, and the greatest strength it reaches (a shift alone never ruins a
+picture).
+"""
 
 HELD_OUT_KINDS = ("pixels", "speckle")
 """Never seen in training."""
@@ -130,7 +147,8 @@ def distorted(image: Image, kind: str, strength: float, seed: int) -> Image:
         image: (H, W, 3) in [0, 1], with :data:`MARGIN` pixels around what is returned.
         kind: a key of :data:`KINDS`.
         strength: 0 to the kind's greatest.
-        seed: of directions, signs and noise; the same one for both of a pair of one kind, so that strength alone differs.
+        seed: of directions, signs and noise; the same one for both of a pair of one kind, so that
+            strength alone differs.
     """
     apply, _ = KINDS[kind]
     out = apply(image, strength, np.random.default_rng(seed))
@@ -146,7 +164,8 @@ def draw_pair(
     Args:
         rng: to draw from.
         kinds: to draw from.
-        across: share of pairs of two different kinds, at least a full step apart; of one kind, at least 0.35 of a step.
+        across: share of pairs of two different kinds, at least a full step apart; of one kind, at
+            least 0.35 of a step.
     """
     while True:
         one, other = (str(k) for k in rng.choice(kinds, 2))

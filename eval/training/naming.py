@@ -1,8 +1,9 @@
-"""What clip-small's image tower learns before it meets sentences: to name each attribute of a picture, by linear heads.
+"""What clip-small's image tower learns before it meets sentences: to name each attribute of a
+picture, by linear heads.
 
-In whole sentences a colour and a ground nearly tell a batch's pictures apart, and a text tower that cannot tell nouns
-apart gives pictures no reason to: shapes, which are harder, went unlearned for long. Here every picture of a batch
-has its own geometry. The heads are used in training alone.
+In whole sentences a colour and a ground nearly tell a batch's pictures apart, and a text tower that
+cannot tell nouns apart gives pictures no reason to: shapes, which are harder, went unlearned for
+long. Here every picture of a batch has its own geometry. The heads are used in training alone.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ SCALE = (0.5, 0.85)
 """Shares of a picture's side: the thing stands about the middle, and background costs time."""
 PEAK = 2e-3
 SCRAMBLED = 0.3
-"""Share of pictures whose colours are scrambled and of which the thing alone is asked: a thing must be known in a colour
-in which it was never seen."""
+"""Share of pictures whose colours are scrambled and of which the thing alone is asked: a thing must
+be known in a colour in which it was never seen."""
 SMOOTHING = 0.05
 KEPT = 200
-"""Worlds of "train-shapes" that are not trained on: what to change in a recipe is decided by them, not by the tests."""
+"""Worlds of "train-shapes" that are not trained on: what to change in a recipe is decided by them,
+not by the tests.
+"""
 
 Ints = npt.NDArray[np.int64]
 
@@ -44,7 +47,13 @@ class Heads(nn.Module):
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        self.counts = {0: len(OBJECTS), 1: len(FINISHES), 2: len(COLORS), 4: len(GROUNDS), 5: len(TIMES)}
+        self.counts = {
+            0: len(OBJECTS),
+            1: len(FINISHES),
+            2: len(COLORS),
+            4: len(GROUNDS),
+            5: len(TIMES),
+        }
         self.guess = nn.Linear(dim, sum(self.counts.values()))
 
     def scores(self, x: torch.Tensor) -> dict[int, torch.Tensor]:
@@ -53,7 +62,9 @@ class Heads(nn.Module):
         return dict(zip(self.counts, parts, strict=True))
 
     def forward(self, x: torch.Tensor, shown: Ints) -> torch.Tensor:
-        """Cross-entropy of (N, dim) features with what is shown, (N, 6), meant over the attributes; -1 is not asked."""
+        """Cross-entropy of (N, dim) features with what is shown, (N, 6), meant over the attributes;
+        -1 is not asked.
+        """
         total = torch.zeros(())
         for column, scores in self.scores(x).items():
             asked = torch.from_numpy(shown[:, column])
@@ -81,12 +92,22 @@ class Part:
 
 
 def pictures_of(data: Path) -> list[Part]:
-    """All pictures that clip-small is trained on; Mitsuba's, which are few, four times each epoch."""
+    """All pictures that clip-small is trained on; Mitsuba's, which are few, four times each
+    epoch."""
     parts = []
-    for name, times in (("train", 1), ("train-rendered", 4), ("train-moved", 1), ("train-shapes", 1)):
+    for name, times in (
+        ("train", 1),
+        ("train-rendered", 4),
+        ("train-moved", 1),
+        ("train-shapes", 1),
+    ):
         pictures = load(data, name)
         worlds = np.unique(pictures.world)
-        kept = np.isin(pictures.world, worlds[-KEPT:]) if name == "train-shapes" else np.zeros(len(pictures), bool)
+        kept = (
+            np.isin(pictures.world, worlds[-KEPT:])
+            if name == "train-shapes"
+            else np.zeros(len(pictures), bool)
+        )
         keys = pictures.world * 8 + pictures.view
         order = np.flatnonzero(~kept)
         order = order[np.argsort(keys[order], kind="stable")]
@@ -95,8 +116,11 @@ def pictures_of(data: Path) -> list[Part]:
     return parts
 
 
-def scrambled(images: torch.Tensor, which: npt.NDArray[np.bool_], rng: np.random.Generator) -> torch.Tensor:
-    """(N, 3, H, W) with the colours of ``which`` mixed at random, the same everywhere in a picture."""
+def scrambled(
+    images: torch.Tensor, which: npt.NDArray[np.bool_], rng: np.random.Generator
+) -> torch.Tensor:
+    """(N, 3, H, W) with the colours of ``which`` mixed at random, the same everywhere in a
+    picture."""
     rows = np.flatnonzero(which)
     mix = rng.dirichlet([0.5, 0.5, 0.5], (len(rows), 3))
     mixed = torch.einsum("nij,njhw->nihw", torch.from_numpy(mix).float(), images[rows])
@@ -106,13 +130,19 @@ def scrambled(images: torch.Tensor, which: npt.NDArray[np.bool_], rng: np.random
 
 
 def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
-    """Train the image tower and the heads; the checkpoint's path, with the states ``vision``, ``norm`` and ``heads``."""
+    """Train the image tower and the heads; the checkpoint's path, with the states ``vision``,
+    ``norm`` and ``heads``.
+    """
     torch.manual_seed(SEED)
     model = channels_last(ClipSmall(1))
     vision, pool = model.vision, model.pool
     heads = Heads(pool.project.in_features)
-    optimizer = torch.optim.AdamW([*groups(vision, 0.05), *groups(pool.norm, 0.0), *groups(heads, 0.05)], lr=PEAK)
-    units = [(k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)]
+    optimizer = torch.optim.AdamW(
+        [*groups(vision, 0.05), *groups(pool.norm, 0.0), *groups(heads, 0.05)], lr=PEAK
+    )
+    units = [
+        (k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)
+    ]
     each = len(units) // BATCH
 
     def epoch(number: int) -> dict[str, float]:
@@ -162,7 +192,9 @@ def _kept_right(sets: list[Part], model: ClipSmall, heads: Heads) -> dict[str, f
             x = torch.from_numpy(part.pictures.images[rows]).permute(0, 3, 1, 2).float().div(255)
             x = F.interpolate(x, (model.size, model.size), mode="bilinear", antialias=True)
             with torch.autocast("cpu", torch.bfloat16):
-                scores = heads.scores(model.pool.features(model.vision(x.to(memory_format=torch.channels_last))[-1]))
+                scores = heads.scores(
+                    model.pool.features(model.vision(x.to(memory_format=torch.channels_last))[-1])
+                )
             shown = part.pictures.attributes[rows]
             right["things"].append(scores[0].argmax(1).numpy() == shown[:, 0])
             colored = np.isin(shown[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])

@@ -1,7 +1,8 @@
-"""Recipe of perceptual-small: a distance of pictures that puts distortions in the order of their strengths.
+"""Recipe of perceptual-small: a distance of pictures that puts distortions in the order of their
+strengths.
 
-Features and channel weights are learned together, on photographs and renderings, from pairs of distortions of which one
-is known to be the stronger (:mod:`training.distort`).
+Features and channel weights are learned together, on photographs and renderings, from pairs of
+distortions of which one is known to be the stronger (:mod:`training.distort`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,9 @@ class Sources:
     renders: npt.NDArray[np.uint8]
 
     def crop(self, rng: np.random.Generator, size: int = SIZE) -> Image:
-        """A random (size + 2 MARGIN) square crop, from a photograph as often as from a rendering, at a random scale."""
+        """A random (size + 2 MARGIN) square crop, from a photograph as often as from a rendering,
+        at a random scale.
+        """
         pick = (
             self.photos[int(rng.integers(len(self.photos)))]
             if rng.uniform() < 0.5
@@ -58,13 +61,22 @@ class Sources:
             min(
                 h,
                 w,
-                full * np.exp(rng.uniform(0, np.log(max(1.0, min(h, w) / full) + 1e-9)) if min(h, w) > full else 0.0),
+                full
+                * np.exp(
+                    rng.uniform(0, np.log(max(1.0, min(h, w) / full) + 1e-9))
+                    if min(h, w) > full
+                    else 0.0
+                ),
             )
         )
         y, x = int(rng.integers(h - side + 1)), int(rng.integers(w - side + 1))
         patch = pick[y : y + side, x : x + side].astype(np.float32) / 255
         if side != full:
-            patch = cv2.resize(patch, (full, full), interpolation=cv2.INTER_AREA if side > full else cv2.INTER_CUBIC)
+            patch = cv2.resize(
+                patch,
+                (full, full),
+                interpolation=cv2.INTER_AREA if side > full else cv2.INTER_CUBIC,
+            )
         if rng.uniform() < 0.5:
             patch = patch[:, ::-1]
         return np.ascontiguousarray(np.clip(patch, 0, 1))
@@ -91,12 +103,22 @@ def triple(
     full = sources.crop(rng)
     (kind_a, a, seed_a), (kind_b, b, seed_b) = draw_pair(rng, kinds, **how)
     m = MARGIN
-    return full[m:-m, m:-m], distorted(full, kind_a, a, seed_a), distorted(full, kind_b, b, seed_b), a, b
+    return (
+        full[m:-m, m:-m],
+        distorted(full, kind_a, a, seed_a),
+        distorted(full, kind_b, b, seed_b),
+        a,
+        b,
+    )
 
 
-def _batch(make: Callable[[], tuple[Image, Image, Image, float, float]], count: int) -> tuple[torch.Tensor, ...]:
+def _batch(
+    make: Callable[[], tuple[Image, Image, Image, float, float]], count: int
+) -> tuple[torch.Tensor, ...]:
     rows = [make() for _ in range(count)]
-    images = [torch.from_numpy(np.stack([r[k] for r in rows])).permute(0, 3, 1, 2) for k in range(3)]
+    images = [
+        torch.from_numpy(np.stack([r[k] for r in rows])).permute(0, 3, 1, 2) for k in range(3)
+    ]
     strengths = torch.tensor([[r[3], r[4]] for r in rows], dtype=torch.float32)
     return (*images, strengths)
 
@@ -132,5 +154,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return {"loss": total / STEPS, "ordered": right / (STEPS * BATCH)}
 
     checkpoint = out / "perceptual-small.pt"
-    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, settings(globals(), "train")).train(epoch)
+    Run(
+        checkpoint, {"model": model, "optimizer": optimizer}, epochs, settings(globals(), "train")
+    ).train(epoch)
     return checkpoint

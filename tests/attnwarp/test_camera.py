@@ -1,4 +1,6 @@
-"""Oracles: OpenCV's projectPoints and Rodrigues, mpmath, SciPy's rotations, matrices multiplied by hand."""
+"""Oracles: OpenCV's projectPoints and Rodrigues, mpmath, SciPy's rotations, matrices multiplied by
+hand.
+"""
 
 import json
 
@@ -60,7 +62,9 @@ def test_directions_are_the_inverse_of_k_times_the_pixel():
 
 @pytest.mark.parametrize("focal", [1.0, 1e5])
 def test_focal_lengths_from_one_to_a_hundred_thousand_pixels_keep_their_digits(focal):
-    cam = camera(K=np.array([[focal, 0, 320.3], [0, focal, 240.7], [0, 0, 1]]), world_to_camera=np.eye(4))
+    cam = camera(
+        K=np.array([[focal, 0, 320.3], [0, focal, 240.7], [0, 0, 1]]), world_to_camera=np.eye(4)
+    )
     with mpmath.workdps(40):
         x = (mpmath.mpf(17.5) - mpmath.mpf(320.3)) / mpmath.mpf(focal)
         expected = float(x)
@@ -71,7 +75,10 @@ def test_resizing_maps_pixels_exactly_and_leaves_the_pose():
     cam = camera()
     small = cam.resize(80, 120)
     points = np.random.default_rng(2).uniform(-1, 1, (20, 3))
-    assert np.abs(small.project(points)[0] - cam.project(points)[0] * [80 / 640, 120 / 480]).max() < 1e-12
+    assert (
+        np.abs(small.project(points)[0] - cam.project(points)[0] * [80 / 640, 120 / 480]).max()
+        < 1e-12
+    )
     assert np.array_equal(small.world_to_camera, cam.world_to_camera)
 
 
@@ -101,13 +108,21 @@ def test_the_relative_pose_keeps_a_tiny_baseline_in_a_far_away_world():
 
 def test_relative_poses_chain_as_matrices_do():
     a, b = camera(), camera(world_to_camera=pose((1.2, 0.1, -0.3), (0.0, 1.0, 2.0)))
-    assert np.abs(a.relative_to(b) - a.world_to_camera @ np.linalg.inv(b.world_to_camera)).max() < 1e-12
+    assert (
+        np.abs(a.relative_to(b) - a.world_to_camera @ np.linalg.inv(b.world_to_camera)).max()
+        < 1e-12
+    )
 
 
 def test_moving_the_world_leaves_what_is_seen():
     points = np.random.default_rng(3).uniform(-1, 1, (20, 3))
     offset = np.array([10.0, -20.0, 30.0])
-    assert np.abs(camera().moved(offset).project(points + offset)[0] - camera().project(points)[0]).max() < 1e-9
+    assert (
+        np.abs(
+            camera().moved(offset).project(points + offset)[0] - camera().project(points)[0]
+        ).max()
+        < 1e-9
+    )
 
 
 def test_json_brings_back_the_same_camera_bit_for_bit():

@@ -70,9 +70,13 @@ def data(tmp_path_factory):
 
 def one_splat():
     return Gaussians(
-        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.2), torch.ones(1),
+        "2d",
+        torch.zeros(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 2), 0.2),
+        torch.ones(1),
         torch.zeros(1, 1, 3),
-    )  # fmt: skip
+    )
 
 
 def test_help_answers_at_once():
@@ -89,7 +93,8 @@ def test_help_answers_at_once():
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys, attnwarp.cli; print([m for m in ('torch', 'numba', 'numpy', 'cv2', 'scipy') if m in sys.modules])"
+        "import sys, attnwarp.cli; print([m for m in ('torch', 'numba', 'numpy', 'cv2', 'scipy') if"
+        " m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -98,9 +103,21 @@ def test_help_imports_nothing_heavy():
 def test_fit_and_render_do_what_they_say(data, tmp_path):
     out = tmp_path / "fit"
     done = call(
-        "fit", data, "--threads", 1, "--kind", "2dgs", "--out", out, "--iterations", 60, "--set", "sh_degree=0",
-        "--set", "evaluate_every=20",
-    )  # fmt: skip
+        "fit",
+        data,
+        "--threads",
+        1,
+        "--kind",
+        "2dgs",
+        "--out",
+        out,
+        "--iterations",
+        60,
+        "--set",
+        "sh_degree=0",
+        "--set",
+        "evaluate_every=20",
+    )
     assert done.returncode == 0, done.stderr
     assert "splats.ply: " in done.stdout and "held-out PSNR" in done.stdout
     assert "loss" in done.stderr and "PSNR" in done.stderr  # plain lines, as there is no terminal
@@ -116,7 +133,15 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
 
     pictures = tmp_path / "pictures"
     done = call(
-        "render", out / "splats.ply", data, "--out", pictures, "--depth", "--normal", "--background", "0.2,0.4,1"
+        "render",
+        out / "splats.ply",
+        data,
+        "--out",
+        pictures,
+        "--depth",
+        "--normal",
+        "--background",
+        "0.2,0.4,1",
     )
     assert done.returncode == 0, done.stderr
     assert len(list(pictures.iterdir())) == 27
@@ -134,21 +159,30 @@ def test_the_ply_opens_in_another_reader(data, tmp_path):
     assert done.exit_code == 0, done.stderr
     vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
     assert len(vertex) == len(read_ply(tmp_path / "splats.ply"))
-    assert {"x", "f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= {p.name for p in vertex.properties}
+    assert {"x", "f_dc_0", "f_rest_44", "opacity", "scale_2", "rot_3"} <= {
+        p.name for p in vertex.properties
+    }
 
 
 def test_the_number_of_threads_changes_no_bit(data, tmp_path):
     for count in (1, 3):
-        done = in_process("fit", data, "--out", tmp_path / str(count), "--iterations", 20, "--threads", count)
+        done = in_process(
+            "fit", data, "--out", tmp_path / str(count), "--iterations", 20, "--threads", count
+        )
         assert done.exit_code == 0, done.stderr
-    assert (tmp_path / "1" / "splats.ply").read_bytes() == (tmp_path / "3" / "splats.ply").read_bytes()
+    assert (tmp_path / "1" / "splats.ply").read_bytes() == (
+        tmp_path / "3" / "splats.ply"
+    ).read_bytes()
 
 
 def start_and_wait_for_a_checkpoint(arguments, out):
     # A background job of a shell ignores the signal, and so would what it starts.
     listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(
-        [*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=listening
+        [*ATTNWARP, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=listening,
     )
     end = time.monotonic() + 100
     while not (out / "checkpoint.pt").exists():
@@ -159,7 +193,11 @@ def start_and_wait_for_a_checkpoint(arguments, out):
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGINT, 130), (signal.SIGKILL, -9), pytest.param(signal.SIGTERM, 130, marks=pytest.mark.slow)],
+    [
+        (signal.SIGINT, 130),
+        (signal.SIGKILL, -9),
+        pytest.param(signal.SIGTERM, 130, marks=pytest.mark.slow),
+    ],
 )
 def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, number, code):
     out = tmp_path / "fit"
@@ -187,7 +225,10 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
             ["fit", "scenes/bear.yaml", "--out", "{out}"],
             "for a scene: attnwarp-eval scenes export scenes/bear.yaml DIR",
         ),
-        (["fit", "{data}/none", "--out", "{out}"], "none: no such file or folder\n"),  # no name of a scene: no hint
+        (
+            ["fit", "{data}/none", "--out", "{out}"],
+            "none: no such file or folder\n",
+        ),  # no name of a scene: no hint
         (["fit", "{data}", "--out", "{out}", "--set", "lr_mean=1"], "did you mean 'lr_means'"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim"], "expected NAME=VALUE"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim=2"], "ssim: got 2"),
@@ -196,7 +237,10 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
         (["fit", "{data}", "--out", "{out}", "--kind", "4dgs"], "4dgs"),
         (["render", "nowhere.ply", "{data}", "--out", "{out}"], "nowhere.ply: no such file"),
         (["render", "{data}/images/0.png", "{data}", "--out", "{out}"], "0.png"),
-        (["render", "{data}/sparse_pc.ply", "{data}", "--out", "{out}", "--background", "blue"], "--background"),
+        (
+            ["render", "{data}/sparse_pc.ply", "{data}", "--out", "{out}", "--background", "blue"],
+            "--background",
+        ),
     ],
 )
 def test_what_cannot_be_used_ends_in_one_clear_line_and_code_2(data, tmp_path, arguments, message):
@@ -232,14 +276,28 @@ def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
     # Once without the limit, lest it be numba's cache of compiled kernels that finds the disk full.
     assert in_process(command, *arguments, "--out", tmp_path / "warm").exit_code == 0
     done = subprocess.run(
-        [*ATTNWARP, command, *map(str, arguments), "--threads", "1", "--out", str(tmp_path / "out")],
-        capture_output=True, text=True, timeout=120, check=False,
+        [
+            *ATTNWARP,
+            command,
+            *map(str, arguments),
+            "--threads",
+            "1",
+            "--out",
+            str(tmp_path / "out"),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
-    )  # fmt: skip
+    )
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     last = done.stderr.strip().splitlines()[-1]
-    assert last.startswith(f"attnwarp: {tmp_path / 'out'}") and "File too large; check the path, the space" in last
+    assert (
+        last.startswith(f"attnwarp: {tmp_path / 'out'}")
+        and "File too large; check the path, the space" in last
+    )
     assert not list((tmp_path / "out").iterdir())  # nor is half a file left
 
 
@@ -258,7 +316,9 @@ def test_render_needs_no_points(data, tmp_path):
     alone = tmp_path / "transforms.json"
     alone.write_bytes((data / "transforms.json").read_bytes())
     assert "ply_file_path" in alone.read_text()
-    done = in_process("render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16")
+    done = in_process(
+        "render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16"
+    )
     assert done.exit_code == 0, done.stderr
 
 
@@ -269,7 +329,9 @@ def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path)
         for z, side in ((0, "left"), (1, "right"))
     ]
     write_transforms(tmp_path / "c.json", Dataset(cameras, [None, None]))
-    done = in_process("render", tmp_path / "m.ply", tmp_path / "c.json", "--out", tmp_path / "out", "--size", "16")
+    done = in_process(
+        "render", tmp_path / "m.ply", tmp_path / "c.json", "--out", tmp_path / "out", "--size", "16"
+    )
     assert done.exit_code == 0, done.stderr
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0000-a.png", "0001-a.png"]
     assert cv2.imread(str(tmp_path / "out" / "0000-a.png")).shape == (16, 16, 3)

@@ -15,7 +15,13 @@ IDENTITY = np.eye(4)
 
 
 def camera(width=8, height=4, f=10.0, cx=None, cy=None):
-    K = np.array([[f, 0, width / 2 if cx is None else cx], [0, f, height / 2 if cy is None else cy], [0, 0, 1]])
+    K = np.array(
+        [
+            [f, 0, width / 2 if cx is None else cx],
+            [0, f, height / 2 if cy is None else cy],
+            [0, 0, 1],
+        ]
+    )
     return Camera(K, IDENTITY, width, height)
 
 
@@ -53,7 +59,8 @@ def test_the_centre_of_pixel_j_is_at_j_plus_a_half():
     assert camera().pixel_centers()[3, 7].tolist() == [7.5, 3.5]
     c = correspond(camera(), camera(), np.full((4, 8), 2.0))
     assert in_bounds(c).all()
-    # A splat whose centre projects onto a pixel's centre is brightest there, and equally bright on both sides.
+    # A splat whose centre projects onto a pixel's centre is brightest there, and equally bright on
+    # both sides.
     at = camera(width=9, height=5, cx=4.5, cy=2.5)
     row = render(one_splat(), at, backend="reference").alpha[2]
     assert row.argmax() == 4
@@ -70,11 +77,15 @@ def test_depth_is_along_the_axis_and_not_along_the_ray():
     at = camera(f=4.0)
     corner = at.unproject(at.pixel_centers(), np.full((4, 8), 2.0))[0, 0]
     assert corner[2] == 2.0
-    assert np.linalg.norm(corner) == pytest.approx(2 * math.sqrt(1 + (3.5 / 4) ** 2 + (1.5 / 4) ** 2))
+    assert np.linalg.norm(corner) == pytest.approx(
+        2 * math.sqrt(1 + (3.5 / 4) ** 2 + (1.5 / 4) ** 2)
+    )
 
 
 def test_undefined_depth_is_nan():
-    seen = render(one_splat(scales=torch.tensor([[0.01, 0.01]])), camera(64, 64, f=64.0), backend="reference")
+    seen = render(
+        one_splat(scales=torch.tensor([[0.01, 0.01]])), camera(64, 64, f=64.0), backend="reference"
+    )
     assert torch.isnan(seen.depth[0, 0])
     assert not seen.valid[0, 0]
     c = correspond(camera(1, 1), camera(1, 1), np.zeros((1, 1)))
@@ -94,7 +105,8 @@ def test_quaternions_are_wxyz():
 
 
 def test_scales_are_linear_standard_deviations():
-    # One standard deviation off the centre, exp(-1/2) of the opacity; the screen filter is smaller here.
+    # One standard deviation off the centre, exp(-1/2) of the opacity; the screen filter is smaller
+    # here.
     at = camera(width=41, height=41, f=100.0, cx=20.5, cy=20.5)
     alpha = render(one_splat(scales=torch.tensor([[0.2, 0.2]])), at, backend="reference").alpha
     assert alpha[20, 20] == pytest.approx(0.9, abs=1e-6)
@@ -110,7 +122,9 @@ def test_normals_are_the_thin_axis():
 def test_harmonics_store_srgb_around_a_half():
     at = camera(width=41, height=41, f=100.0, cx=20.5, cy=20.5)
     color = render(one_splat(), at, backend="reference").color[20, 20]
-    assert torch.allclose(color, 0.9 * torch.tensor([0.25, 0.5, 0.75], dtype=color.dtype), atol=1e-6)
+    assert torch.allclose(
+        color, 0.9 * torch.tensor([0.25, 0.5, 0.75], dtype=color.dtype), atol=1e-6
+    )
 
 
 def test_features_are_channels_first_and_images_channels_last():
@@ -125,7 +139,9 @@ def test_an_origin_keeps_far_worlds_exact():
     far = one_splat(origin=np.array([1e6, -1e6, 1e6]))
     there = camera().moved((1e6, -1e6, 1e6))
     here = render(one_splat(), camera(), backend="reference").depth
-    assert torch.allclose(render(far, there, backend="reference").depth, here, rtol=0, atol=1e-6, equal_nan=True)
+    assert torch.allclose(
+        render(far, there, backend="reference").depth, here, rtol=0, atol=1e-6, equal_nan=True
+    )
 
 
 def test_masks_are_true_where_a_pixel_counts():
@@ -133,4 +149,6 @@ def test_masks_are_true_where_a_pixel_counts():
 
 
 def test_angles_are_degrees():
-    assert angle_between(torch.tensor([1.0, 0, 0]), torch.tensor([0, 2.0, 0])).item() == pytest.approx(90)
+    assert angle_between(
+        torch.tensor([1.0, 0, 0]), torch.tensor([0, 2.0, 0])
+    ).item() == pytest.approx(90)

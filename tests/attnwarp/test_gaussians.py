@@ -43,13 +43,17 @@ def test_colours_become_the_constant_harmonic():
     sh = Gaussians.sh_from_rgb(torch.tensor([[0.5, 0.0, 1.0]]))
     # Y_00 = 1 / (2 sqrt(pi))
     assert sh.shape == (1, 1, 3)
-    assert (sh[0, 0] / (2 * np.sqrt(np.pi)) + 0.5).tolist() == pytest.approx([0.5, 0.0, 1.0], abs=1e-6)
+    assert (sh[0, 0] / (2 * np.sqrt(np.pi)) + 0.5).tolist() == pytest.approx(
+        [0.5, 0.0, 1.0], abs=1e-6
+    )
 
 
 def test_far_away_means_keep_their_digits_through_the_origin():
     origin = np.array([1e6, 2e6, -3e6])
     model = splats(origin=origin)
-    assert np.array_equal(model.world_means() - origin, (model.means.numpy().astype(np.float64) + origin) - origin)
+    assert np.array_equal(
+        model.world_means() - origin, (model.means.numpy().astype(np.float64) + origin) - origin
+    )
     assert np.abs(model.world_means() - origin - model.means.numpy()).max() < 1e-9
 
 
@@ -76,10 +80,19 @@ def test_another_dtype_leaves_the_origin_in_float64():
         ({"quats": torch.ones(5, 3)}, r"quats: got shape \(5, 3\), expected \(5, 4\)"),
         ({"scales": torch.ones(5, 3)}, r"scales: got shape \(5, 3\), expected \(5, 2\)"),
         ({"sh": torch.zeros(5, 2, 3)}, "2 coefficients a channel, expected 1, 4, 9 or 16"),
-        ({"means": torch.tensor([[0, 0, 0]] * 4 + [[0, float("nan"), 0]])}, r"means: nan at index \(4, 1\)"),
-        ({"quats": torch.tensor([[1.0, 0, 0, 0]] * 3 + [[0, 0, 0, 0]] * 2)}, "zero quaternion at index 3 .2 of 5"),
+        (
+            {"means": torch.tensor([[0, 0, 0]] * 4 + [[0, float("nan"), 0]])},
+            r"means: nan at index \(4, 1\)",
+        ),
+        (
+            {"quats": torch.tensor([[1.0, 0, 0, 0]] * 3 + [[0, 0, 0, 0]] * 2)},
+            "zero quaternion at index 3 .2 of 5",
+        ),
         ({"scales": torch.tensor([[1.0, 1]] * 4 + [[1, 0]])}, "not positive at index 4"),
-        ({"opacities": torch.tensor([0.0, 1.0, 1.1, 0, 0])}, r"opacity outside \[0, 1\] at index 2"),
+        (
+            {"opacities": torch.tensor([0.0, 1.0, 1.1, 0, 0])},
+            r"opacity outside \[0, 1\] at index 2",
+        ),
         ({"means": torch.zeros(5, 3, dtype=torch.float16)}, "means: got torch.float16"),
         ({"origin": [0, 0, float("inf")]}, "origin: inf"),
     ],

@@ -23,9 +23,14 @@ def test_ssim_is_that_of_scikit_image(channels):
 
     image, target = pictures(channels=channels)
     expected = structural_similarity(
-        image.numpy(), target.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
-        channel_axis=-1, data_range=1.0,
-    )  # fmt: skip
+        image.numpy(),
+        target.numpy(),
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        channel_axis=-1,
+        data_range=1.0,
+    )
     # Both in float64; scikit-image's kernel is cut at 3.5 sigma, 11 taps as here.
     assert float(losses.ssim(image, target)) == pytest.approx(expected, abs=1e-12)
 
@@ -35,10 +40,16 @@ def test_ssim_map_is_that_of_kornia():
 
     image, target = pictures()
     expected = kornia.metrics.ssim(
-        image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], window_size=11, padding="valid", eps=0.0
+        image.permute(2, 0, 1)[None],
+        target.permute(2, 0, 1)[None],
+        window_size=11,
+        padding="valid",
+        eps=0.0,
     )
     # kornia's C1, C2 are the same; eps is what it adds to the denominator.
-    torch.testing.assert_close(losses.ssim_map(image, target), expected[0].permute(1, 2, 0), rtol=0, atol=1e-10)
+    torch.testing.assert_close(
+        losses.ssim_map(image, target), expected[0].permute(1, 2, 0), rtol=0, atol=1e-10
+    )
 
 
 def test_ssim_in_float32_keeps_five_digits():
@@ -85,7 +96,9 @@ def test_pictures_of_different_shapes_are_refused():
 
 def test_l1_is_the_mean_absolute_difference():
     image, target = pictures()
-    assert float(losses.l1(image, target)) == pytest.approx(np.abs(image.numpy() - target.numpy()).mean(), rel=1e-12)
+    assert float(losses.l1(image, target)) == pytest.approx(
+        np.abs(image.numpy() - target.numpy()).mean(), rel=1e-12
+    )
 
 
 def test_psnr_is_that_of_scikit_image_and_infinite_for_equal_pictures():
@@ -98,7 +111,9 @@ def test_psnr_is_that_of_scikit_image_and_infinite_for_equal_pictures():
 
 
 def plane(angle, size=0.12, half=12):
-    """A sheet of discs through the origin, turned by ``angle`` degrees about the y axis, that face its own normal."""
+    """A sheet of discs through the origin, turned by ``angle`` degrees about the y axis, that face
+    its own normal.
+    """
     u, v = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1))
     flat = np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], -1) * size
     a = math.radians(angle)
@@ -116,17 +131,20 @@ CAMERA = Camera.look_at([0, 0, 4], [0, 0, 0], width=24, height=24, fov_y=20, up=
 
 def test_normals_of_a_tilted_plane_agree_with_its_depth():
     view = render(plane(35), CAMERA, backend="reference")
-    # Depth by intersection is exact on a plane, so both normals are the plane's; the rest is rounding.
+    # Depth by intersection is exact on a plane, so both normals are the plane's; the rest is
+    # rounding.
     assert float(losses.normal_consistency(view)) == pytest.approx(0, abs=1e-6)
 
 
 def test_discs_turned_out_of_their_plane_cost_one_minus_the_cosine():
     sheet = plane(0)
     turned = math.radians(20)
-    sheet.quats[:] = torch.tensor([math.cos(turned / 2), math.sin(turned / 2), 0, 0], dtype=torch.float64)
+    sheet.quats[:] = torch.tensor(
+        [math.cos(turned / 2), math.sin(turned / 2), 0, 0], dtype=torch.float64
+    )
     view = render(sheet, CAMERA, backend="reference", depth="center")
-    # By centre depth the sheet is flat at z = 4 whatever way its discs are turned, so N is its true normal. 22 x 22 of
-    # the 24 x 24 pixels have one.
+    # By centre depth the sheet is flat at z = 4 whatever way its discs are turned, so N is its true
+    # normal. 22 x 22 of the 24 x 24 pixels have one.
     inner = view.alpha[1:-1, 1:-1].sum() / 24**2
     expected = float(inner) * (1 - math.cos(turned))
     assert float(losses.normal_consistency(view)) == pytest.approx(expected, rel=1e-6)
@@ -134,7 +152,9 @@ def test_discs_turned_out_of_their_plane_cost_one_minus_the_cosine():
 
 def test_normal_consistency_of_nothing_is_zero_with_zero_gradient():
     sheet = plane(0)
-    sheet.means = (sheet.means + torch.tensor([0.0, 0, 9])).requires_grad_(True)  # behind the camera
+    sheet.means = (sheet.means + torch.tensor([0.0, 0, 9])).requires_grad_(
+        True
+    )  # behind the camera
     loss = losses.normal_consistency(render(sheet, CAMERA, backend="reference"))
     loss.backward()
     assert float(loss.detach()) == 0
@@ -143,9 +163,13 @@ def test_normal_consistency_of_nothing_is_zero_with_zero_gradient():
 
 def two_discs(gap):
     return Gaussians(
-        "2d", torch.tensor([[0.0, 0, gap / 2], [0, 0, -gap / 2]]), torch.tensor([[1.0, 0, 0, 0]] * 2),
-        torch.full((2, 2), 50.0), torch.tensor([0.5, 0.8]), torch.zeros(2, 1, 3),
-    )  # fmt: skip
+        "2d",
+        torch.tensor([[0.0, 0, gap / 2], [0, 0, -gap / 2]]),
+        torch.tensor([[1.0, 0, 0, 0]] * 2),
+        torch.full((2, 2), 50.0),
+        torch.tensor([0.5, 0.8]),
+        torch.zeros(2, 1, 3),
+    )
 
 
 def test_distortion_of_two_sheets_is_the_closed_form_in_both_forms():
@@ -154,10 +178,14 @@ def test_distortion_of_two_sheets_is_the_closed_form_in_both_forms():
     w1, w2, z1, z2 = 0.5, 0.5 * 0.8, 4 - gap / 2, 4 + gap / 2
     # Discs of sigma 50 are constant across the picture to 1e-4.
     assert float(losses.depth_distortion(view)) == pytest.approx(2 * w1 * w2 * gap, rel=1e-3)
-    assert float(losses.depth_distortion(view, scale=5.0)) == pytest.approx(2 * w1 * w2 * gap / 5, rel=1e-3)
+    assert float(losses.depth_distortion(view, scale=5.0)) == pytest.approx(
+        2 * w1 * w2 * gap / 5, rel=1e-3
+    )
     near, far = 0.2, 100.0
     m1, m2 = (far / (far - near) * (1 - near / z) for z in (z1, z2))
-    assert float(losses.depth_distortion(view, "l2_ndc")) == pytest.approx(w1 * w2 * (m1 - m2) ** 2, rel=1e-3)
+    assert float(losses.depth_distortion(view, "l2_ndc")) == pytest.approx(
+        w1 * w2 * (m1 - m2) ** 2, rel=1e-3
+    )
 
 
 def test_an_unknown_form_of_distortion_is_refused():

@@ -55,7 +55,8 @@ def test_the_oldest_files_go_when_the_folder_is_over_its_limit(tmp_path, monkeyp
     assert cache.usage() == {"kind": (3, 3 * size)}
     assert cache.trim(2 * size) == size
     assert {p.stem for p in (tmp_path / "kind").glob("*.npz")} == {"new", "middle"}
-    # A limit below one file still keeps nothing half-written: the write itself succeeds, then everything goes.
+    # A limit below one file still keeps nothing half-written: the write itself succeeds, then
+    # everything goes.
     monkeypatch.setenv("ATTNWARP_CACHE_GB", "0")
     cache.write_arrays("kind", "last", {"x": np.zeros(10)})
     assert cache.usage() == {}
@@ -103,7 +104,9 @@ def test_the_command_line_tells_what_lies_in_the_cache_and_removes_it(tmp_path, 
             path.write_bytes(bytes(1_500_000))
     told = runner.invoke(app, ["cache", "info"])
     assert told.exit_code == 0 and str(tmp_path) in told.stdout.replace("\n", "")
-    assert re.search(r"meshes +1 files +1\.5 MB", told.stdout) and re.search(r"pictures +2 files +3\.0 MB", told.stdout)
+    assert re.search(r"meshes +1 files +1\.5 MB", told.stdout) and re.search(
+        r"pictures +2 files +3\.0 MB", told.stdout
+    )
     assert re.search(r"all +3 files +4\.5 MB", told.stdout)
     cleared = runner.invoke(app, ["cache", "clear"])
     assert cleared.exit_code == 0 and "4.5 MB removed" in cleared.stdout

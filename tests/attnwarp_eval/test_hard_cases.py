@@ -1,4 +1,6 @@
-"""Hard cases of docs: views and meshes that break truth where it is computed carelessly. The numbers are the cases'."""
+"""Hard cases of docs: views and meshes that break truth where it is computed carelessly. The
+numbers are the cases'.
+"""
 
 import ast
 import re
@@ -16,7 +18,11 @@ from attnwarp_eval.splats.surface import surface_splats
 from attnwarp_eval.truth import AMBIGUOUS, Geometry, appearance, two_view
 
 GROUND = Rectangle(np.zeros(3), np.array([50.0, 0, 0]), np.array([0, 50.0, 0]))
-WORLD = [GROUND, Sphere(np.array([0, 0.8, 0.6]), 0.6), Box(np.array([0, -0.9, 0.4]), np.full(3, 0.4))]
+WORLD = [
+    GROUND,
+    Sphere(np.array([0, 0.8, 0.6]), 0.6),
+    Box(np.array([0, -0.9, 0.4]), np.full(3, 0.4)),
+]
 
 
 def camera(position=(3.0, 0.2, 1.5), look_at=(0, 0, 0.4), K=None, width=32, height=32):
@@ -61,7 +67,9 @@ def test_any_intrinsics_see_the_plane_where_it_is_and_nothing_wraps(K):
     hits = Geometry([GROUND]).trace(target)
     depth, point = on_the_ground(target)
     seen = hits.valid
-    assert seen.sum() > 100 and np.array_equal(seen, (depth > 0) & (np.abs(point[..., :2]) <= 50).all(-1))
+    assert seen.sum() > 100 and np.array_equal(
+        seen, (depth > 0) & (np.abs(point[..., :2]) <= 50).all(-1)
+    )
     assert np.abs(hits.depth / depth - 1)[seen].max() < 1e-9
     assert np.abs(hits.point - point)[seen].max() < 1e-6
 
@@ -82,20 +90,28 @@ def test_case_7_a_tiny_baseline_keeps_its_digits():
     pair = two_view(Geometry([GROUND]), source, target)
     assert pair.hits.valid[20, 10]
     mpmath.mp.dps = 40
-    K, S, T = (mpmath.matrix(m.tolist()) for m in (source.K, source.world_to_camera, target.world_to_camera))
+    K, S, T = (
+        mpmath.matrix(m.tolist())
+        for m in (source.K, source.world_to_camera, target.world_to_camera)
+    )
     eye = T**-1
     ray = eye[:3, :3] * (K**-1 * mpmath.matrix([10.5, 20.5, 1]))
     t = -eye[2, 3] / ray[2]
     point = mpmath.matrix([eye[k, 3] + t * ray[k] for k in range(3)] + [1])
     p = K * (S * point)[:3]
     exact = np.array([float(p[0] / p[2]), float(p[1] / p[2])])
-    # The case asks for 1e-3 px; the shift itself is about 1e-8 px and float64 positions of 30 px hold 1e-14.
+    # The case asks for 1e-3 px; the shift itself is about 1e-8 px and float64 positions of 30 px
+    # hold 1e-14.
     assert np.abs(pair.xy[20, 10] - exact).max() < 1e-10
     assert (pair.visible | (pair.label == AMBIGUOUS))[pair.hits.valid & pair.in_source_image].all()
 
 
-@pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e2), (1.0, 1e4), (1.0, 1e6)])
-def test_cases_9_and_10_scales_from_1e_4_to_1e5_and_offsets_to_1e6_give_the_same_labels(scale, offset):
+@pytest.mark.parametrize(
+    ("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e2), (1.0, 1e4), (1.0, 1e6)]
+)
+def test_cases_9_and_10_scales_from_1e_4_to_1e5_and_offsets_to_1e6_give_the_same_labels(
+    scale, offset
+):
     shift = offset * np.array([1.0, -1.0, 0.5])
     views = [camera(), camera((1.5, 2.5, 1.2))]
     moved = []
@@ -131,9 +147,25 @@ cameras: {look_at: [0, 0, 0.6], radius: 3, size: [64, 64], source: {yaw: 0, heig
 
 def figure():
     parts = [
-        {"type": "ellipsoid", "center": [0, 0, 0.55], "radii": [0.4, 0.45, 0.5], "color": "#c08040"},
-        {"type": "ellipsoid", "center": [0.1, 0, 1.15], "radii": [0.3, 0.32, 0.28], "color": "#e0b070"},
-        {"type": "capsule", "start": [0.1, 0.3, 0.9], "end": [0.5, 0.5, 0.6], "radii": [0.12, 0.1], "mirror": True},
+        {
+            "type": "ellipsoid",
+            "center": [0, 0, 0.55],
+            "radii": [0.4, 0.45, 0.5],
+            "color": "#c08040",
+        },
+        {
+            "type": "ellipsoid",
+            "center": [0.1, 0, 1.15],
+            "radii": [0.3, 0.32, 0.28],
+            "color": "#e0b070",
+        },
+        {
+            "type": "capsule",
+            "start": [0.1, 0.3, 0.9],
+            "end": [0.5, 0.5, 0.6],
+            "radii": [0.12, 0.1],
+            "mirror": True,
+        },
     ]
     return BodySpec.model_validate({"type": "body", "parts": parts, "resolution": 48}).mesh()
 
@@ -141,13 +173,21 @@ def figure():
 def write_scan(folder, mesh):
     """As scanners write: float32, vertex colours, faces of any kind."""
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
-    head += [f"property float {c}" for c in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
-    head += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    head += [f"property float {c}" for c in "xyz"] + [
+        f"property uchar {c}" for c in ("red", "green", "blue")
+    ]
+    head += [
+        f"element face {len(mesh.faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
     vertices = np.zeros(len(mesh.vertices), dtype=[("p", "<f4", 3), ("c", "u1", 3)])
     vertices["p"], vertices["c"] = mesh.vertices, np.clip(255 * mesh.tint, 0, 255)
     faces = np.zeros(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     faces["n"], faces["v"] = 3, mesh.faces
-    (folder / "figure.ply").write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
+    (folder / "figure.ply").write_bytes(
+        "\n".join(head).encode() + vertices.tobytes() + faces.tobytes()
+    )
     (folder / "scan.yaml").write_text(SCAN)
     return folder / "scan.yaml"
 
@@ -160,16 +200,21 @@ def test_a_scan_with_a_hole_doubled_faces_and_a_sliver_goes_through_the_whole_ch
     middle = whole.vertices[whole.faces].mean(1)
     hole = np.linalg.norm(middle - [0.3, 0.2, 0.75], axis=-1) < 0.12
     assert 10 < hole.sum() < 0.1 * len(hole)
-    faces = np.concatenate([whole.faces[~hole], whole.faces[~hole][:200], [[5, 5, 9]]])  # doubled; no area
+    faces = np.concatenate(
+        [whole.faces[~hole], whole.faces[~hole][:200], [[5, 5, 9]]]
+    )  # doubled; no area
     path = write_scan(tmp_path / "torn", Mesh(whole.vertices, faces, None, whole.tint))
-    with pytest.warns(MeshNotice, match=r"figure.ply: dropped 1 of \d+ triangles without area \(first: face \d+\)"):
+    with pytest.warns(
+        MeshNotice, match=r"figure.ply: dropped 1 of \d+ triangles without area \(first: face \d+\)"
+    ):
         torn = load_scene(path)
     with pytest.warns(MeshNotice):
         geometry = Geometry(torn)
     before = Geometry(clean)
     assert torn.content_hash != clean.content_hash
     rays = before.trace(clean.source), geometry.trace(clean.source)
-    # Where the first hit is on the torn mesh as on the whole one, all is as before; through the hole one sees deeper.
+    # Where the first hit is on the torn mesh as on the whole one, all is as before; through the
+    # hole one sees deeper.
     same = np.isclose(rays[0].depth, rays[1].depth, rtol=1e-9, equal_nan=True)
     assert same.mean() > 0.97 and not same.all()
     assert (rays[1].depth > rays[0].depth)[~same & rays[1].valid].all()
@@ -183,7 +228,9 @@ def test_a_scan_with_a_hole_doubled_faces_and_a_sliver_goes_through_the_whole_ch
 
 
 def nearest(vertices, faces, origin, rays):
-    """First hits of rays with triangles by Moller and Trumbore's formula, in float64, one triangle at a time."""
+    """First hits of rays with triangles by Moller and Trumbore's formula, in float64, one triangle
+    at a time.
+    """
     best = np.full(len(rays), np.inf)
     for a, b, c in vertices[faces]:
         p = np.cross(rays, c - a)
@@ -198,7 +245,8 @@ def nearest(vertices, faces, origin, rays):
 
 
 def test_somebody_elses_open_mesh_is_hit_where_float64_brute_force_hits_it(tmp_path):
-    # A model that comes with PyVista: 223 edges without a second face, one with three, units of its own.
+    # A model that comes with PyVista: 223 edges without a second face, one with three, units of its
+    # own.
     from pyvista import examples
 
     (tmp_path / "figure.ply").write_bytes(Path(examples.planefile).read_bytes())
@@ -219,12 +267,18 @@ def test_somebody_elses_open_mesh_is_hit_where_float64_brute_force_hits_it(tmp_p
 
 def test_the_table_of_hard_cases_has_all_forty_and_names_tests_that_there_are():
     root = Path(__file__).parents[2]
-    rows = re.findall(r"^\| (\d+) \| [^|]+ \| (.+) \|$", (root / "docs/hard-cases.md").read_text("utf-8"), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (\d+) \| [^|]+ \| (.+) \|$",
+        (root / "docs/hard-cases.md").read_text("utf-8"),
+        re.MULTILINE,
+    )
     assert [int(number) for number, _ in rows] == list(range(1, 41))
     for number, held in rows:
         for file, names in (part.split(": ", 1) for part in held.split("; ")):
             defined = {
-                n.name for n in ast.parse((root / file).read_text("utf-8")).body if isinstance(n, ast.FunctionDef)
+                n.name
+                for n in ast.parse((root / file).read_text("utf-8")).body
+                if isinstance(n, ast.FunctionDef)
             }
             named = set(re.findall(r"`(test_\w+)`", names))
             assert named and named <= defined, f"case {number}: {file} has no {named - defined}"

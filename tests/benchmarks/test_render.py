@@ -20,7 +20,9 @@ def test_fit_agrees_with_scipy_in_factors_and_intervals() -> None:
     x, z, y = _cases()
     found = bench.fit({"x": x.tolist(), "z": z.tolist()}, y.tolist())
     assert found is not None
-    factors, covariance = optimize.curve_fit(lambda d, a, b: a * d[0] + b * d[1], np.stack([x, z]), y, sigma=y)
+    factors, covariance = optimize.curve_fit(
+        lambda d, a, b: a * d[0] + b * d[1], np.stack([x, z]), y, sigma=y
+    )
     reach = stats.t.ppf(0.975, 28) * np.sqrt(np.diag(covariance))
     for name, factor, r in zip("xz", factors, reach, strict=True):
         assert found[name] == pytest.approx([factor, factor - r, factor + r], rel=1e-4)
@@ -38,12 +40,19 @@ def test_fit_refuses_what_cases_do_not_determine() -> None:
 
 def test_a_small_run_ends_in_a_table() -> None:
     sizes = [(16, 40), (16, 80), (32, 40), (32, 160), (48, 100)]
-    result = bench.run([bench.Case("2d", size, count, 0.1) for size, count in sizes], rounds=1, gsplat=0)
+    result = bench.run(
+        [bench.Case("2d", size, count, 0.1) for size, count in sizes], rounds=1, gsplat=0
+    )
     assert [row["splats"] for row in result["cases"]] == [count for _, count in sizes]
     for row in result["cases"]:
         assert 0 < row["contributing"] <= row["composited"] <= row["pairs"]
         assert row["fma_share"] == pytest.approx(
-            45e-9 * row["pairs"] / row["forward_cpu_ms"] * 1e3 / result["fma_peak_gflops_per_thread"], rel=0.9
+            45e-9
+            * row["pairs"]
+            / row["forward_cpu_ms"]
+            * 1e3
+            / result["fma_peak_gflops_per_thread"],
+            rel=0.9,
         )
         assert 0 < row["forward_bytes"] < row["forward_backward_bytes"]
     text = bench.table(result)
@@ -52,7 +61,7 @@ def test_a_small_run_ends_in_a_table() -> None:
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 def test_hardly_a_pair_is_computed_where_a_splat_does_not_show(kind) -> None:
-    """Squares are listed by exact outlines: few splats are worked on at 16 pixels and drawn to none of them. (That none
-    is left out is what the comparisons with the reference show.)"""
+    """Squares are listed by exact outlines: few splats are worked on at 16 pixels and drawn to none
+    of them. (That none is left out is what the comparisons with the reference show.)"""
     counters = render(bench.scene(kind, 500, 0.1), bench.camera(128), backend="cpu").counters
     assert counters["composited"] <= counters["pairs"] <= 1.05 * counters["composited"]

@@ -4,7 +4,11 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 
 PLAIN = {"type": "plain", "color": "#c0b090"}
-FLOOR = {"name": "floor", "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [6, 6]}, "texture": PLAIN}
+FLOOR = {
+    "name": "floor",
+    "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [6, 6]},
+    "texture": PLAIN,
+}
 WALL = {
     "name": "wall",
     "shape": {"type": "rectangle", "center": [-1.5, 0, 1], "size": [6, 4], "facing": [1, 0, 0]},
@@ -30,9 +34,12 @@ def ball(material=None, center=(0, 0, 0.7), radius=0.6, name="ball"):
 
 def make(objects, lights, bounces=1, spp=16, size=32, **rest):
     cameras = {
-        "look_at": [0, 0, 0.4], "radius": 3, "size": [size, size], "source": {"yaw": 10, "height": 2.0},
+        "look_at": [0, 0, 0.4],
+        "radius": 3,
+        "size": [size, size],
+        "source": {"yaw": 10, "height": 2.0},
         "targets": [{"yaw": 60, "height": 1.5}],
-    } | rest.pop("cameras", {})  # fmt: skip
+    } | rest.pop("cameras", {})
     said = {
         "name": "test", "title": "t", "objects": objects, "lights": lights, "cameras": cameras,
         "appearance": {"bounces": bounces, "spp": spp},
@@ -50,10 +57,14 @@ SCENES = {
     "refraction": lambda: make([FLOOR, WALL, ball(GLASS)], [SKY], 8),
     "medium": lambda: make([FLOOR, ball()], [SKY], 4, medium={"sigma_t": 0.4, "albedo": 0.8}),
     "subsurface": lambda: make(
-        [FLOOR, ball(GLASS | {"interior": {"sigma_t": 4.0, "albedo": 0.9, "tint": "#ffc080"}})], [SKY], 16
+        [FLOOR, ball(GLASS | {"interior": {"sigma_t": 4.0, "albedo": 0.9, "tint": "#ffc080"}})],
+        [SKY],
+        16,
     ),
     "caustics": lambda: make([FLOOR, ball(GLASS)], [POINT], 8),
     "environment": lambda: make([FLOOR, ball()], [SUN, SKY]),
-    "depth_of_field": lambda: make([FLOOR, WALL, ball()], [SUN], cameras={"lens": {"aperture": 0.3, "focus": 2.0}}),
+    "depth_of_field": lambda: make(
+        [FLOOR, WALL, ball()], [SUN], cameras={"lens": {"aperture": 0.3, "focus": 2.0}}
+    ),
 }
 """Effect -> a scene that needs it. "diffuse" needs none that a plan could leave out but its sky."""

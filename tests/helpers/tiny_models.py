@@ -23,12 +23,26 @@ IMAGENET_MEAN, IMAGENET_STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 
 
 def tokens():
-    """Every byte, alone and at a word's end, one merged word, and the two marks at the end, as in CLIP's own."""
+    """Every byte, alone and at a word's end, one merged word, and the two marks at the end, as in
+    CLIP's own.
+    """
     from tokenizers.pre_tokenizers import ByteLevel
 
     letters = sorted(ByteLevel.alphabet())
-    known = [*letters, *(f"{c}</w>" for c in letters), "be", "ar</w>", "bear</w>", "<|startoftext|>", "<|endoftext|>"]
-    return {token: i for i, token in enumerate(known)}, [("b", "e"), ("a", "r</w>"), ("be", "ar</w>")]
+    known = [
+        *letters,
+        *(f"{c}</w>" for c in letters),
+        "be",
+        "ar</w>",
+        "bear</w>",
+        "<|startoftext|>",
+        "<|endoftext|>",
+    ]
+    return {token: i for i, token in enumerate(known)}, [
+        ("b", "e"),
+        ("a", "r</w>"),
+        ("be", "ar</w>"),
+    ]
 
 
 def tokenizer():
@@ -37,10 +51,17 @@ def tokenizer():
 
 
 def save_clip(folder, *, seed=0, side=32, length=24, **processor):
-    """A CLIP of 2 + 2 layers; the model, its processor and its tokenizer, all as transformers has them."""
+    """A CLIP of 2 + 2 layers; the model, its processor and its tokenizer, all as transformers has
+    them.
+    """
     vocab, _ = tokens()
     torch.manual_seed(seed)
-    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    layers = {
+        "hidden_size": 32,
+        "intermediate_size": 64,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+    }
     last = len(vocab) - 1
     model = CLIPModel(
         CLIPConfig(
@@ -53,7 +74,9 @@ def save_clip(folder, *, seed=0, side=32, length=24, **processor):
         )
     ).eval()  # fmt: skip
     square = {"height": side, "width": side}
-    pictures = CLIPImageProcessorPil(**{"size": {"shortest_edge": side}, "crop_size": square, **processor})
+    pictures = CLIPImageProcessorPil(
+        **{"size": {"shortest_edge": side}, "crop_size": square, **processor}
+    )
     words = tokenizer()
     for part in (model, pictures, words):
         part.save_pretrained(folder)
@@ -61,30 +84,47 @@ def save_clip(folder, *, seed=0, side=32, length=24, **processor):
 
 
 def save_dino(folder, *, registers, seed=0):
-    """A DINOv2 of 2 layers for 28 px, seen at 42 px, so that its positions are interpolated as the real one's are."""
+    """A DINOv2 of 2 layers for 28 px, seen at 42 px, so that its positions are interpolated as the
+    real one's are.
+    """
     torch.manual_seed(seed)
     said = {"hidden_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2, "mlp_ratio": 2}
     said |= {"image_size": 28, "patch_size": 14}
     if registers:
-        model = Dinov2WithRegistersModel(Dinov2WithRegistersConfig(**said, num_register_tokens=4)).eval()
+        model = Dinov2WithRegistersModel(
+            Dinov2WithRegistersConfig(**said, num_register_tokens=4)
+        ).eval()
     else:
         model = Dinov2Model(Dinov2Config(**said)).eval()
-    with torch.no_grad():  # layer scale starts at 1 and class tokens at nearly 0: all pictures would look alike
+    with (
+        torch.no_grad()
+    ):  # layer scale starts at 1 and class tokens at nearly 0: all pictures would look alike
         for parameter in model.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
     model.save_pretrained(folder)
     # What the published folders hold, which the saver here would name otherwise.
     processor = {
-        "crop_size": {"height": 42, "width": 42}, "do_center_crop": True, "do_convert_rgb": True, "do_normalize": True,
-        "do_rescale": True, "do_resize": True, "image_mean": IMAGENET_MEAN, "image_processor_type": "BitImageProcessor",
-        "image_std": IMAGENET_STD, "resample": 3, "rescale_factor": 0.00392156862745098, "size": {"shortest_edge": 48},
-    }  # fmt: skip
+        "crop_size": {"height": 42, "width": 42},
+        "do_center_crop": True,
+        "do_convert_rgb": True,
+        "do_normalize": True,
+        "do_rescale": True,
+        "do_resize": True,
+        "image_mean": IMAGENET_MEAN,
+        "image_processor_type": "BitImageProcessor",
+        "image_std": IMAGENET_STD,
+        "resample": 3,
+        "rescale_factor": 0.00392156862745098,
+        "size": {"shortest_edge": 48},
+    }
     (folder / "preprocessor_config.json").write_text(json.dumps(processor))
     return model, processor
 
 
 class _Fire(nn.Module):
-    """SqueezeNet's block, put together from the paper and torchvision's names, for the oracle alone."""
+    """SqueezeNet's block, put together from the paper and torchvision's names, for the oracle
+    alone.
+    """
 
     def __init__(self, inputs, narrow, wide):
         super().__init__()
@@ -98,7 +138,11 @@ class _Fire(nn.Module):
     def forward(self, x):
         x = self.squeeze_activation(self.squeeze(x))
         return torch.cat(
-            [self.expand1x1_activation(self.expand1x1(x)), self.expand3x3_activation(self.expand3x3(x))], 1
+            [
+                self.expand1x1_activation(self.expand1x1(x)),
+                self.expand3x3_activation(self.expand3x3(x)),
+            ],
+            1,
         )
 
 
@@ -107,14 +151,42 @@ def torchvision_features(name):
     C, R = nn.Conv2d, nn.ReLU
     if name == "alexnet":
         return nn.Sequential(
-            C(3, 64, kernel_size=11, stride=4, padding=2), R(), nn.MaxPool2d(kernel_size=3, stride=2),
-            C(64, 192, kernel_size=5, padding=2), R(), nn.MaxPool2d(kernel_size=3, stride=2),
-            C(192, 384, kernel_size=3, padding=1), R(), C(384, 256, kernel_size=3, padding=1), R(),
-            C(256, 256, kernel_size=3, padding=1), R(), nn.MaxPool2d(kernel_size=3, stride=2),
-        )  # fmt: skip
+            C(3, 64, kernel_size=11, stride=4, padding=2),
+            R(),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+            C(64, 192, kernel_size=5, padding=2),
+            R(),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+            C(192, 384, kernel_size=3, padding=1),
+            R(),
+            C(384, 256, kernel_size=3, padding=1),
+            R(),
+            C(256, 256, kernel_size=3, padding=1),
+            R(),
+            nn.MaxPool2d(kernel_size=3, stride=2),
+        )
     if name == "vgg16":
         layers, inputs = [], 3
-        for v in [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M"]:
+        for v in [
+            64,
+            64,
+            "M",
+            128,
+            128,
+            "M",
+            256,
+            256,
+            256,
+            "M",
+            512,
+            512,
+            512,
+            "M",
+            512,
+            512,
+            512,
+            "M",
+        ]:
             if v == "M":
                 layers.append(nn.MaxPool2d(kernel_size=2, stride=2))
             else:
@@ -122,11 +194,20 @@ def torchvision_features(name):
                 inputs = v
         return nn.Sequential(*layers)
     return nn.Sequential(
-        C(3, 64, kernel_size=3, stride=2), R(), nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(64, 16, 64), _Fire(128, 16, 64), nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(128, 32, 128), _Fire(256, 32, 128), nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
-        _Fire(256, 48, 192), _Fire(384, 48, 192), _Fire(384, 64, 256), _Fire(512, 64, 256),
-    )  # fmt: skip
+        C(3, 64, kernel_size=3, stride=2),
+        R(),
+        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
+        _Fire(64, 16, 64),
+        _Fire(128, 16, 64),
+        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
+        _Fire(128, 32, 128),
+        _Fire(256, 32, 128),
+        nn.MaxPool2d(kernel_size=3, stride=2, ceil_mode=True),
+        _Fire(256, 48, 192),
+        _Fire(384, 48, 192),
+        _Fire(384, 64, 256),
+        _Fire(512, 64, 256),
+    )
 
 
 TORCHVISION = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}

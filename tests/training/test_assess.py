@@ -1,4 +1,6 @@
-"""The questions of the model cards, put to encoders whose answers are known: perfect, blind, random, made by hand."""
+"""The questions of the model cards, put to encoders whose answers are known: perfect, blind,
+random, made by hand.
+"""
 
 import re
 from types import SimpleNamespace
@@ -17,12 +19,15 @@ SETS = ("test", "test-new-pairs", "test-rendered")
 
 
 def chance_like(value, count, chance):
-    """Whether a share of answers can come from guessing: within the 99.99 % interval of the binomial distribution."""
+    """Whether a share of answers can come from guessing: within the 99.99 % interval of the
+    binomial distribution.
+    """
     low, high = binom.ppf([5e-5, 1 - 5e-5], count, chance)
     return low <= round(value * count) <= high
 
 
-# figure --------------------------------------------------------------------------------------------------------------
+# figure
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_balanced_figure_has_the_interval_of_the_central_limit():
@@ -44,13 +49,16 @@ def test_answers_of_one_world_count_as_one_in_the_interval():
     alone = figure("?", right, np.arange(200))
     together = figure("?", np.repeat(right, 9), np.repeat(np.arange(200), 9))
     assert together.value == alone.value
-    # Nine times the same answer is no more evidence; taken as independent the interval would be a third as wide.
+    # Nine times the same answer is no more evidence; taken as independent the interval would be a
+    # third as wide.
     assert together.high - together.low == pytest.approx(alone.high - alone.low, rel=1e-9)
 
 
 def test_an_unbalanced_figure_is_that_of_a_bootstrap_written_out():
     random = np.random.default_rng(2)
-    groups = [list(random.uniform(size=int(random.integers(1, 12))) < random.uniform()) for _ in range(40)]
+    groups = [
+        list(random.uniform(size=int(random.integers(1, 12))) < random.uniform()) for _ in range(40)
+    ]
     means = []
     for _ in range(4000):
         drawn = [answer for _ in groups for answer in groups[int(random.integers(len(groups)))]]
@@ -64,24 +72,33 @@ def test_an_unbalanced_figure_is_that_of_a_bootstrap_written_out():
 
 
 def test_a_figure_of_nothing_is_refused():
-    with pytest.raises(ValueError, match="the colour: got 0 answers and 0 worlds, expected one world for each"):
+    with pytest.raises(
+        ValueError, match="the colour: got 0 answers and 0 worlds, expected one world for each"
+    ):
         figure("the colour", [], [])
 
 
-# clip-small ----------------------------------------------------------------------------------------------------------
+# clip-small
+# --------------------------------------------------------------------------------------------------
 
 
 def any_attributes(random, thing):
     finish = int(random.integers(len(FINISHES)))
     one, two = (int(c) for c in random.choice(len(COLORS), 2, replace=False))
     return (
-        thing, finish, one if FINISHES[finish] in COLORED else -1, two if FINISHES[finish] in TWO_COLORED else -1,
-        int(random.integers(len(GROUNDS))), int(random.integers(len(TIMES))),
-    )  # fmt: skip
+        thing,
+        finish,
+        one if FINISHES[finish] in COLORED else -1,
+        two if FINISHES[finish] in TWO_COLORED else -1,
+        int(random.integers(len(GROUNDS))),
+        int(random.integers(len(TIMES))),
+    )
 
 
 def numbered(name, count=100, views=2, looks=3):
-    """Pictures that show nothing but the number of their set and row, for encoders that know the rest."""
+    """Pictures that show nothing but the number of their set and row, for encoders that know the
+    rest.
+    """
     random = np.random.default_rng([7, SETS.index(name) if name in SETS else 9])
     rows = []
     for world in range(count):
@@ -93,13 +110,18 @@ def numbered(name, count=100, views=2, looks=3):
         rows += [(said[look], world, view, look) for view in range(views) for look in range(looks)]
     images = np.zeros((len(rows), 2, 2, 3), np.uint8)
     images[..., 0] = SETS.index(name) if name in SETS else 9
-    images[..., 1], images[..., 2] = (part[:, None, None] for part in np.divmod(np.arange(len(rows)), 256))
+    images[..., 1], images[..., 2] = (
+        part[:, None, None] for part in np.divmod(np.arange(len(rows)), 256)
+    )
     said, world, view, look = (np.array(column) for column in zip(*rows, strict=True))
     return Pictures(images, said, world, view, look)
 
 
 def three_sets():
-    return {name: numbered(name, **({"views": 1, "looks": 1} if name == "test-rendered" else {})) for name in SETS}
+    return {
+        name: numbered(name, **({"views": 1, "looks": 1} if name == "test-rendered" else {}))
+        for name in SETS
+    }
 
 
 def number(image):
@@ -116,7 +138,11 @@ WORDS = {
     **{f: ("finish", f) for f in FINISHES if f != "plain"},
     **{f: ("finish", "shiny") for f in ("glossy", "plastic", "polished")},
     **{"gold": ("finish", "golden"), "steel": ("finish", "silver"), "chrome": ("finish", "silver")},
-    **{"copper": ("finish", "bronze"), "white marble": ("finish", "marble"), "chequered": ("finish", "checked")},
+    **{
+        "copper": ("finish", "bronze"),
+        "white marble": ("finish", "marble"),
+        "chequered": ("finish", "checked"),
+    },
 }
 READ = re.compile(r"\b(" + "|".join(sorted(WORDS, key=len, reverse=True)) + r")\b")
 PLACE = {
@@ -124,11 +150,15 @@ PLACE = {
     for k, (kind, word) in enumerate(
         (kind, word)
         for kind, words in (
-            ("object", OBJECTS), ("finish", FINISHES), ("color", COLORS), ("ground", GROUNDS), ("time", TIMES),
+            ("object", OBJECTS),
+            ("finish", FINISHES),
+            ("color", COLORS),
+            ("ground", GROUNDS),
+            ("time", TIMES),
         )
         for word in words
     )
-}  # fmt: skip
+}
 
 
 def vector(meanings):
@@ -150,7 +180,9 @@ class Knowing:
         thing, finish, color, second, ground, time = self.sets[SETS[kind]].attributes[row]
         shown = {("object", OBJECTS[thing]), ("ground", GROUNDS[ground]), ("time", TIMES[time])}
         shown |= {("color", COLORS[c]) for c in (color, second) if c >= 0}
-        return vector(shown | ({("finish", FINISHES[finish])} if FINISHES[finish] != "plain" else set()))
+        return vector(
+            shown | ({("finish", FINISHES[finish])} if FINISHES[finish] != "plain" else set())
+        )
 
     def texts(self, texts):
         return np.array([vector({WORDS[found] for found in READ.findall(text)}) for text in texts])
@@ -163,7 +195,9 @@ class Guessing(Knowing):
         return np.random.default_rng([1, kind, row]).normal(size=32)
 
     def texts(self, texts):
-        return np.array([np.random.default_rng([2, *text.encode()]).normal(size=32) for text in texts])
+        return np.array(
+            [np.random.default_rng([2, *text.encode()]).normal(size=32) for text in texts]
+        )
 
 
 class Blind(Knowing):
@@ -188,7 +222,10 @@ def test_who_knows_everything_has_every_answer_of_clip_right(sets):
     titles = ("new shapes", "new pairs of colour and object", "path-traced")
     asked = {f"name the {part}, {title}" for part in parts for title in titles}
     asked |= {f"the caption among 64, {title}" for title in titles}
-    asked |= {"the edit among 8, by directional similarity", "the same name for two views of a thing"}
+    asked |= {
+        "the edit among 8, by directional similarity",
+        "the same name for two views of a thing",
+    }
     assert set(found) == asked
     assert found["name the object, new shapes"].count == len(sets["test"])
     assert found["the caption among 64, new shapes"].count == 100
@@ -210,7 +247,9 @@ def test_one_answer_spoilt_is_one_answer_missed(sets):
         def one(self, kind, row):
             if (kind, row) != (0, 17):
                 return super().one(kind, row)
-            return vector({("object", "snowman" if self.sets["test"].attributes[row, 0] == 0 else OBJECTS[0])})
+            return vector(
+                {("object", "snowman" if self.sets["test"].attributes[row, 0] == 0 else OBJECTS[0])}
+            )
 
     found = {f.what: f for f in assess.clip_figures(Once(sets), sets)}
     assert found["name the object, new shapes"].value == pytest.approx(1 - 1 / len(sets["test"]))
@@ -221,7 +260,9 @@ def test_a_caption_that_is_true_too_is_no_error(sets):
     rows = np.flatnonzero((sets["test"].view == 0) & (sets["test"].look == 0))
     shown = sets["test"].attributes.copy()
     shown[rows] = shown[rows[0]]
-    alike = Pictures(sets["test"].images, shown, sets["test"].world, sets["test"].view, sets["test"].look)
+    alike = Pictures(
+        sets["test"].images, shown, sets["test"].world, sets["test"].view, sets["test"].look
+    )
     found = assess._retrieval(Blind(sets), np.ones((len(shown), 32)), alike, "?")
     assert found.value == 1
 
@@ -231,13 +272,20 @@ def test_two_views_of_a_thing_share_a_name_as_often_as_counted_by_hand(sets):
     names = pictures.attributes[:, 0].copy()
     turned = (pictures.view == 1) & (pictures.world % 4 == 0)
     names[turned] = (names[turned] + 1) % len(OBJECTS)
-    found = assess._viewpoint(np.eye(len(OBJECTS))[names], pictures, {"object": np.eye(len(OBJECTS))})
+    found = assess._viewpoint(
+        np.eye(len(OBJECTS))[names], pictures, {"object": np.eye(len(OBJECTS))}
+    )
     assert (found.value, found.count) == (0.75, 300)
 
 
 def test_a_change_that_is_not_in_the_picture_is_not_asked(sets):
     pictures = sets["test"]
-    index = {(w, v, k): i for i, (w, v, k) in enumerate(zip(pictures.world, pictures.view, pictures.look, strict=True))}
+    index = {
+        (w, v, k): i
+        for i, (w, v, k) in enumerate(
+            zip(pictures.world, pictures.view, pictures.look, strict=True)
+        )
+    }
     images = pictures.images.copy()
     for world in range(30):
         images[index[world, 0, 1]] = images[index[world, 0, 0]]
@@ -248,7 +296,8 @@ def test_a_change_that_is_not_in_the_picture_is_not_asked(sets):
     assert (found.value, found.count) == (1.0, 170)
 
 
-# dino-small ----------------------------------------------------------------------------------------------------------
+# dino-small
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_other_side_is_found_by_who_knows_the_thing_and_by_chance_else():
@@ -265,7 +314,8 @@ def test_the_other_side_is_found_by_who_knows_the_thing_and_by_chance_else():
 
 def test_the_query_is_of_the_look_that_is_asked_and_the_gallery_of_the_first():
     pictures = numbered("dino", count=64, looks=2)
-    # In its second look each thing is taken for the next one; among all 64 that one is always there.
+    # In its second look each thing is taken for the next one; among all 64 that one is always
+    # there.
     taken = np.where(pictures.look == 1, (pictures.world + 1) % 64, pictures.world)
     assert np.mean(assess.nearest(np.eye(64)[taken], pictures, look=0)[0]) == 1
     assert np.mean(assess.nearest(np.eye(64)[taken], pictures, look=1)[0]) == 0
@@ -283,7 +333,9 @@ def test_histograms_and_pixels_see_what_their_names_say():
         counted[r, g, b] += 1 / 1024
     np.testing.assert_allclose(one**2, counted.ravel(), atol=1e-12)
     a, b, c = assess._unit(assess.raw_pixels(np.concatenate([image, image // 2, shuffled])))
-    assert a @ b == pytest.approx(1, abs=1e-3) and abs(a @ c) < 0.1  # half as bright is alike, another place is not
+    assert (
+        a @ b == pytest.approx(1, abs=1e-3) and abs(a @ c) < 0.1
+    )  # half as bright is alike, another place is not
 
 
 class Tokens:
@@ -293,7 +345,9 @@ class Tokens:
         self.pictures, self.table = pictures, tokens
 
     def images(self, images):
-        return np.eye(self.pictures.world.max() + 1)[[self.pictures.world[number(image)[1]] for image in images]]
+        return np.eye(self.pictures.world.max() + 1)[
+            [self.pictures.world[number(image)[1]] for image in images]
+        ]
 
     def tokens(self, images):
         assert len(images) == 2 and images[0].shape == (SIZE, SIZE, 3)
@@ -314,9 +368,11 @@ def test_the_figures_of_dino_put_each_method_to_the_same_question(monkeypatch):
 
 
 def test_pck_is_the_share_counted_by_hand(monkeypatch):
-    """A flat world seen by a second camera 20 px further left: 8 patches of the thing, 2 of them hidden there, 1 out of it.
+    """A flat world seen by a second camera 20 px further left: 8 patches of the thing, 2 of them
+    hidden there, 1 out of it.
 
-    Of the five that count three are matched to where they are, one to its right neighbour, 20 px off, one to the far
+    Of the five that count three are matched to where they are, one to its right neighbour, 20 px
+    off, one to the far
     corner: 3 of 5.
     """
     side, step = 8, SIZE // 8
@@ -331,10 +387,14 @@ def test_pck_is_the_share_counted_by_hand(monkeypatch):
         depth[row * step : (row + 1) * step, (column + 1) * step : (column + 2) * step] = 3.0
     second = SimpleNamespace(object_id=np.roll(thing, step, axis=1), depth=depth)
     camera = SimpleNamespace(project=lambda points: (points[:, :2], points[:, 2]))
-    world = SimpleNamespace(seed=11, thing=0, scene=lambda look, size: SimpleNamespace(cameras=[None, camera]))
+    world = SimpleNamespace(
+        seed=11, thing=0, scene=lambda look, size: SimpleNamespace(cameras=[None, camera])
+    )
     grey = np.full((SIZE, SIZE, 3), 90, np.uint8)
     monkeypatch.setattr(assess, "draw_world", lambda seed, **how: world)
-    monkeypatch.setattr(render, "pictures", lambda world, looks, size, view: ([grey], second if view else first))
+    monkeypatch.setattr(
+        render, "pictures", lambda world, looks, size, view: ([grey], second if view else first)
+    )
     names = np.arange(side * side).reshape(side, side)
     there = names + 1000
     for row, column in patches[1:]:
@@ -342,7 +402,10 @@ def test_pck_is_the_share_counted_by_hand(monkeypatch):
     there[4, 5], there[4, 6] = 2000, names[4, 4]  # matched 20 px off
     there[5, 6], there[7, 0] = 2001, names[5, 5]  # matched far away
     table = np.stack([names, there])[..., None] == np.concatenate([names.ravel(), [2000]])
-    found = {f.what.rpartition(": ")[2]: f for f in assess.part_figures(Tokens(None, table.astype(float)), 1)}
+    found = {
+        f.what.rpartition(": ")[2]: f
+        for f in assess.part_figures(Tokens(None, table.astype(float)), 1)
+    }
     assert {f.count for f in found.values()} == {5}
     assert found["patch tokens"].value == 3 / 5
     assert found["raw patches"].value == 0  # all grey alike: the first, which is far from all
@@ -353,8 +416,12 @@ def test_pck_is_the_share_counted_by_hand(monkeypatch):
     assert found["middle of the thing"].value == near.mean()
 
 
-def test_parts_of_rendered_worlds_are_found_by_who_knows_their_points_and_by_chance_else(monkeypatch):
-    """Tokens that say where on the thing a patch's middle lies, by waves of many lengths, from the rays themselves."""
+def test_parts_of_rendered_worlds_are_found_by_who_knows_their_points_and_by_chance_else(
+    monkeypatch,
+):
+    """Tokens that say where on the thing a patch's middle lies, by waves of many lengths, from the
+    rays themselves.
+    """
     shown = []
     waves = np.random.default_rng(5).normal(0, 8, (3, 256))
     original = render.pictures
@@ -367,7 +434,9 @@ def test_parts_of_rendered_worlds_are_found_by_who_knows_their_points_and_by_cha
     class Rays(Tokens):
         def tokens(self, images):
             middle = np.arange(8) * 20 + 10
-            points = np.stack([np.nan_to_num(h.point[np.ix_(middle, middle)], posinf=99) for h in shown[-2:]])
+            points = np.stack(
+                [np.nan_to_num(h.point[np.ix_(middle, middle)], posinf=99) for h in shown[-2:]]
+            )
             return np.concatenate([np.cos(points @ waves), np.sin(points @ waves)], axis=-1)
 
     class Noise(Tokens):
@@ -377,11 +446,13 @@ def test_parts_of_rendered_worlds_are_found_by_who_knows_their_points_and_by_cha
     monkeypatch.setattr(render, "pictures", kept)
     knowing, guessing = (assess.part_figures(kind(None, None), 3)[0] for kind in (Rays, Noise))
     assert knowing.count == guessing.count > 10
-    # A disc of 16 px is 3 % of the picture; what is seen at a slant has no patch whose middle is near.
+    # A disc of 16 px is 3 % of the picture; what is seen at a slant has no patch whose middle is
+    # near.
     assert knowing.value > 0.7 > 0.2 > guessing.value
 
 
-# perceptual-small ----------------------------------------------------------------------------------------------------
+# perceptual-small
+# --------------------------------------------------------------------------------------------------
 
 
 class Distances:
@@ -426,5 +497,10 @@ def test_who_knows_the_strengths_puts_them_in_order_and_the_others_do_not(monkey
 def test_the_contestants_are_what_their_names_say():
     random = np.random.default_rng(9)
     a, b = random.uniform(size=(2, 40, 40, 3)).astype(np.float32)
-    assert assess.psnr_distance(a, b) == pytest.approx(float(np.mean((a.astype(float) - b) ** 2)), rel=1e-5)
-    assert assess.ssim_distance(a, a) == pytest.approx(0, abs=1e-7) and assess.ssim_distance(a, b) > 0.5
+    assert assess.psnr_distance(a, b) == pytest.approx(
+        float(np.mean((a.astype(float) - b) ** 2)), rel=1e-5
+    )
+    assert (
+        assess.ssim_distance(a, a) == pytest.approx(0, abs=1e-7)
+        and assess.ssim_distance(a, b) > 0.5
+    )

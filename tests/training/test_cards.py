@@ -15,8 +15,22 @@ def encoder():
 
 
 def made(facts, files=()):
-    figure = {"what": "order", "value": 0.9, "low": 0.8, "high": 0.95, "count": 10, "chance": 0.5, "asked": 0.95}
-    return card("perceptual-small", [figure], [figure | {"value": 0.4}], facts | {"seconds": 0.5, "threads": 1}, files)
+    figure = {
+        "what": "order",
+        "value": 0.9,
+        "low": 0.8,
+        "high": 0.95,
+        "count": 10,
+        "chance": 0.5,
+        "asked": 0.95,
+    }
+    return card(
+        "perceptual-small",
+        [figure],
+        [figure | {"value": 0.4}],
+        facts | {"seconds": 0.5, "threads": 1},
+        files,
+    )
 
 
 def test_a_card_says_how_long_training_took_where_the_checkpoint_is_at_hand(tmp_path):
@@ -39,7 +53,10 @@ def test_a_card_has_the_hash_of_each_file_and_the_one_that_results_name(tmp_path
     weights, words = WEIGHTS / "clip-small.safetensors", WEIGHTS / "clip-small.tokenizer.json"
     text = made(facts, [weights, words])
     for path in (weights, words):
-        assert f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |" in text
+        assert (
+            f"| `{path.name}` | {path.stat().st_size} | `{hashlib.sha256(path.read_bytes()).hexdigest()}` |"
+            in text
+        )
     together = hashlib.sha256(weights.read_bytes() + words.read_bytes()).hexdigest()
     assert f"by which results name the encoder: `{together}`." in text
     assert load_encoder("clip-small", "clip").about.weights_sha256 == together

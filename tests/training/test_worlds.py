@@ -1,4 +1,6 @@
-"""Oracles: Mitsuba's pictures of the same worlds, truth by brute force over words, and what may never be drawn."""
+"""Oracles: Mitsuba's pictures of the same worlds, truth by brute force over words, and what may
+never be drawn.
+"""
 
 import numpy as np
 import pytest
@@ -29,7 +31,14 @@ from training.worlds import (
 
 def _look(rng, **said):
     base = draw_look(0, rng, pairs="any")
-    fields = {"finish": 0, "color": 0, "second": -1, "ground": base.ground, "time": base.time, "seed": base.seed}
+    fields = {
+        "finish": 0,
+        "color": 0,
+        "second": -1,
+        "ground": base.ground,
+        "time": base.time,
+        "seed": base.seed,
+    }
     return Look(**(fields | said))
 
 
@@ -76,7 +85,9 @@ def test_what_a_caption_says_is_true_of_its_picture_and_the_wrong_one_is_not():
         assert false != said
         text = sentence(said, rng)
         if said[0] >= 0:
-            assert any(noun in text for noun in [*worlds.NOUNS[OBJECTS[said[0]]], "polar", "grizzly"])
+            assert any(
+                noun in text for noun in [*worlds.NOUNS[OBJECTS[said[0]]], "polar", "grizzly"]
+            )
         if said[5] >= 0:
             assert any(hour in text for hour in worlds.HOURS[TIMES[said[5]]])
         if said[4] >= 0:
@@ -86,8 +97,12 @@ def test_what_a_caption_says_is_true_of_its_picture_and_the_wrong_one_is_not():
 def test_two_colours_have_no_order_and_one_colour_is_not_said_of_two():
     red, white = COLORS.index("red"), COLORS.index("white")
     stripes, plain, shiny = (FINISHES.index(f) for f in ("striped", "plain", "shiny"))
-    picture = np.array([[3, stripes, red, white, 0, 0], [3, plain, red, -1, 0, 0], [3, shiny, red, -1, 0, 0]])
-    captions = np.array([[3, stripes, white, red, -1, -1], [3, -1, red, -1, -1, -1], [3, shiny, red, -1, -1, -1]])
+    picture = np.array(
+        [[3, stripes, red, white, 0, 0], [3, plain, red, -1, 0, 0], [3, shiny, red, -1, 0, 0]]
+    )
+    captions = np.array(
+        [[3, stripes, white, red, -1, -1], [3, -1, red, -1, -1, -1], [3, shiny, red, -1, -1, -1]]
+    )
     assert true_of(captions, picture).tolist() == [
         [True, False, False],
         [False, True, False],
@@ -115,7 +130,9 @@ def test_moved_things_keep_their_surface_and_change_ground_and_time():
         assert a.time != b.time
 
 
-@pytest.mark.parametrize(("finish", "time"), [("plain", "day"), ("striped", "cloudy"), ("marble", "sunset")])
+@pytest.mark.parametrize(
+    ("finish", "time"), [("plain", "day"), ("striped", "cloudy"), ("marble", "sunset")]
+)
 def test_the_ray_caster_draws_what_mitsuba_draws(finish, time, monkeypatch):
     from attnwarp_eval.truth import mitsuba
 
@@ -129,7 +146,10 @@ def test_the_ray_caster_draws_what_mitsuba_draws(finish, time, monkeypatch):
     scene = world.scene(look, 64)
     theirs = render_plan(scene, scene.source, plan(scene, 64), 0)
     # Ray-cast pictures have one ray a pixel; blocks of 8 x 8 leave edges and noise little weight.
-    blocks = [x.reshape(8, 8, 8, 8, 3).mean(axis=(1, 3)) for x in (to_linear(ours / 255), np.clip(theirs, 0, 1))]
+    blocks = [
+        x.reshape(8, 8, 8, 8, 3).mean(axis=(1, 3))
+        for x in (to_linear(ours / 255), np.clip(theirs, 0, 1))
+    ]
     brightness = blocks[1].mean()
     error = np.abs(blocks[0] - blocks[1]).mean() / brightness
     upside_down = np.abs(blocks[0] - blocks[1][::-1]).mean() / brightness

@@ -1,7 +1,8 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """Gradients: the tiles back to front, then each splat's sums, then the parameters and the pose.
 
-In vectors of 16 pixels, a square of 4 x 4, with the sums of a splat in registers while the squares of its tile go by.
+In vectors of 16 pixels, a square of 4 x 4, with the sums of a splat in registers while the squares
+of its tile go by.
 """
 
 from __future__ import annotations
@@ -32,20 +33,24 @@ from attnwarp.render._kernels.projection import (
 )  # fmt: skip
 # isort: on
 
-# Slots of the backward pass: gradients of the loss in what a pixel sums up, and sums over the splats behind.
+# Slots of the backward pass: gradients of the loss in what a pixel sums up, and sums over the
+# splats behind.
 BXS, BYS = 0, 1  # as in the forward pass
 (BT, BLAST, BMEDK, BZREF, BIREF, GW, GD, GM2, GL1, GMED, TOTA, BEHA, BEHD, BEHQ, GNX, GNY, GNZ, GC0, GC1,
  GC2) = range(2, 22)  # fmt: skip
 BACK_SLOTS = 22
 
-# In the backward pass's work, behind the splat's row: what is summed over the tile, and as PLACED above.
+# In the backward pass's work, behind the splat's row: what is summed over the tile, and as PLACED
+# above.
 SUMS, BACK_PLACED = ROW, ROW + 32
 BACK_WORK = BACK_PLACED + 16
 
 
 @inlined
 def _rows_flat(work, row, rows, sx, sy, line):
-    """A 2D splat's row of gradients from its sums; ``row`` is its row of the table, moved by (sx, sy) to the tile."""
+    """A 2D splat's row of gradients from its sums; ``row`` is its row of the table, moved by (sx,
+    sy) to the tile.
+    """
     b = u64(SUMS)
     tu, tux, tuy = f64(work[b + u64(7)]), f64(work[b + u64(8)]), f64(work[b + u64(9)])
     tv, tvx, tvy = f64(work[b + u64(10)]), f64(work[b + u64(11)]), f64(work[b + u64(12)])
@@ -55,7 +60,11 @@ def _rows_flat(work, row, rows, sx, sy, line):
     rows[line, UX], rows[line, UY], rows[line, U0] = tux + sx * tu, tuy + sy * tu, tu
     rows[line, VX], rows[line, VY], rows[line, V0] = tvx + sx * tv, tvy + sy * tv, tv
     rows[line, WX], rows[line, WY], rows[line, W0] = twx + sx * tw, twy + sy * tw, tw
-    rows[line, Z0], rows[line, ZLO], rows[line, ZHI] = work[b + u64(18)], work[b + u64(19)], work[b + u64(20)]
+    rows[line, Z0], rows[line, ZLO], rows[line, ZHI] = (
+        work[b + u64(18)],
+        work[b + u64(19)],
+        work[b + u64(20)],
+    )
 
 
 @inlined
@@ -66,19 +75,29 @@ def _rows_round(work, row, rows, line):
         f64(work[b + u64(7)]), f64(work[b + u64(8)]), work[b + u64(9)], work[b + u64(10)], work[b + u64(11)],
     )  # fmt: skip
     gl, rx, ry = f64(work[b + u64(15)]), f64(work[b + u64(18)]), f64(work[b + u64(19)])
-    rows[line, X0] = row[CA] * dx + row[CB] * dy - gl * row[LX] - 2 * (row[RXX] * rx + row[RXY] * ry)
-    rows[line, Y0] = row[CB] * dx + row[CC] * dy - gl * row[LY] - 2 * (row[RXY] * rx + row[RYY] * ry)
+    rows[line, X0] = (
+        row[CA] * dx + row[CB] * dy - gl * row[LX] - 2 * (row[RXX] * rx + row[RXY] * ry)
+    )
+    rows[line, Y0] = (
+        row[CB] * dx + row[CC] * dy - gl * row[LY] - 2 * (row[RXY] * rx + row[RYY] * ry)
+    )
     rows[line, CA], rows[line, CB], rows[line, CC] = f32(-0.5) * xx, -xy, f32(-0.5) * yy
     rows[line, LX], rows[line, LY] = work[b + u64(16)], work[b + u64(17)]
     rows[line, RXX], rows[line, RXY] = work[b + u64(20)], f32(2.0) * work[b + u64(21)]
     rows[line, RYY], rows[line, 10] = work[b + u64(22)], f32(0.0)
-    rows[line, Z0], rows[line, ZLO], rows[line, ZHI] = work[b + u64(14)], work[b + u64(12)], work[b + u64(13)]
+    rows[line, Z0], rows[line, ZLO], rows[line, ZHI] = (
+        work[b + u64(14)],
+        work[b + u64(12)],
+        work[b + u64(13)],
+    )
 
 
 @inlined
 def _load_tile(buf, corner, width, height, background, scale, alpha, depth, state, g_color, g_alpha, g_depth, g_median,
                g_normal, g_l1, g_l2):  # fmt: skip
-    """What the backward pass needs of a whole tile of three channels, whose first pixel is ``corner``, to its buffer."""
+    """What the backward pass needs of a whole tile of three channels, whose first pixel is
+    ``corner``, to its buffer.
+    """
     image = width * height
     for k in range(PIXELS // 4):
         r, q = k // SIDE, k % SIDE
@@ -99,7 +118,8 @@ def _load_tile(buf, corner, width, height, background, scale, alpha, depth, stat
         L.separate4(buf, GNX * PIXELS + p, PIXELS, g_normal, 3 * at)
         L.separate4(buf, GC0 * PIXELS + p, PIXELS, g_color, 3 * at)
     for p in range(0, PIXELS, 16):
-        # Selected, not multiplied: where nothing is drawn, depth is NaN, and gradients may be anything.
+        # Selected, not multiplied: where nothing is drawn, depth is NaN, and gradients may be
+        # anything.
         drawn = L.load(buf, BLAST * PIXELS + p) > f32(0.0)
         A = L.where(drawn, L.load(buf, TOTA * PIXELS + p), f32(1.0))
         g2 = L.load(buf, GM2 * PIXELS + p) * scale
@@ -113,7 +133,11 @@ def _load_tile(buf, corner, width, height, background, scale, alpha, depth, stat
         L.store(buf, GW * PIXELS + p, L.where(drawn, gw, f32(0.0)))
         L.store(buf, GD * PIXELS + p, L.where(drawn, L.load(buf, GD * PIXELS + p) / A, f32(0.0)))
         L.store(buf, GM2 * PIXELS + p, L.where(drawn, g2 * A, f32(0.0)))
-        L.store(buf, GL1 * PIXELS + p, L.where(drawn, L.load(buf, GL1 * PIXELS + p) * f32(2.0), f32(0.0)))
+        L.store(
+            buf,
+            GL1 * PIXELS + p,
+            L.where(drawn, L.load(buf, GL1 * PIXELS + p) * f32(2.0), f32(0.0)),
+        )
         L.store(buf, GMED * PIXELS + p, L.where(drawn, L.load(buf, GMED * PIXELS + p), f32(0.0)))
         L.store(buf, BZREF * PIXELS + p, L.where(drawn, L.load(buf, BZREF * PIXELS + p), f32(0.0)))
         L.store(buf, TOTA * PIXELS + p, L.where(drawn, A, f32(0.0)))
@@ -124,12 +148,13 @@ def _load_tile(buf, corner, width, height, background, scale, alpha, depth, stat
 def backward(first, last, visit, view, tiles_x, starts, done, entries, table, thin, features, background, ndc_scale,
              alpha, depth, state, g_color, g_alpha, g_depth, g_median, g_normal, g_l1, g_l2, g_weight, place, rows,
              buf, work, exact):  # fmt: skip
-    """Gradients of the tiles visit[first:last], one row of ``rows`` for each entry worked off, from place[tile] on;
-    none is written for entries without squares, which are nowhere drawn.
+    """Gradients of the tiles visit[first:last], one row of ``rows`` for each entry worked off, from
+    place[tile] on; none is written for entries without squares, which are nowhere drawn.
 
-    A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in its normal and
-    values. Splats are visited back to front: the transmittance before each is recovered by division from what the
-    forward pass left. A splat's sums stay in registers while its squares go by.
+    A row holds the gradient in the first GRADIENTS columns of the splat's ``table`` row, then in
+    its normal and values. Splats are visited back to front: the transmittance before each is
+    recovered by division from what the forward pass left. A splat's sums stay in registers while
+    its squares go by.
     """
     flat, peak = view[FLAT] > 0, view[CENTER] == 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
@@ -252,7 +277,9 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                 lean = L.load(buf, TOTA * PIXELS + s) - w - two * behind_a
                 g = g + gl1 * (dz * lean + wz + two * behind_d)
                 in_z = w * (gd + gl1 * lean)
-                in_z = in_z + L.where(step == L.load(buf, BMEDK * PIXELS + s), L.load(buf, GMED * PIXELS + s), zero)
+                in_z = in_z + L.where(
+                    step == L.load(buf, BMEDK * PIXELS + s), L.load(buf, GMED * PIXELS + s), zero
+                )
                 # What 1 / z is blamed for, as a gradient in z.
                 in_z = in_z - two * w * gm * iz * iz
                 in_a = L.where(hit & (a < f32(K.ALPHA_MAX)), (T * g - behind_q * rest) * a, zero)
@@ -263,15 +290,35 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                 s0, s1, s2 = s0 + w * gn0, s1 + w * gn1, s2 + w * gn2
                 s3, s4, s5 = s3 + w * gc0, s4 + w * gc1, s5 + w * gc2
                 b0 = b0 + in_a
-                ex, ey = nx + L.spread(work, BACK_PLACED + AT_X), ny + L.spread(work, BACK_PLACED + AT_Y)
+                ex, ey = (
+                    nx + L.spread(work, BACK_PLACED + AT_X),
+                    ny + L.spread(work, BACK_PLACED + AT_Y),
+                )
                 low, high, z0 = L.spread(work, ZLO), L.spread(work, ZHI), L.spread(work, Z0)
                 if flat:
                     # As in shade.
-                    v_w = L.spread(work, BACK_PLACED + AT_W) + L.spread(work, WX) * nx + L.spread(work, WY) * ny
-                    u = L.spread(work, BACK_PLACED + AT_U) + L.spread(work, UX) * nx + L.spread(work, UY) * ny
-                    v = L.spread(work, BACK_PLACED + AT_V) + L.spread(work, VX) * nx + L.spread(work, VY) * ny
-                    sx, sy = sx + L.spread(work, BACK_PLACED + SCREEN_X), sy + L.spread(work, BACK_PLACED + SCREEN_Y)
-                    meets = (v_w <= L.spread(work, WMAX)) & ((u * u + v * v) * (p * p) <= sx * sx + sy * sy)
+                    v_w = (
+                        L.spread(work, BACK_PLACED + AT_W)
+                        + L.spread(work, WX) * nx
+                        + L.spread(work, WY) * ny
+                    )
+                    u = (
+                        L.spread(work, BACK_PLACED + AT_U)
+                        + L.spread(work, UX) * nx
+                        + L.spread(work, UY) * ny
+                    )
+                    v = (
+                        L.spread(work, BACK_PLACED + AT_V)
+                        + L.spread(work, VX) * nx
+                        + L.spread(work, VY) * ny
+                    )
+                    sx, sy = (
+                        sx + L.spread(work, BACK_PLACED + SCREEN_X),
+                        sy + L.spread(work, BACK_PLACED + SCREEN_Y),
+                    )
+                    meets = (v_w <= L.spread(work, WMAX)) & (
+                        (u * u + v * v) * (p * p) <= sx * sx + sy * sy
+                    )
                     r = p
                     # Selected, not multiplied by 0: what it is multiplied with may be infinite.
                     rs = L.where(meets, r, zero)
@@ -280,7 +327,8 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                     gu, gv = blame * u, blame * v
                     gw = gu * u + gv * v
                     screened = L.where(meets, zero, in_a) * two
-                    # Strictly: a splat that faces the camera has WLOW = WTOP = W, and its depth is its plane's.
+                    # Strictly: a splat that faces the camera has WLOW = WTOP = W, and its depth is
+                    # its plane's.
                     under, over = L.spread(work, WTOP) < v_w, v_w < L.spread(work, WLOW)
                     if not peak:
                         under, over = zero_lanes < one, zero_lanes < zero
@@ -323,7 +371,9 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
                 for c in range(GRADIENTS + 6):
                     rows[line, c] = zero
                 continue
-            L.store(work, SUMS, L.totals(s0, s1, s2, s3, s4, s5, b0, b1, b2, b3, b4, b5, b6, b7, b8, b9))
+            L.store(
+                work, SUMS, L.totals(s0, s1, s2, s3, s4, s5, b0, b1, b2, b3, b4, b5, b6, b7, b8, b9)
+            )
             L.store(work, SUMS + 16, L.totals8(b10, b11, b12, b13, b14, b15, b16, b16))
             for c in range(6):
                 rows[line, GRADIENTS + c] = work[u64(SUMS + c)]
@@ -336,7 +386,9 @@ def backward(first, last, visit, view, tiles_x, starts, done, entries, table, th
 
 @jit
 def reduce_rows(low, high, first, last, visit, starts, done, entries, place, rows, total):
-    """Add the rows of the tiles visit[first:last] to those of the splats low..high in ``total``, in their order."""
+    """Add the rows of the tiles visit[first:last] to those of the splats low..high in ``total``, in
+    their order.
+    """
     columns = rows.shape[1]
     for visited in range(first, last):
         t = visit[visited]
@@ -357,10 +409,11 @@ def reduce_rows(low, high, first, last, visit, starts, done, entries, place, row
 @jit
 def project_backward(first, last, order, view, m, q, sizes, o, values, channels, table, total,
                      gm, gq, gs, go, gv, g_view):  # fmt: skip
-    """Gradients in the parameters of the splats order[first:last] from those in their projection, ``total``.
+    """Gradients in the parameters of the splats order[first:last] from those in their projection,
+    ``total``.
 
-    The vector-Jacobian product of :func:`project`, in float64, every step of it in reverse. ``g_view`` (12) receives
-    the sums for R and t.
+    The vector-Jacobian product of :func:`project`, in float64, every step of it in reverse.
+    ``g_view`` (12) receives the sums for R and t.
     """
     R = view[:9].copy().reshape(3, 3)
     fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
@@ -631,12 +684,18 @@ def project_backward(first, last, order, view, m, q, sizes, o, values, channels,
                 dx += C35 * 2 * x * z * gY[14] + C36 * 3 * (x * x - y * y) * gY[15]
                 dy += C30 * 3 * (x * x - y * y) * gY[9] + C31 * x * z * gY[10]
                 dy += C32 * (4 * z * z - x * x - 3 * y * y) * gY[11] - C33 * 6 * y * z * gY[12]
-                dy += -C34 * 2 * x * y * gY[13] - C35 * 2 * y * z * gY[14] - C36 * 6 * x * y * gY[15]
+                dy += (
+                    -C34 * 2 * x * y * gY[13] - C35 * 2 * y * z * gY[14] - C36 * 6 * x * y * gY[15]
+                )
                 dz += C31 * x * y * gY[10] + C32 * 8 * y * z * gY[11]
                 dz += C33 * 3 * (2 * z * z - x * x - y * y) * gY[12] + C34 * 8 * x * z * gY[13]
                 dz += C35 * (x * x - y * y) * gY[14]
             along = x * dx + y * dy + z * dz
-            h[0], h[1], h[2] = (dx - x * along) / length, (dy - y * along) / length, (dz - z * along) / length
+            h[0], h[1], h[2] = (
+                (dx - x * along) / length,
+                (dy - y * along) / length,
+                (dz - z * along) / length,
+            )
             for r in range(3):
                 for k in range(3):
                     gc[r] += R[r, k] * h[k]
@@ -659,7 +718,12 @@ def project_backward(first, last, order, view, m, q, sizes, o, values, channels,
             gt[r] += gc[r]
             for k in range(3):
                 gR[r, k] += gc[r] * at[k]
-        w, x, y, z = f64(q[i, 0]) / size, f64(q[i, 1]) / size, f64(q[i, 2]) / size, f64(q[i, 3]) / size
+        w, x, y, z = (
+            f64(q[i, 0]) / size,
+            f64(q[i, 1]) / size,
+            f64(q[i, 2]) / size,
+            f64(q[i, 3]) / size,
+        )
         gw = 2 * (x * (gQ[2, 1] - gQ[1, 2]) + y * (gQ[0, 2] - gQ[2, 0]) + z * (gQ[1, 0] - gQ[0, 1]))
         yx, zx, zy = gQ[0, 1] + gQ[1, 0], gQ[0, 2] + gQ[2, 0], gQ[1, 2] + gQ[2, 1]
         gx = 2 * (-2 * x * (gQ[1, 1] + gQ[2, 2]) + y * yx + z * zx + w * (gQ[2, 1] - gQ[1, 2]))

@@ -1,5 +1,7 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""Which splats may show in which tiles, down to squares of 4 x 4 pixels: exact outlines, no bounding circles."""
+"""Which splats may show in which tiles, down to squares of 4 x 4 pixels: exact outlines, no
+bounding circles.
+"""
 
 from __future__ import annotations
 
@@ -18,13 +20,19 @@ NOTES = 64
 
 @inlined
 def _overlaps(row, x1, x2, y1, y2, cut, most, filtered):
-    """Whether a 2D splat of any outline may show in a rectangle (relative to its reference point), by intervals."""
+    """Whether a 2D splat of any outline may show in a rectangle (relative to its reference point),
+    by intervals.
+    """
     hx, hy, mx, my = (x2 - x1) / 2, (y2 - y1) / 2, (x1 + x2) / 2, (y1 + y2) / 2
     w = row[W0] + row[WX] * mx + row[WY] * my + abs(row[WX]) * hx + abs(row[WY]) * hy
     if w > 0:
         w = min(w, most)
-        u = max(abs(row[U0] + row[UX] * mx + row[UY] * my) - abs(row[UX]) * hx - abs(row[UY]) * hy, 0.0)
-        v = max(abs(row[V0] + row[VX] * mx + row[VY] * my) - abs(row[VX]) * hx - abs(row[VY]) * hy, 0.0)
+        u = max(
+            abs(row[U0] + row[UX] * mx + row[UY] * my) - abs(row[UX]) * hx - abs(row[UY]) * hy, 0.0
+        )
+        v = max(
+            abs(row[V0] + row[VX] * mx + row[VY] * my) - abs(row[VX]) * hx - abs(row[VY]) * hy, 0.0
+        )
         if u * u + v * v <= cut * w * w:
             return True
     if filtered:
@@ -44,7 +52,9 @@ def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, 
         for tx in range(tiles_x + 1):
             x1 = tx * TILE + 0.5 - x0 - slack
             x2 = min(tx * TILE + TILE, width) - 0.5 - x0 + slack
-            if tx < tiles_x and _overlaps(row, x1, x2, y1, y2, cut, slim[WIDE + WMAX], slim[WIDE + FILTER] > 0):
+            if tx < tiles_x and _overlaps(
+                row, x1, x2, y1, y2, cut, slim[WIDE + WMAX], slim[WIDE + FILTER] > 0
+            ):
                 run += 1
             elif run > 0:
                 if used < spans.shape[0]:
@@ -62,11 +72,13 @@ def _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, 
 
 
 @bare
-def _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change):
+def _emit(
+    notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change
+):
     """The runs of the pieces of ellipses that are noted; see :func:`outline`.
 
-    In steps, each for all notes: what finds the columns waits for no branch, and the branches (how many rows has a
-    splat) wait for no root or division.
+    In steps, each for all notes: what finds the columns waits for no branch, and the branches (how
+    many rows has a splat) wait for no root or division.
     """
     zero, far = f32(0.0), f32(1e9)
     for j in range(noted):
@@ -77,27 +89,39 @@ def _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, span
         top, shrink = L.spread(pieces, at + SHAPE_TOP), L.spread(pieces, at + SHAPE_SHRINK)
         half, lean = L.spread(pieces, at + SHAPE_HALF), L.spread(pieces, at + SHAPE_LEAN)
         stretch, tip = L.spread(pieces, at + SHAPE_WIDE), L.spread(pieces, at + SHAPE_TIP)
-        e1, e2 = L.most(y1 - L.spread(pieces, at + SHAPE_EY), -top), L.least(y2 - L.spread(pieces, at + SHAPE_EY), top)
+        e1, e2 = (
+            L.most(y1 - L.spread(pieces, at + SHAPE_EY), -top),
+            L.least(y2 - L.spread(pieces, at + SHAPE_EY), top),
+        )
         t1, t2 = e1 * shrink, e2 * shrink
         # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
         chord1 = L.rough_root(L.most(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
         chord2 = L.rough_root(L.most(f32(1.0) - t2 * t2, zero) + f32(5e-7)) * half
-        right = L.where((e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2))
-        left = L.where((e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2))
+        right = L.where(
+            (e1 <= tip) & (tip <= e2), stretch, L.most(lean * e1 + chord1, lean * e2 + chord2)
+        )
+        left = L.where(
+            (e1 <= -tip) & (-tip <= e2), -stretch, L.least(lean * e1 - chord1, lean * e2 - chord2)
+        )
         meets = e1 <= e2
         middle = L.spread(pieces, at + SHAPE_EX)
         left, right = L.where(meets, left + middle, far), L.where(meets, right + middle, -far)
         if flat:
             # The disc of the screen filter is joined to the ellipse.
             near = L.most(L.most(y1, -y2), zero)
-            chord = L.rough_root(L.most(L.spread(pieces, at + SHAPE_SQUARE) - near * near, f32(1e-12)))
+            chord = L.rough_root(
+                L.most(L.spread(pieces, at + SHAPE_SQUARE) - near * near, f32(1e-12))
+            )
             meets = near < L.spread(pieces, at + SHAPE_RADIUS)
             left = L.where(meets, L.least(left, -chord), left)
             right = L.where(meets, L.most(right, chord), right)
         left = L.up(L.most(left + L.spread(pieces, at + SHAPE_LEFT), zero))
         right = L.down(L.least(right + L.spread(pieces, at + SHAPE_RIGHT), f32(width - 1)))
         shows = left <= right
-        left, right = L.where(shows, left * f32(0.25), f32(32767.0)), L.where(shows, right * f32(0.25), f32(-1.0))
+        left, right = (
+            L.where(shows, left * f32(0.25), f32(32767.0)),
+            L.where(shows, right * f32(0.25), f32(-1.0)),
+        )
         L.store_ends(codes, j * 48, left, right)
         # Of the four rows of each row of tiles.
         left, right = L.least(left, L.swapped1(left)), L.most(right, L.swapped1(right))
@@ -131,17 +155,19 @@ def _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, span
 @bare
 def outline(first, last, table, thin, view, tiles_x, tiles_y, before, shapes, spans, counts, change, codes, pieces,
             notes):  # fmt: skip
-    """Write the runs of tiles that the splats first..last (places in the order of depth) may show in to ``spans``.
+    """Write the runs of tiles that the splats first..last (places in the order of depth) may show
+    in to ``spans``.
 
-    Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if the outline rho <=
-    cut meets the rectangle of its pixel centres (but for roundings, which only add). Sixteen rows of squares are done
-    at once. Splat k has ``counts[k]`` runs, which follow those of k - 1; a run is (first tile, number of tiles, columns
-    of squares in each row of them), see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and taken away
-    behind its end. Returns the rows needed; where they are more than fit, nothing of this counts. Runs without a tile
-    that is wanted, by ``before`` (tiles + 1), the number of them before each, are left out.
-    ``shapes`` are the outlines, from :func:`project`. ``codes`` (48 NOTES, int32), ``pieces`` (16 NOTES, float32) and
-    ``notes`` (NOTES, 3) are for work: ellipses are noted in pieces of 16 rows of squares, NOTES of them, and then
-    worked off together.
+    Exact for ellipses, down to the tiles' squares of 4 x 4 pixels: a square is taken if and only if
+    the outline rho <= cut meets the rectangle of its pixel centres (but for roundings, which only
+    add). Sixteen rows of squares are done at once. Splat k has ``counts[k]`` runs, which follow
+    those of k - 1; a run is (first tile, number of tiles, columns of squares in each row of them),
+    see RUN. ``change`` (tiles + 1) gets 1 added where a run begins and taken away behind its end.
+    Returns the rows needed; where they are more than fit, nothing of this counts. Runs without a
+    tile that is wanted, by ``before`` (tiles + 1), the number of them before each, are left out.
+    ``shapes`` are the outlines, from :func:`project`. ``codes`` (48 NOTES, int32), ``pieces`` (16
+    NOTES, float32) and ``notes`` (NOTES, 3) are for work: ellipses are noted in pieces of 16 rows
+    of squares, NOTES of them, and then worked off together.
     """
     flat = view[FLAT] > 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
@@ -155,17 +181,45 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, before, shapes, sp
         r1, r2 = int(shapes[shape, u64(SHAPE_FIRST)]), int(shapes[shape, u64(SHAPE_LAST)])
         if r1 < 0:
             # In the order of the splats: what has been noted comes first.
-            used = _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change)
+            used = _emit(
+                notes,
+                pieces,
+                noted,
+                flat,
+                steps,
+                codes,
+                width,
+                tiles_x,
+                before,
+                spans,
+                used,
+                counts,
+                change,
+            )
             noted = 0
             row, slim = table[k], thin[k]
             cut = f64(slim[WIDE + CUT]) * (1 + 1e-6)
-            used = _intervals(row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change)
+            used = _intervals(
+                row, slim, k, width, height, tiles_x, tiles_y, cut, spans, used, counts, change
+            )
             continue
         start = f64(shapes[shape, u64(SHAPE_Y)]) - table[k, Y0]
         while r1 <= r2:
             if noted == NOTES:
                 used = _emit(
-                    notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change
+                    notes,
+                    pieces,
+                    noted,
+                    flat,
+                    steps,
+                    codes,
+                    width,
+                    tiles_x,
+                    before,
+                    spans,
+                    used,
+                    counts,
+                    change,
                 )
                 noted = 0
             L.store(pieces, noted * 16, L.load(shapes, (k - first) * 16))
@@ -174,13 +228,28 @@ def outline(first, last, table, thin, view, tiles_x, tiles_y, before, shapes, sp
             notes[noted, 2] = min(16 // SIDE, r2 // SIDE - r1 // SIDE + 1)
             noted += 1
             r1 += 16
-    return _emit(notes, pieces, noted, flat, steps, codes, width, tiles_x, before, spans, used, counts, change)
+    return _emit(
+        notes,
+        pieces,
+        noted,
+        flat,
+        steps,
+        codes,
+        width,
+        tiles_x,
+        before,
+        spans,
+        used,
+        counts,
+        change,
+    )
 
 
 @bare
 def place_cursors(changes, live, cursors, starts):
-    """Where each chunk of splats puts its entries: from the changes (chunks, tiles + 1) that its runs make, to
-    ``cursors`` of the same shape and ``starts`` (tiles + 1); nothing goes to tiles that are not live."""
+    """Where each chunk of splats puts its entries: from the changes (chunks, tiles + 1) that its
+    runs make, to ``cursors`` of the same shape and ``starts`` (tiles + 1); nothing goes to tiles
+    that are not live."""
     total = 0
     chunks = changes.shape[0]
     running = cursors[:, starts.shape[0] - 1]
@@ -197,8 +266,8 @@ def place_cursors(changes, live, cursors, starts):
 
 @inlined
 def _bits(code, begin):
-    """A row of a run, as :func:`outline` writes it, as one bit for each column of squares from ``begin`` on; up to 58
-    columns."""
+    """A row of a run, as :func:`outline` writes it, as one bit for each column of squares from
+    ``begin`` on; up to 58 columns."""
     low, high = (code & 0xFFFF) - begin, (code >> 16) - begin
     return ((2 << high) - (1 << low)) if code >= 0 else 0
 
@@ -212,7 +281,8 @@ def _columns(code, column):
 
 @bare
 def scatter(first, last, spans, counts, live, before, cursor, entries):
-    """Write the entries of the splats first..last to the tiles that are live, each at its ``cursor``.
+    """Write the entries of the splats first..last to the tiles that are live, each at its
+    ``cursor``.
 
     Args:
         spans: their runs, in order. before: (tiles + 1) live tiles before each.

@@ -1,9 +1,10 @@
-"""Sixteen float32, or eight float64, as one value inside numba kernels: a whole loop can keep its sums in vector registers.
+"""Sixteen float32, or eight float64, as one value inside numba kernels: a whole loop can keep its
+sums in vector registers.
 
-LLVM vectorises loops over arrays, but then every sum lives in memory: 16 loads and 16 stores for each splat and 16
-pixels, which was most of the time. ``Lanes`` has the usual arithmetic (numbers are broadcast), comparisons that give a
-``Mask``, and the functions below; ``Wide`` and ``WideMask`` are the same of eight float64. LLVM splits them where the
-machine's vectors are shorter.
+LLVM vectorises loops over arrays, but then every sum lives in memory: 16 loads and 16 stores for
+each splat and 16 pixels, which was most of the time. ``Lanes`` has the usual arithmetic (numbers
+are broadcast), comparisons that give a ``Mask``, and the functions below; ``Wide`` and ``WideMask``
+are the same of eight float64. LLVM splits them where the machine's vectors are shorter.
 
 Products and sums may be fused but are not reordered: the exponential's rounding relies on that.
 """
@@ -19,12 +20,23 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_jitable, register_model
+from numba.extending import (
+    intrinsic,
+    lower_builtin,
+    lower_cast,
+    models,
+    register_jitable,
+    register_model,
+)
 
 WIDTH = 16
 FUSED = ("contract",)
-FLOATS, BITS, INTS = (ir.VectorType(kind, WIDTH) for kind in (ir.FloatType(), ir.IntType(1), ir.IntType(32)))
-DOUBLES, WIDE_BITS, LONGS = (ir.VectorType(kind, 8) for kind in (ir.DoubleType(), ir.IntType(1), ir.IntType(64)))
+FLOATS, BITS, INTS = (
+    ir.VectorType(kind, WIDTH) for kind in (ir.FloatType(), ir.IntType(1), ir.IntType(32))
+)
+DOUBLES, WIDE_BITS, LONGS = (
+    ir.VectorType(kind, 8) for kind in (ir.DoubleType(), ir.IntType(1), ir.IntType(64))
+)
 
 
 class Lanes(types.Type):
@@ -85,7 +97,9 @@ class _WideMaskModel(models.PrimitiveModel):
 def _spread(builder: Any, value: Any, kind: Any = FLOATS) -> Any:
     empty = ir.Constant(kind, ir.Undefined)
     one = builder.insert_element(empty, value, ir.IntType(32)(0))
-    return builder.shuffle_vector(one, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count))
+    return builder.shuffle_vector(
+        one, empty, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), [0] * kind.count)
+    )
 
 
 @lower_cast(types.Number, Lanes)
@@ -98,7 +112,9 @@ def _broadcast_wide(context: Any, builder: Any, kind: Any, _: Any, value: Any) -
     return _spread(builder, context.cast(builder, value, kind, types.float64), DOUBLES)
 
 
-def _operate(symbol: Any, operands: types.Type, result: types.Type, build: Callable[[Any, Any, Any], Any]) -> None:
+def _operate(
+    symbol: Any, operands: types.Type, result: types.Type, build: Callable[[Any, Any, Any], Any]
+) -> None:
     @infer_global(symbol)
     class _Template(AbstractTemplate):
         key = symbol
@@ -106,7 +122,9 @@ def _operate(symbol: Any, operands: types.Type, result: types.Type, build: Calla
         def generic(self, args: Any, kws: Any) -> Any:
             numbers = operands in (lanes, wide)
             taken = all(a == operands or (numbers and isinstance(a, types.Number)) for a in args)
-            return signature(result, *[operands] * len(args)) if taken and operands in args else None
+            return (
+                signature(result, *[operands] * len(args)) if taken and operands in args else None
+            )
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         return build(builder, *args)
@@ -187,12 +205,18 @@ def store8(typing: Any, array: Any, item: Any, value: Any) -> Any:
 
 @intrinsic
 def narrow(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
-    """Eight float64 of ``source`` from ``begin`` on, as float32 to ``array`` from ``item`` on; both counted flat."""
+    """Eight float64 of ``source`` from ``begin`` on, as float32 to ``array`` from ``item`` on; both
+    counted flat.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         wide, short = ir.VectorType(ir.DoubleType(), 8), ir.VectorType(ir.FloatType(), 8)
         value = builder.load(_pointer(context, builder, sig.args[2], wide, *args[2:]), align=8)
-        builder.store(builder.fptrunc(value, short), _pointer(context, builder, sig.args[0], short, *args[:2]), align=4)
+        builder.store(
+            builder.fptrunc(value, short),
+            _pointer(context, builder, sig.args[0], short, *args[:2]),
+            align=4,
+        )
         return context.get_dummy_value()
 
     return types.void(array, types.int64, source, types.int64), codegen
@@ -246,23 +270,27 @@ def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
 
 
 def _approach(builder: Any, x: Any, name: str) -> tuple[Any, Any]:
-    """The processor's estimate, to 14 bits, of 1 / x ("rcp14") or of 1 / sqrt(x) ("rsqrt14"), with AVX-512; and the
-    function that fuses a product and a sum."""
+    """The processor's estimate, to 14 bits, of 1 / x ("rcp14") or of 1 / sqrt(x) ("rsqrt14"), with
+    AVX-512; and the function that fuses a product and a sum."""
     single = x.type == FLOATS
     lanes_here = ir.IntType(x.type.count if x.type.count > 8 else 8)
     kind = ir.FunctionType(x.type, [x.type, x.type, lanes_here])
     whole = f"llvm.x86.avx512.{name}.{'ps' if single else 'pd'}.512"
     estimate = cgutils.get_or_insert_function(builder.module, kind, whole)
     kind = ir.FunctionType(x.type, [x.type] * 3)
-    fused = cgutils.get_or_insert_function(builder.module, kind, "llvm.fma.v16f32" if single else "llvm.fma.v8f64")
+    fused = cgutils.get_or_insert_function(
+        builder.module, kind, "llvm.fma.v16f32" if single else "llvm.fma.v8f64"
+    )
     return builder.call(estimate, [x, ir.Constant(x.type, ir.Undefined), lanes_here(-1)]), fused
 
 
 @intrinsic
 def inverse(typing: Any, x: Any) -> Any:
-    """1 / x to the last bit or two; anything where x is 0, infinite or below 1e-38 (float64: 1e-308).
+    """1 / x to the last bit or two; anything where x is 0, infinite or below 1e-38 (float64:
+    1e-308).
 
-    With AVX-512 an estimate of 14 bits and a step or two of Newton's: three times as fast as a division.
+    With AVX-512 an estimate of 14 bits and a step or two of Newton's: three times as fast as a
+    division.
     """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -288,7 +316,10 @@ def inverse_root(typing: Any, x: Any) -> Any:
         if not llvm.get_host_cpu_features().get("avx512f"):
             kind = ir.FunctionType(DOUBLES, [DOUBLES])
             return builder.fdiv(
-                one, builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f64"), [x])
+                one,
+                builder.call(
+                    cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v8f64"), [x]
+                ),
             )
         r, fused = _approach(builder, x, "rsqrt14")
         for _ in range(2):
@@ -301,13 +332,17 @@ def inverse_root(typing: Any, x: Any) -> Any:
 
 @intrinsic
 def rough_root(typing: Any, x: Any) -> Any:
-    """A square root of x > 0 that is right or too large by at most 1.3e-4 of itself: several times as fast."""
+    """A square root of x > 0 that is right or too large by at most 1.3e-4 of itself: several times
+    as fast.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]
         if not llvm.get_host_cpu_features().get("avx512f"):
             kind = ir.FunctionType(FLOATS, [FLOATS])
-            return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x])
+            return builder.call(
+                cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x]
+            )
         r, _ = _approach(builder, x, "rsqrt14")
         return builder.fmul(builder.fmul(x, ir.Constant(FLOATS, [1 + 2.0**-14] * WIDTH)), r)
 
@@ -368,11 +403,14 @@ def flipped(typing: Any, chosen: Any) -> Any:
 
 @intrinsic
 def times_power(typing: Any, x: Any, shifted: Any) -> Any:
-    """x 2^k, where ``shifted`` is k + 1.5 2^23, so that k is its lowest bits; no range is checked."""
+    """x 2^k, where ``shifted`` is k + 1.5 2^23, so that k is its lowest bits; no range is
+    checked."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x, k = (builder.bitcast(a, INTS) for a in args)
-        return builder.bitcast(builder.add(x, builder.shl(k, ir.Constant(INTS, [23] * WIDTH))), FLOATS)
+        return builder.bitcast(
+            builder.add(x, builder.shl(k, ir.Constant(INTS, [23] * WIDTH))), FLOATS
+        )
 
     return lanes(lanes, lanes), codegen
 
@@ -386,7 +424,9 @@ def total(typing: Any, x: Any) -> Any:
         for half in (8, 4, 2, 1):
             empty = ir.Constant(x.type, ir.Undefined)
             low, high = (
-                builder.shuffle_vector(x, empty, ir.Constant(ir.VectorType(ir.IntType(32), half), list(places)))
+                builder.shuffle_vector(
+                    x, empty, ir.Constant(ir.VectorType(ir.IntType(32), half), list(places))
+                )
                 for places in (range(half), range(half, 2 * half))
             )
             x = builder.fadd(low, high)
@@ -397,14 +437,17 @@ def total(typing: Any, x: Any) -> Any:
 
 def _fold(half: int) -> Any:
     places = [[g * 2 * half + k for g in range(WIDTH // half)] for k in range(half)]
-    # Of both vectors, one after the other: the first and the second ``half`` of every group of 2 ``half``.
+    # Of both vectors, one after the other: the first and the second ``half`` of every group of 2
+    # ``half``.
     low = sorted(place for row in places for place in row)
     high = [place + half for place in low]
 
     @intrinsic
     def fold(typing: Any, x: Any, y: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            first, second = (builder.shuffle_vector(*args, ir.Constant(INTS, which)) for which in (low, high))
+            first, second = (
+                builder.shuffle_vector(*args, ir.Constant(INTS, which)) for which in (low, high)
+            )
             return builder.fadd(first, second)
 
         return lanes(lanes, lanes), codegen
@@ -417,7 +460,9 @@ _fold8, _fold4, _fold2, _fold1 = (_fold(half) for half in (8, 4, 2, 1))
 
 @register_jitable(inline="always")
 def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-untyped-def]
-    """The sums of the lanes of sixteen vectors, as one vector: a transposition that adds on its way."""
+    """The sums of the lanes of sixteen vectors, as one vector: a transposition that adds on its
+    way.
+    """
     low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
     high = _fold2(_fold4(_fold8(i, j), _fold8(k, m)), _fold4(_fold8(n, o), _fold8(p, q)))
     return _fold1(low, high)
@@ -470,19 +515,25 @@ def spread(typing: Any, array: Any, item: Any) -> Any:
     """The number at ``item`` of a float32 array, counted flat, in every lane."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _spread(builder, builder.load(_pointer(context, builder, sig.args[0], ir.FloatType(), *args)))
+        return _spread(
+            builder, builder.load(_pointer(context, builder, sig.args[0], ir.FloatType(), *args))
+        )
 
     return lanes(array, types.int64), codegen
 
 
 @intrinsic
 def having(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
-    """Which of sixteen int32 of ``array`` from ``item`` on, counted flat, have one of these bits: a bit for each."""
+    """Which of sixteen int32 of ``array`` from ``item`` on, counted flat, have one of these bits: a
+    bit for each.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         words = builder.load(_pointer(context, builder, sig.args[0], INTS, *args[:2]), align=4)
         mask = _spread(builder, builder.trunc(args[2], ir.IntType(32)), INTS)
-        found = builder.icmp_unsigned("!=", builder.and_(words, mask), ir.Constant(INTS, [0] * WIDTH))
+        found = builder.icmp_unsigned(
+            "!=", builder.and_(words, mask), ir.Constant(INTS, [0] * WIDTH)
+        )
         return builder.zext(_as_bits(builder, found), ir.IntType(64))
 
     return types.int64(array, types.int64, types.int64), codegen
@@ -500,7 +551,9 @@ def lowest(typing: Any, bits: Any) -> Any:
 
 @intrinsic
 def store_ends(typing: Any, array: Any, item: Any, first: Any, last: Any) -> Any:
-    """Put first | last << 16, of sixteen whole numbers each, into an int32 array from ``item`` on, counted flat."""
+    """Put first | last << 16, of sixteen whole numbers each, into an int32 array from ``item`` on,
+    counted flat.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         low, high = (builder.fptosi(value, INTS) for value in args[2:])
@@ -545,7 +598,8 @@ FOUR = ir.VectorType(ir.IntType(32), 4)
 
 @intrinsic
 def copy_whole4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
-    """Four int32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted flat."""
+    """Four int32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted
+    flat."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = builder.load(_pointer(context, builder, sig.args[2], FOUR, *args[2:]), align=4)
@@ -557,7 +611,9 @@ def copy_whole4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> 
 
 @intrinsic
 def copy4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
-    """Four float32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted flat."""
+    """Four float32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted
+    flat.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         value = builder.load(_pointer(context, builder, sig.args[2], QUAD, *args[2:]), align=4)
@@ -569,20 +625,28 @@ def copy4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
 
 @intrinsic
 def interleave4(typing: Any, array: Any, item: Any, source: Any, begin: Any, step: Any) -> Any:
-    """Four float32 of ``source`` from each of ``begin``, + step, + 2 step on, as four triples to ``array``."""
+    """Four float32 of ``source`` from each of ``begin``, + step, + 2 step on, as four triples to
+    ``array``.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         begin, step = args[3:]
         first, second, third = (
             builder.load(_pointer(context, builder, sig.args[2], QUAD, args[2], place), align=4)
-            for place in (begin, builder.add(begin, step), builder.add(begin, builder.add(step, step)))
+            for place in (
+                begin,
+                builder.add(begin, step),
+                builder.add(begin, builder.add(step, step)),
+            )
         )
 
         def places(*which: int) -> Any:
             return ir.Constant(ir.VectorType(ir.IntType(32), len(which)), list(which))
 
         pair = builder.shuffle_vector(first, second, places(0, 4, 1, 5, 2, 6, 3, 7))
-        wide = builder.shuffle_vector(third, ir.Constant(QUAD, ir.Undefined), places(0, 1, 2, 3, 0, 0, 0, 0))
+        wide = builder.shuffle_vector(
+            third, ir.Constant(QUAD, ir.Undefined), places(0, 1, 2, 3, 0, 0, 0, 0)
+        )
         triples = builder.shuffle_vector(pair, wide, places(0, 1, 8, 2, 3, 9, 4, 5, 10, 6, 7, 11))
         to = _pointer(context, builder, sig.args[0], triples.type, *args[:2])
         builder.store(triples, to, align=4)
@@ -593,8 +657,8 @@ def interleave4(typing: Any, array: Any, item: Any, source: Any, begin: Any, ste
 
 @intrinsic
 def separate4(typing: Any, array: Any, item: Any, step: Any, source: Any, begin: Any) -> Any:
-    """The reverse of :func:`interleave4`: four triples of ``source`` from ``begin`` on, their first numbers to ``array`` from
-    ``item`` on, the second to + ``step``, the third to + 2 ``step``."""
+    """The reverse of :func:`interleave4`: four triples of ``source`` from ``begin`` on, their first
+    numbers to ``array`` from ``item`` on, the second to + ``step``, the third to + 2 ``step``."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         item, step = args[1:3]
@@ -602,7 +666,9 @@ def separate4(typing: Any, array: Any, item: Any, step: Any, source: Any, begin:
         triples = builder.load(_pointer(context, builder, sig.args[3], twelve, *args[3:]), align=4)
         empty = ir.Constant(twelve, ir.Undefined)
         for part in range(3):
-            places = ir.Constant(ir.VectorType(ir.IntType(32), 4), [part, part + 3, part + 6, part + 9])
+            places = ir.Constant(
+                ir.VectorType(ir.IntType(32), 4), [part, part + 3, part + 6, part + 9]
+            )
             to = _pointer(context, builder, sig.args[0], QUAD, args[0], item)
             builder.store(builder.shuffle_vector(triples, empty, places), to, align=4)
             item = builder.add(item, step)

@@ -1,5 +1,6 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""Splats as the camera sees them: their order, outline, depth and colour, eight at once in float64."""
+"""Splats as the camera sees them: their order, outline, depth and colour, eight at once in
+float64."""
 
 from __future__ import annotations
 
@@ -35,20 +36,29 @@ C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
 
 @inlined
 def _root(x):
-    """The square root of eight float64 >= 0, to the last bits; anything where they are negative or infinite."""
+    """The square root of eight float64 >= 0, to the last bits; anything where they are negative or
+    infinite.
+    """
     return x * L.inverse_root(L.most(x, 1e-300))
 
 
 @inlined
 def _log(x):
-    """The natural logarithm of eight float64, to 1e-12, for x > 0 that are not denormal: with x = f 2^k and f about 1,
-    2 artanh((f - 1) / (f + 1)) + k log 2."""
+    """The natural logarithm of eight float64, to 1e-12, for x > 0 that are not denormal: with x = f
+    2^k and f about 1, 2 artanh((f - 1) / (f + 1)) + k log 2."""
     f, k = L.fraction(x), L.exponent(x)
     large = f > 1.4142135623730951
     f, k = L.where(large, f * 0.5, f), L.where(large, k + 1.0, k)
     z = (f - 1.0) / (f + 1.0)
     s = z * z
-    series = s * (s * (s * (s * (s * (s * (s * (1 / 15) + 1 / 13) + 1 / 11) + 1 / 9) + 1 / 7) + 1 / 5) + 1 / 3) + 1.0
+    series = (
+        s
+        * (
+            s * (s * (s * (s * (s * (s * (1 / 15) + 1 / 13) + 1 / 11) + 1 / 9) + 1 / 7) + 1 / 5)
+            + 1 / 3
+        )
+        + 1.0
+    )
     return k * 0.6931471805599453 + z * series * 2.0
 
 
@@ -61,7 +71,11 @@ def harmonics(degree, x, y, z, out):
         out[4], out[5], out[6] = C20 * x * y, C21 * y * z, C22 * (2 * z * z - x * x - y * y)
         out[7], out[8] = C23 * x * z, C24 * (x * x - y * y)
     if degree > 2:
-        out[9], out[10], out[11] = C30 * y * (3 * x * x - y * y), C31 * x * y * z, C32 * y * (4 * z * z - x * x - y * y)
+        out[9], out[10], out[11] = (
+            C30 * y * (3 * x * x - y * y),
+            C31 * x * y * z,
+            C32 * y * (4 * z * z - x * x - y * y),
+        )
         out[12] = C33 * z * (2 * z * z - 3 * x * x - 3 * y * y)
         out[13], out[14] = C34 * x * (4 * z * z - x * x - y * y), C35 * z * (x * x - y * y)
         out[15] = C36 * x * (x * x - 3 * y * y)
@@ -84,7 +98,8 @@ def axes(q, i, Q):
 def depths(first, last, view, m, q, s, o, key, listed):
     """The depth of each of the splats first..last, to ``key``; NaN where nothing can show.
 
-    ``listed`` (1) gets a guess at how many tiles will list them: rectangles of 5 sigmas, their centres in the picture.
+    ``listed`` (1) gets a guess at how many tiles will list them: rectangles of 5 sigmas, their
+    centres in the picture.
     """
     fx, fy = view[FX] / TILE, view[FY] / TILE
     wide, tall = view[WIDTH] / TILE, view[HEIGHT] / TILE
@@ -98,15 +113,28 @@ def depths(first, last, view, m, q, s, o, key, listed):
         if flat and not shows:
             w, x, y, z = f64(q[i, 0]), f64(q[i, 1]), f64(q[i, 2]), f64(q[i, 3])
             square = w * w + x * x + y * y + z * z
-            a0 = r0 * (square - 2 * (y * y + z * z)) + r1 * 2 * (x * y + w * z) + r2 * 2 * (x * z - w * y)
-            a1 = r0 * 2 * (x * y - w * z) + r1 * (square - 2 * (x * x + z * z)) + r2 * 2 * (y * z + w * x)
+            a0 = (
+                r0 * (square - 2 * (y * y + z * z))
+                + r1 * 2 * (x * y + w * z)
+                + r2 * 2 * (x * z - w * y)
+            )
+            a1 = (
+                r0 * 2 * (x * y - w * z)
+                + r1 * (square - 2 * (x * x + z * z))
+                + r2 * 2 * (y * z + w * x)
+            )
             spread = math.sqrt((f64(s[i, 0]) * a0) ** 2 + (f64(s[i, 1]) * a1) ** 2) / square
             shows = c2 + K.EXTENT_SIGMAS * spread > near
         shows = shows and o[i] >= K.ALPHA_MIN
         key[i] = c2 if shows else np.nan
         if shows and c2 > near:
             c0 = view[0] * f64(m[i, 0]) + view[1] * f64(m[i, 1]) + view[2] * f64(m[i, 2]) + view[TX]
-            c1 = view[3] * f64(m[i, 0]) + view[4] * f64(m[i, 1]) + view[5] * f64(m[i, 2]) + view[TX + 1]
+            c1 = (
+                view[3] * f64(m[i, 0])
+                + view[4] * f64(m[i, 1])
+                + view[5] * f64(m[i, 2])
+                + view[TX + 1]
+            )
             x, y = fx * c0 / c2 + px, fy * c1 / c2 + py
             if 0 < x < wide and 0 < y < tall:
                 first_side = min(1 + 5 * fx * f64(s[i, 0]) / c2, wide)
@@ -117,7 +145,8 @@ def depths(first, last, view, m, q, s, o, key, listed):
 
 @inlined
 def _reaches(view, c0, c1, c2, size, wanted):
-    """Whether a splat may show in a wanted tile, by a rectangle that holds it whatever its rotation.
+    """Whether a splat may show in a wanted tile, by a rectangle that holds it whatever its
+    rotation.
 
     c: its centre in camera axes. size: its largest sigma.
     """
@@ -129,8 +158,8 @@ def _reaches(view, c0, c1, c2, size, wanted):
     if every & (at_x > 0) & (at_x < view[WIDTH]) & (at_y > 0) & (at_y < view[HEIGHT]) & (c2 > near):
         return True
     if view[FLAT] > 0:
-        # A sphere holds it: (c0 + d0) / (c2 + d2) - c0 / c2 is at most |d| (1 + |c0 / c2|) / (c2 - |d|). And 2.4
-        # pixels hold the disc of the screen filter.
+        # A sphere holds it: (c0 + d0) / (c2 + d2) - c0 / c2 is at most |d| (1 + |c0 / c2|) / (c2 -
+        # |d|). And 2.4 pixels hold the disc of the screen filter.
         reach = K.EXTENT_SIGMAS * size
         if c2 - reach <= near:
             return True
@@ -153,8 +182,9 @@ def _reaches(view, c0, c1, c2, size, wanted):
     return wanted[r2, t2] - wanted[r1, t2] - wanted[r2, t1] + wanted[r1, t1] > 0
 
 
-# What eight splats are worked off in, rows of eight: in float64 their parameters, their centres in camera axes, and the
-# first columns of their rows of the table; in float32 the table's other columns, then the outline's.
+# What eight splats are worked off in, rows of eight: in float64 their parameters, their centres in
+# camera axes, and the first columns of their rows of the table; in float32 the table's other
+# columns, then the outline's.
 IN_Q, IN_S, IN_O, IN_C, OUT = 3, 7, 10, 11, 14
 FACTOR = 8 * (OUT + WIDE)
 SETUP = FACTOR + 24
@@ -164,14 +194,33 @@ SETUP_NARROW = 8 * (SHAPES + 16)
 
 @bare
 def project(
-    first, last, order, view, m, q, s, o, values, channels, wanted, table, thin, features, shapes, work, slim, Y
+    first,
+    last,
+    order,
+    view,
+    m,
+    q,
+    s,
+    o,
+    values,
+    channels,
+    wanted,
+    table,
+    thin,
+    features,
+    shapes,
+    work,
+    slim,
+    Y,
 ):
-    """The splats order[first:last] to the rows first..last of the table, and of ``features`` (M, channels) if there
-    are more than three; and their outlines to the rows 0..last - first of ``shapes`` (., 16).
+    """The splats order[first:last] to the rows first..last of the table, and of ``features`` (M,
+    channels) if there are more than three; and their outlines to the rows 0..last - first of
+    ``shapes`` (., 16).
 
-    ``wanted`` (tiles_y + 1, tiles_x + 1) holds how many tiles are wanted above and left of each tile's corner: a splat
-    that cannot show in a wanted one gets a negative CUT and no outline, and the rest of its row is left as it was.
-    ``work`` (SETUP), ``slim`` (SETUP_NARROW) and ``Y`` (16) are for work. Eight splats are done at once, in float64.
+    ``wanted`` (tiles_y + 1, tiles_x + 1) holds how many tiles are wanted above and left of each
+    tile's corner: a splat that cannot show in a wanted one gets a negative CUT and no outline, and
+    the rest of its row is left as it was. ``work`` (SETUP), ``slim`` (SETUP_NARROW) and ``Y`` (16)
+    are for work. Eight splats are done at once, in float64.
     """
     R00, R01, R02, R10, R11, R12 = view[0], view[1], view[2], view[3], view[4], view[5]
     R20, R21, R22 = view[6], view[7], view[8]
@@ -199,7 +248,11 @@ def project(
             work[at + u64(8 * IN_S + 16)] = 0.0 if flat else s[i, u64(s.shape[1] - 1)]
             work[at + u64(8 * IN_O)] = o[i]
         m0, m1, m2 = L.load8(work, 0), L.load8(work, 8), L.load8(work, 16)
-        s0, s1, s2 = L.load8(work, 8 * IN_S), L.load8(work, 8 * IN_S + 8), L.load8(work, 8 * IN_S + 16)
+        s0, s1, s2 = (
+            L.load8(work, 8 * IN_S),
+            L.load8(work, 8 * IN_S + 8),
+            L.load8(work, 8 * IN_S + 16),
+        )
         c0 = m0 * R00 + m1 * R01 + m2 * R02 + view[TX]
         c1 = m0 * R10 + m1 * R11 + m2 * R12 + view[TX + 1]
         c2 = m0 * R20 + m1 * R21 + m2 * R22 + view[TX + 2]
@@ -207,7 +260,11 @@ def project(
         ahead = near < c2
         at_x, at_y = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
         kept = 255 >> (8 - here)
-        inside = L.as_bits(ahead & (at_x > 0.0) & (at_x < width) & (at_y > 0.0) & (at_y < height)) if every else 0
+        inside = (
+            L.as_bits(ahead & (at_x > 0.0) & (at_x < width) & (at_y > 0.0) & (at_y < height))
+            if every
+            else 0
+        )
         if kept & ~inside:
             L.store8(work, 8 * IN_C, c0)
             L.store8(work, 8 * IN_C + 8, c1)
@@ -216,7 +273,11 @@ def project(
                 if inside >> lane & 1:
                     continue
                 at = u64(lane)
-                size = max(work[at + u64(8 * IN_S)], work[at + u64(8 * IN_S + 8)], work[at + u64(8 * IN_S + 16)])
+                size = max(
+                    work[at + u64(8 * IN_S)],
+                    work[at + u64(8 * IN_S + 8)],
+                    work[at + u64(8 * IN_S + 16)],
+                )
                 b = at + u64(8 * IN_C)
                 if not _reaches(view, work[b], work[b + u64(8)], work[b + u64(16)], size, wanted):
                     kept &= ~(1 << lane)
@@ -288,13 +349,22 @@ def project(
             limit = K.JACOBIAN_MARGIN * height / 2 / fy
             py = L.least(L.most(c1 * ic, -cy / fy - limit), (height - cy) / fy + limit)
             scale = s0 * ic
-            gx, gy = ((a00 - px * a20) * fx + (a10 - py * a20) * skew) * scale, (a10 - py * a20) * fy * scale
+            gx, gy = (
+                ((a00 - px * a20) * fx + (a10 - py * a20) * skew) * scale,
+                (a10 - py * a20) * fy * scale,
+            )
             sxx, sxy, syy = gx * gx, gx * gy, gy * gy
             scale = s1 * ic
-            gx, gy = ((a01 - px * a21) * fx + (a11 - py * a21) * skew) * scale, (a11 - py * a21) * fy * scale
+            gx, gy = (
+                ((a01 - px * a21) * fx + (a11 - py * a21) * skew) * scale,
+                (a11 - py * a21) * fy * scale,
+            )
             sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
             scale = s2 * ic
-            gx, gy = ((a02 - px * a22) * fx + (a12 - py * a22) * skew) * scale, (a12 - py * a22) * fy * scale
+            gx, gy = (
+                ((a02 - px * a22) * fx + (a12 - py * a22) * skew) * scale,
+                (a12 - py * a22) * fy * scale,
+            )
             sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
             sharp = sxx * syy - sxy * sxy
             sxx, syy = sxx + K.BLUR_3D, syy + K.BLUR_3D
@@ -327,14 +397,20 @@ def project(
                 f2 = S02 * c0 + S12 * c1 + S22 * c2
                 scale = c2 * L.inverse(f0 * c0 + f1 * c1 + f2 * c2)
                 gx, gy = scale * f0, scale * f1
-                # Denominator minus l^2: positive semidefinite, so the difference of large numbers is taken here in
-                # float64.
-                xx, xy, yy = scale * c2 * S00 - gx * gx, scale * c2 * S01 - gx * gy, scale * c2 * S11 - gy * gy
+                # Denominator minus l^2: positive semidefinite, so the difference of large numbers
+                # is taken here in float64.
+                xx, xy, yy = (
+                    scale * c2 * S00 - gx * gx,
+                    scale * c2 * S01 - gx * gy,
+                    scale * c2 * S11 - gy * gy,
+                )
                 L.store8(work, 8 * (OUT + LX), gx * kx)
                 L.store8(work, 8 * (OUT + LY), gy * ky + gx * kxy)
                 L.store8(work, 8 * (OUT + RXX), xx * (kx * kx))
                 L.store8(work, 8 * (OUT + RXY), (xx * kxy + xy * ky) * kx)
-                L.store8(work, 8 * (OUT + RYY), xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky))
+                L.store8(
+                    work, 8 * (OUT + RYY), xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky)
+                )
             # The normal is the shortest axis.
             second = s1 < s0
             third = s2 < L.where(second, s1, s0)
@@ -348,8 +424,8 @@ def project(
         reach = spread * K.EXTENT_SIGMAS
         low, high = L.most(c2 - reach, near), L.most(c2 + reach, near)
         if flat:
-            # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not in front, W must
-            # be positive, else it may be anything, see shade.
+            # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not
+            # in front, W must be positive, else it may be anything, see shade.
             L.store8(slim, 8 * (WTOP - WIDE), depth * L.inverse(low))
             L.store8(slim, 8 * (WLOW - WIDE), L.where(ahead, depth * L.inverse(high), 1e-20))
         if center:
@@ -391,7 +467,8 @@ def project(
         over = L.inverse(A)
         begin = y0 - (0.5 + 1e-4) + L.least(ey - top, -radius)
         end = y0 - (0.5 - 1e-4) + L.most(ey + top, radius)
-        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all sides.
+        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all
+        # sides.
         slack = (wide + L.magnitude(ex) + L.magnitude(x0)) * 1e-6 + 1e-4
         slack_y = (top + L.magnitude(ey) + L.magnitude(y0)) * 5e-7 + 1e-4
         shows = drawn & (end >= 0.0) & (begin <= height - 1.0)
@@ -447,7 +524,9 @@ def project(
                     thin[to, u64(WIDE + VALUES + k)] = max(total, 0.0)
             else:
                 for k in range(3):
-                    thin[to, u64(WIDE + VALUES + k)] = values[i, u64(k)] if k < channels else f32(0.0)
+                    thin[to, u64(WIDE + VALUES + k)] = (
+                        values[i, u64(k)] if k < channels else f32(0.0)
+                    )
                 if channels > 3:
                     for k in range(channels):
                         features[to, u64(k)] = values[i, u64(k)]
@@ -455,15 +534,16 @@ def project(
 
 @jit
 def radix_order(key, index, other, bits, spare):
-    """Indices of the keys that are not NaN, ascending, equal ones in their order of input (LSD radix sort of bits);
-    and the places in them of keys that are equal to one beside them. All arrays are as long as ``key``; the results
-    lie in ``index`` and ``other``."""
+    """Indices of the keys that are not NaN, ascending, equal ones in their order of input (LSD
+    radix sort of bits); and the places in them of keys that are equal to one beside them. All
+    arrays are as long as ``key``; the results lie in ``index`` and ``other``."""
     raw = key.view(np.uint32)
     n = 0
     for i in range(key.shape[0]):
         if key[i] == key[i]:
             b = raw[i] if key[i] != 0 else np.uint32(0)
-            # Flipping makes the order of the bits that of the numbers: all bits of a negative, the sign of a positive.
+            # Flipping makes the order of the bits that of the numbers: all bits of a negative, the
+            # sign of a positive.
             bits[n] = ~b if b >> np.uint32(31) else b | np.uint32(0x80000000)
             index[n] = i
             n += 1

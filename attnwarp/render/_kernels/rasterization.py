@@ -1,8 +1,8 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
 """Splats over one another, tile by tile: the pictures, and what the backward pass needs of them.
 
-In vectors of 16 pixels, a square of 4 x 4, with the sums of a square in registers while a block of splats goes by. exp is a
-polynomial, since LLVM has no vector exp here.
+In vectors of 16 pixels, a square of 4 x 4, with the sums of a square in registers while a block of
+splats goes by. exp is a polynomial, since LLVM has no vector exp here.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from attnwarp.render._kernels.layout import (
 )  # fmt: skip
 # isort: on
 
-# A block of splats as the forward pass works on them: their rows, with each one's place among the tile's; then its weights at the
-# 16 pixels of all squares, and of the square at hand; then what depends on where pixels are counted from, at the middle of
-# the quarter of the tile at hand.
+# A block of splats as the forward pass works on them: their rows, with each one's place among the
+# tile's; then its weights at the 16 pixels of all squares, and of the square at hand; then what
+# depends on where pixels are counted from, at the middle of the quarter of the tile at hand.
 BLOCK = 32
 AHEAD = 32
 STEP = 28
@@ -42,10 +42,17 @@ SLOTS = 20  # and one more for each channel from the fourth on
 FAR = 1e15  # its square is HUGE
 LOG2E_HALF = f32(0.5 * math.log2(math.e))
 
-# exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error, 9.1e-8.
+# exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error,
+# 9.1e-8.
 E1, E2, E3, E4, E5 = (
     f32(c)
-    for c in (0.6931469775373009, 0.24022242044016756, 0.05550733832514562, 0.009671514536030823, 0.0013264700286626865)
+    for c in (
+        0.6931469775373009,
+        0.24022242044016756,
+        0.05550733832514562,
+        0.009671514536030823,
+        0.0013264700286626865,
+    )
 )
 ROUND = f32(1.5 * 2**23)
 
@@ -72,8 +79,8 @@ def slopes(exact, at):
 
 @inlined
 def lay_out(work, at, exact, begin, table, thin, i, ox, oy, flat):
-    """Row i of the table as float32 to ``work`` from ``at`` on; and to ``exact`` from ``begin`` on what it is at the tile's
-    middle (ox, oy), and its slopes."""
+    """Row i of the table as float32 to ``work`` from ``at`` on; and to ``exact`` from ``begin`` on
+    what it is at the tile's middle (ox, oy), and its slopes."""
     i, b, e = u64(i), u64(at), u64(begin)
     L.narrow(work, at, table, i * u64(COLUMNS))
     work[b + u64(8)], work[b + u64(9)] = table[i, 8], table[i, 9]
@@ -93,29 +100,33 @@ def lay_out(work, at, exact, begin, table, thin, i, ox, oy, flat):
         f11, f12, f22 = table[i, F11], table[i, F12], table[i, F22]
         work[b + u64(CA)], work[b + u64(CB)], work[b + u64(CC)] = f11, f12, f22
         exact[e + u64(AT_U)], exact[e + u64(AT_V)] = f11 * sx + f12 * sy, f22 * sy
-        exact[e + u64(8 + AT_U)], exact[e + u64(16 + AT_U)], exact[e + u64(16 + AT_V)] = f11, f12, f22
+        exact[e + u64(8 + AT_U)], exact[e + u64(16 + AT_U)], exact[e + u64(16 + AT_V)] = (
+            f11,
+            f12,
+            f22,
+        )
 
 
 @inlined
 def refer(work, at, exact, begin, dx, dy):
-    """What depends on where pixels are counted from, as float32 to ``work`` from ``at`` on: counted from (dx, dy) off the
-    tile's middle."""
+    """What depends on where pixels are counted from, as float32 to ``work`` from ``at`` on: counted
+    from (dx, dy) off the tile's middle."""
     slope_x, slope_y = L.load8(exact, begin + 8), L.load8(exact, begin + 16)
     L.store8(work, at, L.load8(exact, begin) + slope_x * dx + slope_y * dy)
 
 
 @inlined
 def shade(work, at, off, x, y, screen_x, screen_y, flat, peak):
-    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere); and p, q, which :func:`depth_less`
-    makes its z and 1 / z of. ``at``: its row. ``off``: what :func:`refer` made. ``screen_x`` and ``screen_y`` are x and
-    y times the root of 2.
+    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere); and p, q,
+    which :func:`depth_less` makes its z and 1 / z of. ``at``: its row. ``off``: what :func:`refer`
+    made. ``screen_x`` and ``screen_y`` are x and y times the root of 2.
 
-    A 2D splat's W is clamped to the z that it may have, between WLOW and WTOP, before anything is divided by it. That bounds
-    the z of what its filter draws, and changes nothing that its intersection draws, nor adds to it. For take its centre in
-    front, and the centre's z as 1: at (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and
-    WLOW = 1 / (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than WLOW, |U| > (1 - WLOW) / |s| = E WLOW: |U| / WLOW is
-    more than E too, where nothing is drawn. Where W is more than WTOP, |U| / WTOP is more than |U| / W, which is more than E,
-    unless WTOP is that of the near plane; this is what WMAX is for.
+    A 2D splat's W is clamped to the z that it may have, between WLOW and WTOP, before anything is
+    divided by it. That bounds the z of what its filter draws, and changes nothing that its
+    intersection draws, nor adds to it. For take its centre in front, and the centre's z as 1: at
+    (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and WLOW = 1 /
+    (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than WLOW, |U| > (1 - WLOW) / |s| = E WLOW:
+    |U| / WLOW is more than E too, where nothing is drawn. Where W is more than WTOP, |U| / WTOP is more than |U| / W, which is more than E, unless WTOP is that of the near plane; this is what WMAX is for.
     """
     if flat:
         w = L.spread(work, off + AT_W) + L.spread(work, at + WX) * x + L.spread(work, at + WY) * y
@@ -123,7 +134,10 @@ def shade(work, at, off, x, y, screen_x, screen_y, flat, peak):
         v = L.spread(work, off + AT_V) + L.spread(work, at + VX) * x + L.spread(work, at + VY) * y
         q = L.least(L.most(w, L.spread(work, at + WLOW)), L.spread(work, at + WTOP))
         p = L.inverse(q)
-        ex, ey = screen_x + L.spread(work, off + SCREEN_X), screen_y + L.spread(work, off + SCREEN_Y)
+        ex, ey = (
+            screen_x + L.spread(work, off + SCREEN_X),
+            screen_y + L.spread(work, off + SCREEN_Y),
+        )
         meets = w <= L.spread(work, at + WMAX)
         rho = L.least(L.where(meets, (u * u + v * v) * (p * p), f32(HUGE)), ex * ex + ey * ey)
     else:
@@ -162,15 +176,15 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
             work, exact, picks, places, masks):  # fmt: skip
     """Composite those of the tiles visit[first:last] that are live.
 
-    A tile is 16 squares of 16 pixels. Splats come in blocks of those that show in a square that is not opaque yet: their
-    coefficients are laid out once for the tile; each square then picks those that its list says may show in it, and
-    composites them with its sums in registers.
+    A tile is 16 squares of 16 pixels. Splats come in blocks of those that show in a square that is
+    not opaque yet: their coefficients are laid out once for the tile; each square then picks those
+    that its list says may show in it, and composites them with its sums in registers.
 
-    ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry, mean and spread of
-    1 / z; of no height if there will be none. Per tile, ``done`` is the number of entries worked off, ``tested_in``
-    that of pairs whose intersection was computed, ``shaded_in`` of those in a square that the splat draws to,
-    ``drawn_in`` of contributing pairs, ``full`` whether every
-    pixel has ended; ``seen`` is the sum of weights of each entry.
+    ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry,
+    mean and spread of 1 / z; of no height if there will be none. Per tile, ``done`` is the number
+    of entries worked off, ``tested_in`` that of pairs whose intersection was computed,
+    ``shaded_in`` of those in a square that the splat draws to, ``drawn_in`` of contributing pairs,
+    ``full`` whether every pixel has ended; ``seen`` is the sum of weights of each entry.
     """
     flat, peak = view[FLAT] > 0, view[CENTER] == 0
     width, height = int(view[WIDTH]), int(view[HEIGHT])
@@ -211,7 +225,8 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
         for p in range(0, PIXELS, 16):
             L.store(buf, TT * PIXELS + p, f32(1.0))
         if rows < TILE or cols < TILE:
-            # Pixels outside of the image are opaque from the start: they take no part and never delay the stop.
+            # Pixels outside of the image are opaque from the start: they take no part and never
+            # delay the stop.
             for p in range(PIXELS):
                 column, row = p // 16 % SIDE * 4 + p % 4, p // (16 * SIDE) * 4 + p // 4 % 4
                 if column >= cols or row >= rows:
@@ -237,7 +252,18 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                     seen[u64(e)] = f32(0.0)
                 else:
                     places[u64(size)], masks[u64(size)] = e, squares
-                    lay_out(work, size * ROW, exact, size * EXACT, table, thin, entry & PLACE, ox, oy, flat)
+                    lay_out(
+                        work,
+                        size * ROW,
+                        exact,
+                        size * EXACT,
+                        table,
+                        thin,
+                        entry & PLACE,
+                        ox,
+                        oy,
+                        flat,
+                    )
                     work[u64(size * ROW + STEP)] = f32(e - begin + 1)
                     L.store(work, WEIGHTS + size * 16, f32(0.0))
                     size += 1
@@ -249,7 +275,10 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                 corner = turn & 8 | turn >> 1 & 2
                 if turn & 3 == 0:
                     dx, dy = (corner & 2) * 4.0 - 4.0, (corner & 8) - 4.0
-                    left = L.having(masks, 0, QUARTER << corner) | L.having(masks, 16, QUARTER << corner) << 16
+                    left = (
+                        L.having(masks, 0, QUARTER << corner)
+                        | L.having(masks, 16, QUARTER << corner) << 16
+                    )
                     while left != 0:
                         k = L.lowest(left)
                         left &= left - 1
@@ -263,7 +292,11 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                 s = q * 16
                 x, y = L.load(buf, XS * PIXELS + s), L.load(buf, YS * PIXELS + s)
                 sx, sy = x * f32(ROOT2), y * f32(ROOT2)
-                T, A, D = L.load(buf, TT * PIXELS + s), L.load(buf, AA * PIXELS + s), L.load(buf, DD * PIXELS + s)
+                T, A, D = (
+                    L.load(buf, TT * PIXELS + s),
+                    L.load(buf, AA * PIXELS + s),
+                    L.load(buf, DD * PIXELS + s),
+                )
                 sum1, sum2 = L.load(buf, M1 * PIXELS + s), L.load(buf, M2 * PIXELS + s)
                 pairs, final = L.load(buf, L1 * PIXELS + s), L.load(buf, LAST * PIXELS + s)
                 n0, n1 = L.load(buf, NX * PIXELS + s), L.load(buf, NY * PIXELS + s)
@@ -271,8 +304,8 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                 c1, c2 = L.load(buf, C_1 * PIXELS + s), L.load(buf, C_2 * PIXELS + s)
                 zref, iref = L.load(buf, ZREF * PIXELS + s), L.load(buf, IREF * PIXELS + s)
                 med, medk = L.load(buf, MED * PIXELS + s), L.load(buf, MEDK * PIXELS + s)
-                # Once no pixel is, what only the first splats of a pixel decide is over: for a block at a time, so that
-                # it costs no branch that goes both ways.
+                # Once no pixel is, what only the first splats of a pixel decide is over: for a
+                # block at a time, so that it costs no branch that goes both ways.
                 undecided = L.some(half < T)
                 alive = stop < T
                 used = 0
@@ -285,8 +318,8 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                     b = k * ROW
                     left &= left - 1
                     if left != 0:
-                        # One splat ahead: a long chain of operations that wait for each other, while the sums of the
-                        # one at hand wait for nothing.
+                        # One splat ahead: a long chain of operations that wait for each other,
+                        # while the sums of the one at hand wait for nothing.
                         following = L.lowest(left)
                         inside_then, a_then, p_then, q_then = shade(
                             work, following * ROW, PLACED + following * 8, x, y, sx, sy, flat, peak
@@ -300,8 +333,8 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
                         z, iz = depth_less(work, b, p, iq, flat, peak, zero, zero)
                         opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
                         med, medk = L.where(opens, z, med), L.where(opens, step, medk)
-                        # Depths are summed relative to the pixel's first, which keeps the digits of thin layers far
-                        # away.
+                        # Depths are summed relative to the pixel's first, which keeps the digits of
+                        # thin layers far away.
                         zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
                     z, m = depth_less(work, b, p, iq, flat, peak, zref, iref)
                     wz, wm = w * z, w * m
@@ -381,7 +414,9 @@ def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thi
             L.store(buf, M1 * PIXELS + p, L.load(buf, IREF * PIXELS + p) + a1 * inverse)
             mean = L.load(buf, ZREF * PIXELS + p) + L.load(buf, DD * PIXELS + p) * inverse
             L.store(buf, DD * PIXELS + p, L.where(covered, mean, f32(np.nan)))
-            L.store(buf, MED * PIXELS + p, L.where(covered, L.load(buf, MED * PIXELS + p), f32(np.nan)))
+            L.store(
+                buf, MED * PIXELS + p, L.where(covered, L.load(buf, MED * PIXELS + p), f32(np.nan))
+            )
             L.store(buf, L1 * PIXELS + p, L.load(buf, L1 * PIXELS + p) * f32(2.0))
             through = f32(1.0) - A
             for c in range(channels):
@@ -435,8 +470,9 @@ def hand_out(order, sums, weight):
 
 @bare
 def settle(ended, starts, done, entries, seen, weight, offset, places, kept):
-    """Of the tiles that have ``ended``: add the entries' weights to their splats' (by place in the order of depth),
-    and, if there is room in ``kept``, keep what was worked off; tile t's from places[t] - ``offset`` on.
+    """Of the tiles that have ``ended``: add the entries' weights to their splats' (by place in the
+    order of depth), and, if there is room in ``kept``, keep what was worked off; tile t's from
+    places[t] - ``offset`` on.
 
     Weights are summed as whole numbers of WEIGHT_UNIT: the same bits in whatever order tiles end.
     """

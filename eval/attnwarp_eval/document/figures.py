@@ -30,7 +30,8 @@ MARKERS = "osD^vP*X"
 def drawing(
     path: Path, columns: int = 1, height: float = 3.4, *, rows: int = 1, width: float | None = None
 ) -> Iterator[list[Axes]]:
-    """A figure of ``rows`` x ``columns`` axes, row by row, saved on leaving without a date or random ids.
+    """A figure of ``rows`` x ``columns`` axes, row by row, saved on leaving without a date or
+    random ids.
 
     Args:
         path: of the SVG.
@@ -53,7 +54,11 @@ def drawing(
     }
     with matplotlib.rc_context(style):
         figure, axes = plt.subplots(
-            rows, columns, figsize=(width or 5.4 * columns, height), squeeze=False, layout="constrained"
+            rows,
+            columns,
+            figsize=(width or 5.4 * columns, height),
+            squeeze=False,
+            layout="constrained",
         )
         yield list(axes.flat)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,7 +86,9 @@ def lines(
     log: bool = False,
     legend: bool = True,
 ) -> None:
-    """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from 0 to 1."""
+    """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from
+    0 to 1.
+    """
     for i, line in enumerate(series):
         mean = np.array([v.mean for v in line.y])
         keep = np.isfinite(mean)
@@ -93,9 +100,17 @@ def lines(
         shift = (i - (len(series) - 1) / 2) * 0.8
         bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
         axes.errorbar(
-            where + shift, mean[keep], yerr=bars, color=PALETTE[i % len(PALETTE)], marker=MARKERS[i % len(MARKERS)],
-            markersize=4.5, linewidth=1.4, elinewidth=0.8, capsize=2, label=line.name,
-        )  # fmt: skip
+            where + shift,
+            mean[keep],
+            yerr=bars,
+            color=PALETTE[i % len(PALETTE)],
+            marker=MARKERS[i % len(MARKERS)],
+            markersize=4.5,
+            linewidth=1.4,
+            elinewidth=0.8,
+            capsize=2,
+            label=line.name,
+        )
     axes.set(xlabel=x, ylabel=y)
     axes.set_title(title, loc="left", fontsize=9.5)
     if log:
@@ -115,7 +130,8 @@ def heatmap(
     framed: npt.NDArray[np.bool_],
     title: str,
 ) -> None:
-    """Shares as coloured cells with their numbers: blue toward 1, white at 0.5, red toward 0; undefined ones grey.
+    """Shares as coloured cells with their numbers: blue toward 1, white at 0.5, red toward 0;
+    undefined ones grey.
 
     Args:
         values: (R, C) in [0, 1], NaN where undefined.
@@ -127,13 +143,27 @@ def heatmap(
 
     axes.grid(False)
     colors = mpl.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
-    axes.pcolormesh(np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1)
+    axes.pcolormesh(
+        np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1
+    )
     for (i, j), value in np.ndenumerate(values):
         shown = f"{value:.2f}" if np.isfinite(value) else "–"
         dark = np.isfinite(value) and abs(value - 0.5) > 0.33
-        axes.text(j + 0.5, i + 0.5, shown, ha="center", va="center", fontsize=8, color="white" if dark else "black")
+        axes.text(
+            j + 0.5,
+            i + 0.5,
+            shown,
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if dark else "black",
+        )
         if framed[i, j]:
-            axes.add_patch(Rectangle((j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"))
+            axes.add_patch(
+                Rectangle(
+                    (j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"
+                )
+            )
     axes.set_xticks(np.arange(len(columns)) + 0.5, columns, rotation=30, ha="right")
     axes.set_yticks(np.arange(len(rows)) + 0.5, rows)
     axes.tick_params(length=0)
@@ -151,7 +181,8 @@ def cost_front(
     title: str,
     log: bool = True,
 ) -> list[str]:
-    """Error against seconds with intervals on both axes; the front as a staircase, dominated points in grey.
+    """Error against seconds with intervals on both axes; the front as a staircase, dominated points
+    in grey.
 
     ``log``: whether the error's axis is logarithmic, as that of seconds always is.
 
@@ -169,11 +200,20 @@ def cost_front(
             continue
         on = i in kept
         colour = PALETTE[0] if on else "#999999"
-        # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above it.
+        # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above
+        # it.
         axes.errorbar(
-            seconds.mean, quality.mean, color=colour, marker="o" if on else "x", markersize=5, linewidth=0,
-            elinewidth=0.8, capsize=2, xerr=_bars(seconds), yerr=_bars(quality),
-        )  # fmt: skip
+            seconds.mean,
+            quality.mean,
+            color=colour,
+            marker="o" if on else "x",
+            markersize=5,
+            linewidth=0,
+            elinewidth=0.8,
+            capsize=2,
+            xerr=_bars(seconds),
+            yerr=_bars(quality),
+        )
         notes.append(
             axes.annotate(
                 name,
@@ -186,7 +226,12 @@ def cost_front(
         )
     if kept:
         axes.step(
-            [cost[i] for i in kept], [error[i] for i in kept], where="post", color=PALETTE[0], linewidth=1, alpha=0.6
+            [cost[i] for i in kept],
+            [error[i] for i in kept],
+            where="post",
+            color=PALETTE[0],
+            linewidth=1,
+            alpha=0.6,
         )
     axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log" if log else "linear")
     axes.set_title(title, loc="left", fontsize=9.5)

@@ -1,4 +1,5 @@
-"""A report's content, apart from how it is written: sections of text, tables, figures and pictures."""
+"""A report's content, apart from how it is written: sections of text, tables, figures and
+pictures."""
 
 from __future__ import annotations
 
@@ -9,7 +10,8 @@ from dataclasses import dataclass, field
 class Table:
     """A table of ready-made text cells.
 
-    Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until a reader opens it.
+    Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until
+    a reader opens it.
     """
 
     columns: list[str]

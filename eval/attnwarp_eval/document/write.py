@@ -25,9 +25,12 @@ _CLASSES = {
 
 
 def inline(text: str) -> Markup:
-    """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) have been set."""
+    """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) have been
+    set."""
     escaped = html.escape(text, quote=False)
-    escaped = re.sub(r"`(#[0-9a-f]{6})`", r'<span class="swatch" style="background:\1"></span>', escaped)
+    escaped = re.sub(
+        r"`(#[0-9a-f]{6})`", r'<span class="swatch" style="background:\1"></span>', escaped
+    )
     escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
     return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped))
 

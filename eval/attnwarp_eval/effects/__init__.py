@@ -1,1 +1,3 @@
-"""Light transport: which effects a scene calls for, the cheapest plan that shows them, and its proof."""
+"""Light transport: which effects a scene calls for, the cheapest plan that shows them, and its
+proof.
+"""

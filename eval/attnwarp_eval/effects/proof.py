@@ -1,14 +1,18 @@
-"""Proof that a plan drops nothing that shows: a ladder of tests, each of which can refuse, and one that can certify.
+"""Proof that a plan drops nothing that shows: a ladder of tests, each of which can refuse, and one
+that can certify.
 
-1. Structural: what the plan leaves out is nowhere in the file, in Mitsuba's parsed graph or in the loaded scene.
-2. The same seed gives the same picture, bit for bit, where both take the same paths: certified, no statistics needed.
+1. Structural: what the plan leaves out is nowhere in the file, in Mitsuba's parsed graph or in the
+   loaded scene.
+2. The same seed gives the same picture, bit for bit, where both take the same paths: certified, no
+   statistics needed.
 3. Paired bias: the same seeds at one sample a pixel, a t-test on the differences of their means.
-4. Fresh seeds: Welch's test with Satterthwaite's degrees of freedom on every pixel, every 8 x 8 block and the whole
-   picture, with Sidak's correction over all of them, AND equivalence of the whole (two one-sided tests within 1 %).
+4. Fresh seeds: Welch's test with Satterthwaite's degrees of freedom on every pixel, every 8 x 8
+   block and the whole picture, with Sidak's correction over all of them, AND equivalence of the
+   whole (two one-sided tests within 1 %).
 
-No difference found is not yet equality: only the equivalence test certifies, and it refuses when the noise is too great
-for it. What neither side simulates no comparison can find: a scene that calls for it is never certified. The statistics
-are pure functions of stacks of pictures.
+No difference found is not yet equality: only the equivalence test certifies, and it refuses when
+the noise is too great for it. What neither side simulates no comparison can find: a scene that
+calls for it is never certified. The statistics are pure functions of stacks of pictures.
 """
 
 from __future__ import annotations
@@ -27,7 +31,16 @@ from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
-from attnwarp_eval.truth.plan import Lens, Pass, Plan, convex, everything_on, plan, small_lamps, small_lights
+from attnwarp_eval.truth.plan import (
+    Lens,
+    Pass,
+    Plan,
+    convex,
+    everything_on,
+    plan,
+    small_lamps,
+    small_lights,
+)
 
 Array = npt.NDArray[np.float64]
 Verdict = Literal["certified", "refused", "can't tell"]
@@ -47,7 +60,8 @@ ROUNDING = 1e-5
 """Relative differences below this are float32 sums taken in another order, not light."""
 
 
-# Statistics ----------------------------------------------------------------------------------------------------------
+# Statistics
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,36 +85,50 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
     """Welch (1947) with Satterthwaite's degrees of freedom, along the first axis.
 
     Args:
-        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Where neither varies, p is 1 for equal values
-            (within ``ROUNDING``) and 0 for others.
+        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Where neither varies, p is 1 for
+            equal values (within ``ROUNDING``) and 0 for others.
     """
     from scipy import stats
 
     first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if len(first) < 2 or len(second) < 2:
-        raise ValueError(f"a, b: got {len(first)} and {len(second)} samples, expected at least 2 of each")
+        raise ValueError(
+            f"a, b: got {len(first)} and {len(second)} samples, expected at least 2 of each"
+        )
     va, vb = first.var(0, ddof=1) / len(first), second.var(0, ddof=1) / len(second)
     difference, variance = second.mean(0) - first.mean(0), va + vb
     floor = (ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))) ** 2
     still = variance <= floor
     with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(still, np.inf, variance**2 / (va**2 / (len(first) - 1) + vb**2 / (len(second) - 1)))
+        freedom = np.where(
+            still, np.inf, variance**2 / (va**2 / (len(first) - 1) + vb**2 / (len(second) - 1))
+        )
         t = np.abs(difference) / np.sqrt(variance)
-        p = np.where(still, np.where(difference**2 <= floor, 1.0, 0.0), 2 * stats.t.sf(t, np.minimum(freedom, 1e9)))
+        p = np.where(
+            still,
+            np.where(difference**2 <= floor, 1.0, 0.0),
+            2 * stats.t.sf(t, np.minimum(freedom, 1e9)),
+        )
     return Welch(difference, np.sqrt(variance), freedom, p)
 
 
 def sidak(alpha: float, tests: int) -> float:
-    """The level of each of ``tests`` independent tests at which all together refuse a truth with chance ``alpha``."""
+    """The level of each of ``tests`` independent tests at which all together refuse a truth with
+    chance ``alpha``.
+    """
     return -math.expm1(math.log1p(-alpha) / max(tests, 1))
 
 
 def blocks(pictures: npt.ArrayLike, size: int = BLOCK) -> Array:
-    """Means over blocks of ``size`` x ``size`` pixels: (n, H, W, C) to (n, ceil(H / size), ceil(W / size), C)."""
+    """Means over blocks of ``size`` x ``size`` pixels: (n, H, W, C) to (n, ceil(H / size), ceil(W /
+    size), C).
+    """
     data = np.asarray(pictures, np.float64)
     rows, columns = (np.arange(0, n, size) for n in data.shape[1:3])
     sums = np.add.reduceat(np.add.reduceat(data, rows, axis=1), columns, axis=2)
-    tall, wide = (np.diff([*start, n]) for start, n in zip((rows, columns), data.shape[1:3], strict=True))
+    tall, wide = (
+        np.diff([*start, n]) for start, n in zip((rows, columns), data.shape[1:3], strict=True)
+    )
     return sums / (tall[:, None] * wide[None, :])[None, :, :, None]
 
 
@@ -114,8 +142,8 @@ class Level:
         least: the smallest p.
         threshold: what p must stay above, after Sidak over the values and over the three levels.
         worst: the largest difference in standard errors, as a share of the picture's mean.
-        detectable: the difference, as a share of the picture's mean, that a value of median noise would have shown with
-            80 % chance.
+        detectable: the difference, as a share of the picture's mean, that a value of median noise
+            would have shown with 80 % chance.
     """
 
     name: str
@@ -132,10 +160,12 @@ class Level:
 
 
 def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[Level]:
-    """Welch's test on pixels, blocks and the whole picture, refusing a true null with chance ``alpha`` in all.
+    """Welch's test on pixels, blocks and the whole picture, refusing a true null with chance
+    ``alpha`` in all.
 
     Args:
-        a, b: (n, H, W, C) and (m, H, W, C) pictures of independent seeds. Channels, which share noise, are averaged.
+        a, b: (n, H, W, C) and (m, H, W, C) pictures of independent seeds. Channels, which share
+            noise, are averaged.
     """
     from scipy import stats
 
@@ -154,9 +184,15 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
         reach = result.error * (stats.t.isf(threshold / 2, freedom) + stats.t.ppf(0.8, freedom))
         index = int(np.argmin(result.p))
         out.append(
-            Level(name, tests, float(result.p.min()), threshold, float(result.difference.ravel()[index]) / scale,
-                  float(np.median(reach)) / scale)
-        )  # fmt: skip
+            Level(
+                name,
+                tests,
+                float(result.p.min()),
+                threshold,
+                float(result.difference.ravel()[index]) / scale,
+                float(np.median(reach)) / scale,
+            )
+        )
     return out
 
 
@@ -175,7 +211,9 @@ class Equivalence:
 
     @property
     def bound(self) -> float:
-        """|difference| + 2.33 standard errors: with 99 % on either side the true difference is smaller."""
+        """|difference| + 2.33 standard errors: with 99 % on either side the true difference is
+        smaller.
+        """
         return abs(self.difference) + ONE_SIDED * self.error
 
     @property
@@ -185,8 +223,12 @@ class Equivalence:
 
 
 def equivalence(a: npt.ArrayLike, b: npt.ArrayLike, *, margin: float = MARGIN) -> Equivalence:
-    """Whether the means of two stacks of pictures are equal within ``margin`` of the mean of ``b``, the reference."""
-    first, second = (np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1)[:, None] for x in (a, b))
+    """Whether the means of two stacks of pictures are equal within ``margin`` of the mean of ``b``,
+    the reference.
+    """
+    first, second = (
+        np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1)[:, None] for x in (a, b)
+    )
     result, scale = welch(first, second), max(abs(float(second.mean())), 1e-300)
     return Equivalence(float(result.difference[0]) / scale, float(result.error[0]) / scale, margin)
 
@@ -208,19 +250,27 @@ class Paired:
 
 
 def paired(a: npt.ArrayLike, b: npt.ArrayLike) -> Paired:
-    """Student's t-test on mean(b_k) - mean(a_k): pictures (n, ...) whose k-th seeds are the same."""
+    """Student's t-test on mean(b_k) - mean(a_k): pictures (n, ...) whose k-th seeds are the
+    same."""
     from scipy import stats
 
-    first, second = (np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1) for x in (a, b))
+    first, second = (
+        np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1) for x in (a, b)
+    )
     scale = max(abs(float(second.mean())), 1e-300)
     d = (second - first) / scale
     error = float(d.std(ddof=1) / math.sqrt(len(d)))
     mean = float(d.mean())
-    p = float(2 * stats.t.sf(abs(mean) / error, len(d) - 1)) if error > ROUNDING else float(abs(mean) <= ROUNDING)
+    p = (
+        float(2 * stats.t.sf(abs(mean) / error, len(d) - 1))
+        if error > ROUNDING
+        else float(abs(mean) <= ROUNDING)
+    )
     return Paired(mean, error, p, len(d))
 
 
-# The ladder ----------------------------------------------------------------------------------------------------------
+# The ladder
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -238,12 +288,15 @@ class Proof:
     """What the ladder says of a plan.
 
     Attributes:
-        verdict: "certified" only when bits are equal or the equivalence test holds, nothing else refused, and all that
-            the scene calls for is simulated; "refused" when a difference was found; "can't tell" otherwise.
-        of_simulated: what the comparison alone says, of what is simulated; above ``verdict`` only where something is not.
+        verdict: "certified" only when bits are equal or the equivalence test holds, nothing else
+            refused, and all that the scene calls for is simulated; "refused" when a difference was
+            found; "can't tell" otherwise.
+        of_simulated: what the comparison alone says, of what is simulated; above ``verdict`` only
+            where something is not.
         not_simulated: what the scene calls for and neither the plan nor everything on shows.
         rungs: the tests, in order.
-        detectable: the smallest difference that could have been seen, a share of the mean, by level.
+        detectable: the smallest difference that could have been seen, a share of the mean, by
+            level.
         seconds: spent.
     """
 
@@ -259,7 +312,10 @@ class Proof:
         """The verdict, with the reason where it is not that of the comparison."""
         if self.verdict == self.of_simulated:
             return self.verdict
-        return f"{self.verdict}: not simulated: {', '.join(self.not_simulated)}; {self.of_simulated} but for that"
+        return (
+            f"{self.verdict}: not simulated: {', '.join(self.not_simulated)}; {self.of_simulated}"
+            " but for that"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
@@ -292,10 +348,12 @@ def prove(
     Args:
         size: of the square picture of the source view.
         seeds: pictures a side for the last rung, at least 10.
-        seconds: what rendering may take. Samples a pixel are chosen from a few trial pictures so that the equivalence
-            test can succeed, if that fits; if it does not, the verdict is "can't tell".
+        seconds: what rendering may take. Samples a pixel are chosen from a few trial pictures so
+            that the equivalence test can succeed, if that fits; if it does not, the verdict is
+            "can't tell".
         seed: the first of those used.
-        structure: without it the first rung is left out, so that the statistics stand alone (to test them).
+        structure: without it the first rung is left out, so that the statistics stand alone (to
+            test them).
 
     Raises:
         ValueError: fewer than 10 seeds a side.
@@ -314,13 +372,19 @@ def prove(
     def pictures(made: Plan, spp: int, first: int, count: int) -> Array:
         steps = _with_spp(made, spp)
         return np.stack(
-            [render_plan(scene, scene.source, steps, first + k, made_by=made_by) for k in range(count)]
+            [
+                render_plan(scene, scene.source, steps, first + k, made_by=made_by)
+                for k in range(count)
+            ]
         ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
-        # Both sides lack what is not simulated, so that equal pictures say nothing of it; unequal ones still refuse.
+        # Both sides lack what is not simulated, so that equal pictures say nothing of it; unequal
+        # ones still refuse.
         capped: Verdict = "can't tell" if blind and verdict == "certified" else verdict
-        return Proof(capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind)
+        return Proof(
+            capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind
+        )
 
     if rungs and rungs[0].passed is False:
         return finish("refused")
@@ -333,7 +397,9 @@ def prove(
 
 
 Pictures = Callable[[int, int, int, int], Array]
-"""Pictures (count, H, W, C) of a side (0 the plan, 1 everything on), samples a pixel, first seed and count."""
+"""Pictures (count, H, W, C) of a side (0 the plan, 1 everything on), samples a pixel, first seed
+and count.
+"""
 
 
 @dataclass(frozen=True)
@@ -346,12 +412,18 @@ class Climb:
 
 
 def climb(
-    pictures: Pictures, *, seeds: int = 12, seconds: float = 60.0, seed: int = 1000, alpha: float = ALPHA
+    pictures: Pictures,
+    *,
+    seeds: int = 12,
+    seconds: float = 60.0,
+    seed: int = 1000,
+    alpha: float = ALPHA,
 ) -> Climb:
-    """The rungs that look at pictures only; together they refuse two sides that are the same with chance ``alpha``.
+    """The rungs that look at pictures only; together they refuse two sides that are the same with
+    chance ``alpha``.
 
-    Two of them can refuse, paired bias and Welch's test, and they look at pictures of different seeds: each has Sidak's
-    share of ``alpha``.
+    Two of them can refuse, paired bias and Welch's test, and they look at pictures of different
+    seeds: each has Sidak's share of ``alpha``.
     """
     from scipy import stats
 
@@ -361,19 +433,22 @@ def climb(
     pairs = 24
     a, b = pictures(0, 1, seed, pairs), pictures(1, 1, seed, pairs)
     if np.array_equal(a, b):
-        rungs.append(Rung("same seed", True, f"{pairs} pictures equal bit for bit: the paths are the same"))
+        rungs.append(
+            Rung("same seed", True, f"{pairs} pictures equal bit for bit: the paths are the same")
+        )
         return Climb("certified", tuple(rungs), {"any": 0.0})
     rungs.append(Rung("same seed", None, "the pictures differ, as those of different paths do"))
     common = paired(a, b)
     bad = common.p < share
     rungs.append(
         Rung(
-            "paired bias, 1 spp", not bad,
-            f"everything on is {common.difference:+.2%} +- {common.error:.2%} brighter over {pairs} common seeds "
-            f"(p = {common.p:.2g}, refused below {share:.2g})",
+            "paired bias, 1 spp",
+            not bad,
+            f"everything on is {common.difference:+.2%} +- {common.error:.2%} brighter over {pairs}"
+            f" common seeds (p = {common.p:.2g}, refused below {share:.2g})",
             asdict(common),
         )
-    )  # fmt: skip
+    )
     if bad:
         reach = float(stats.t.isf(share / 2, pairs - 1) + stats.t.ppf(0.8, pairs - 1))
         return Climb("refused", tuple(rungs), {"picture": reach * common.error})
@@ -386,12 +461,13 @@ def climb(
     for level in found:
         rungs.append(
             Rung(
-                f"Welch, {level.name}", not level.differs,
-                f"least p {level.least:.2g} of {level.tests} (refused below {level.threshold:.2g}), "
-                f"there {level.worst:+.2%} of the mean",
+                f"Welch, {level.name}",
+                not level.differs,
+                f"least p {level.least:.2g} of {level.tests} (refused below {level.threshold:.2g}),"
+                f" there {level.worst:+.2%} of the mean",
                 asdict(level),
             )
-        )  # fmt: skip
+        )
     same = equivalence(a, b)
     rungs.append(
         Rung(
@@ -410,17 +486,23 @@ def _with_spp(made: Plan, spp: int) -> Plan:
     from dataclasses import replace
 
     least = min(step.spp for step in made.passes)
-    return replace(made, passes=tuple(replace(step, spp=spp * step.spp // least) for step in made.passes))
+    return replace(
+        made, passes=tuple(replace(step, spp=spp * step.spp // least) for step in made.passes)
+    )
 
 
 def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
-    """Samples a pixel at which 2.33 standard errors come to half the margin, or as many as the time allows."""
+    """Samples a pixel at which 2.33 standard errors come to half the margin, or as many as the time
+    allows.
+    """
     trial, count = 4, 6
     start = time.perf_counter()
     means = [pictures(side, trial, seed + 100 * side, count).mean((1, 2, 3)) for side in (0, 1)]
     each = (time.perf_counter() - start) / count / trial
     scale = max(abs(float(means[1].mean())), 1e-300)
-    variance = sum(float(m.var(ddof=1)) for m in means) / scale**2 * trial  # of one sample, both sides together
+    variance = (
+        sum(float(m.var(ddof=1)) for m in means) / scale**2 * trial
+    )  # of one sample, both sides together
     wanted = variance / seeds / (MARGIN / 2 / ONE_SIDED) ** 2
     affordable = max(0.0, seconds - (time.perf_counter() - start)) / (each * seeds)
     spp = max(16.0, min(wanted, affordable, 4096.0))
@@ -436,18 +518,26 @@ def _structural(scene: Scene, ours: Plan) -> Rung:
     blind: list[str] = [name for name in found if found[name].needed and not found[name].simulated]
     if found["caustics"].simulated and small_lights(scene) is not None:
         blind.append("caustics seen in mirrors and through glass")
-    lacks = list(_lacks(scene, ours, caustic=found["caustics"].needed and found["caustics"].simulated))
+    lacks = list(
+        _lacks(scene, ours, caustic=found["caustics"].needed and found["caustics"].simulated)
+    )
     bounces = scene.spec.appearance.bounces
     words = "what is left out is in neither the file nor Mitsuba's graphs"
     if found["interreflection"].source == "said":
-        words += f"; bounces beyond {bounces} are left out by the scene's own word and not part of this proof"
+        words += (
+            f"; bounces beyond {bounces} are left out by the scene's own word and not part of this"
+            " proof"
+        )
     if blind:
         words += f"; not simulated and so not proved: {', '.join(blind)}"
-    return Rung("structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks, "not_simulated": blind})
+    return Rung(
+        "structure", not lacks, "; ".join(lacks) or words, {"lacks": lacks, "not_simulated": blind}
+    )
 
 
 def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
-    """What the scene's words and Mitsuba's graphs call for and the plan's passes do not make, one sentence each.
+    """What the scene's words and Mitsuba's graphs call for and the plan's passes do not make, one
+    sentence each.
 
     Args:
         caustic: whether the scene has a caustic that can be simulated.
@@ -467,13 +557,20 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
     elif said is None and ours.lens is not None:
         yield "the scene says no lens, but the plan has one"
 
-    # What a light shows where something rough is seen first, and where something smooth is (or a lamp, or nothing).
+    # What a light shows where something rough is seen first, and where something smooth is (or a
+    # lamp, or nothing).
     both = {"smooth", "rough"}
     for name, shines in _shining(scene):
         seen: set[str] = set()
         for step in ours.passes:
             if step.sign > 0 and not step.beam and shines(step):
-                seen |= {"rough"} if step.integrator == "ptracer" else both if step.first == "any" else {step.first}
+                seen |= (
+                    {"rough"}
+                    if step.integrator == "ptracer"
+                    else both
+                    if step.first == "any"
+                    else {step.first}
+                )
         missing = sorted(both - seen)
         if missing:
             where = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
@@ -483,27 +580,45 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
         if taken > given:
             yield f"the beam of {name} is taken away and no paths from the light put it back"
 
-    # A surface that nothing else faces is lit once; everywhere else any bounce below the scene's own cap may show.
+    # A surface that nothing else faces is lit once; everywhere else any bounce below the scene's
+    # own cap may show.
     bounces = 1 if convex(scene) and not ours.media else spec.appearance.bounces
     depth = -1 if bounces == "unlimited" else bounces + 1
-    longer = [name for name in ("refraction", "specular", "subsurface", "medium", "interreflection") if name in called]
+    longer = [
+        name
+        for name in ("refraction", "specular", "subsurface", "medium", "interreflection")
+        if name in called
+    ]
     for step in ours.passes:
         reach = 2 if step.integrator == "direct" else step.max_depth
         if reach >= 0 and (depth < 0 or reach < depth):
             wanted = "no end" if depth < 0 else f"{depth} edges"
-            yield f"paths of the pass {step.integrator} have {reach} edges, but {', '.join(longer) or 'the scene'} needs {wanted}"
+            yield (
+                f"paths of the pass {step.integrator} have {reach} edges, but"
+                f" {', '.join(longer) or 'the scene'} needs {wanted}"
+            )
 
     if caustic:
         small = set(small_lamps(scene))
         for k, light in enumerate(spec.lights):
-            if light.type != "sky" and not any(s.integrator == "ptracer" and k in s.lights for s in ours.passes):
-                yield f"the caustic of lights[{k}], a {light.type}, needs paths from the light (ptracer)"
+            if light.type != "sky" and not any(
+                s.integrator == "ptracer" and k in s.lights for s in ours.passes
+            ):
+                yield (
+                    f"the caustic of lights[{k}], a {light.type}, needs paths from the light"
+                    " (ptracer)"
+                )
         if small and not any(step.integrator == "ptracer" and step.lamps for step in ours.passes):
-            yield f"the caustic of object {spec.objects[min(small)].name!r} needs paths from the light (ptracer)"
+            yield (
+                f"the caustic of object {spec.objects[min(small)].name!r} needs paths from the"
+                " light (ptracer)"
+            )
 
 
 def _shining(scene: Scene) -> Iterator[tuple[str, Callable[[Pass], bool]]]:
-    """Every light of a scene and its lamps together: what they are called, and whether they shine in a pass."""
+    """Every light of a scene and its lamps together: what they are called, and whether they shine
+    in a pass.
+    """
     for k, light in enumerate(scene.spec.lights):
         yield f"lights[{k}], a {light.type},", functools.partial(_shines, k)
     lamps = [item.name for item in scene.spec.objects if item.emission]

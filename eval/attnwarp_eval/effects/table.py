@@ -1,4 +1,6 @@
-"""The table of all scenes: which effects each one needs, the plan, its proof, what it saves, and what it looks like."""
+"""The table of all scenes: which effects each one needs, the plan, its proof, what it saves, and
+what it looks like.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,12 @@ USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
 
 TIMED = (
-    "time, everything on / plan", "at equal noise", "light changed by the cap", "time, everything on within the cap / plan",
+    "time, everything on / plan",
+    "at equal noise",
+    "light changed by the cap",
+    "time, everything on within the cap / plan",
     "at equal error",
-)  # fmt: skip
+)
 """Columns that come from timing."""
 
 AMPLIFIED = 8.0
@@ -65,10 +70,11 @@ def collect(
     settings: Settings,
     progress: Callable[[str, int], None] = lambda *_: None,
 ) -> list[dict[str, Any]]:
-    """Make the table's entries and write them, with their pictures, below ``out``; what is there already is kept.
+    """Make the table's entries and write them, with their pictures, below ``out``; what is there
+    already is kept.
 
-    Entries are kept by the scene's content, the settings and Mitsuba's version and variant: after an interruption, or
-    when one scene has changed, only what is missing is made.
+    Entries are kept by the scene's content, the settings and Mitsuba's version and variant: after
+    an interruption, or when one scene has changed, only what is missing is made.
 
     Args:
         names: scenes' names or paths.
@@ -79,7 +85,8 @@ def collect(
         The entries, as they stand in ``effects.json``.
 
     Raises:
-        InputError: a scene that is unknown or contradicts itself, or an ``effects.json`` of something else.
+        InputError: a scene that is unknown or contradicts itself, or an ``effects.json`` of
+            something else.
     """
     import mitsuba
 
@@ -92,21 +99,37 @@ def collect(
     for number, name in enumerate(names):
         scene = load_scene(name)
         key = content_key(
-            "effects", PROTOCOL, APPEARANCE_PROTOCOL, mitsuba.__version__, variant(), scene.content_hash,
-            settings.prove, settings.budget, settings.rounds,
-        )  # fmt: skip
+            "effects",
+            PROTOCOL,
+            APPEARANCE_PROTOCOL,
+            mitsuba.__version__,
+            variant(),
+            scene.content_hash,
+            settings.prove,
+            settings.budget,
+            settings.rounds,
+        )
         entry = known.get(scene.name)
-        if entry is None or entry["key"] != key or (settings.pictures and not (out / entry["picture"]).is_file()):
-            entry = {"key": key} | _entry(scene, out, settings, functools.partial(_told, progress, number))
+        if (
+            entry is None
+            or entry["key"] != key
+            or (settings.pictures and not (out / entry["picture"]).is_file())
+        ):
+            entry = {"key": key} | _entry(
+                scene, out, settings, functools.partial(_told, progress, number)
+            )
             known[scene.name] = entry
         entries.append(entry)
-        # Scenes of an earlier call stay in the file; the table is of those asked for, as far as they are done.
+        # Scenes of an earlier call stay in the file; the table is of those asked for, as far as
+        # they are done.
         _write(out, known, entries)
         forget()
     return entries
 
 
-def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]) -> dict[str, Any]:
+def _entry(
+    scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]
+) -> dict[str, Any]:
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
@@ -120,7 +143,9 @@ def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str]
         "variant": variant(),
         "needed": [name for name in found if found[name].needed and found[name].simulated],
         "left_out": [name for name in found if found[name].source == "said"],
-        "not_simulated": [name for name in found if found[name].needed and not found[name].simulated],
+        "not_simulated": [
+            name for name in found if found[name].needed and not found[name].simulated
+        ],
         "plan": planned.to_dict(),
         "everything_on": everything_on(scene, capped=False).to_dict(),
         "picture": f"{scene.name}.jpg",
@@ -141,7 +166,8 @@ def _entry(scene: Scene, out: Path, settings: Settings, progress: Callable[[str]
 
 
 def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
-    """Write plan, everything on and their difference (grey is none, ``AMPLIFIED`` times) as one JPEG.
+    """Write plan, everything on and their difference (grey is none, ``AMPLIFIED`` times) as one
+    JPEG.
 
     Returns:
         "largest_difference": of an 8 x 8 block of the displayed pictures, in [0, 1].
@@ -177,10 +203,15 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
     except FileNotFoundError:
         return {}
     try:
-        return {entry["scene"]: entry for entry in json.loads(text)["scenes"] if entry["key"] and entry["picture"]}
+        return {
+            entry["scene"]: entry
+            for entry in json.loads(text)["scenes"]
+            if entry["key"] and entry["picture"]
+        }
     except (ValueError, KeyError, TypeError):
         raise InputError(
-            f"{path}: it is not a table of effects; name another folder with --out, or remove the file"
+            f"{path}: it is not a table of effects; name another folder with --out, or remove the"
+            " file"
         ) from None
 
 
@@ -191,7 +222,10 @@ def _told(progress: Callable[[str, int], None], number: int, text: str) -> None:
 def _write(out: Path, known: Mapping[str, Any], shown: Sequence[Mapping[str, Any]]) -> None:
     from attnwarp_eval.cost import environment
 
-    data: dict[str, Any] = {"environment": environment(), "scenes": [known[name] for name in sorted(known)]}
+    data: dict[str, Any] = {
+        "environment": environment(),
+        "scenes": [known[name] for name in sorted(known)],
+    }
     _replace(out / "effects.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
     _replace(out / "effects.md", _page(shown, data["environment"]))
 
@@ -203,15 +237,24 @@ def _replace(path: Path, text: str) -> None:
     temporary.replace(path)
 
 
-# Words ---------------------------------------------------------------------------------------------------------------
+# Words
+# --------------------------------------------------------------------------------------------------
 
 
 def table(entries: Iterable[Mapping[str, Any]]) -> Table:
     """The entries as a table: effects, plan, and what was proved and timed of them."""
     from attnwarp_eval.document.model import Table
 
-    columns = ["scene", "beyond the usual", "not simulated", "plan", "proof", "bound", "smallest difference seen",
-               *TIMED]  # fmt: skip
+    columns = [
+        "scene",
+        "beyond the usual",
+        "not simulated",
+        "plan",
+        "proof",
+        "bound",
+        "smallest difference seen",
+        *TIMED,
+    ]
     rows = []
     for entry in entries:
         proof, cost = entry.get("proof"), entry.get("cost")
@@ -232,11 +275,15 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
 
 def plan_words(planned: Mapping[str, Any]) -> str:
     """A plan in a few words: integrator, and the camera where it is not a pinhole."""
-    return str(planned["integrator"]) + (", thin lens" if planned["sensor"]["type"] == "thinlens" else "")
+    return str(planned["integrator"]) + (
+        ", thin lens" if planned["sensor"]["type"] == "thinlens" else ""
+    )
 
 
 def proof_words(proof: Mapping[str, Any]) -> str:
-    """A verdict in a few words, with what the comparison alone came to where something is not simulated."""
+    """A verdict in a few words, with what the comparison alone came to where something is not
+    simulated.
+    """
     if proof["verdict"] == proof["of_simulated"]:
         return str(proof["verdict"])
     return f"{proof['verdict']} ({proof['of_simulated']} but for what is not simulated)"
@@ -254,8 +301,11 @@ def _bound(proof: Mapping[str, Any] | None) -> str:
 def _smallest(proof: Mapping[str, Any] | None) -> str:
     if proof is None or "any" in proof["detectable"]:
         return "–"
-    return ", ".join(f"{name} {proof['detectable'][name]:.2g}" for name in ("picture", "block", "pixel")
-                     if name in proof["detectable"])  # fmt: skip
+    return ", ".join(
+        f"{name} {proof['detectable'][name]:.2g}"
+        for name in ("picture", "block", "pixel")
+        if name in proof["detectable"]
+    )
 
 
 def _times(cost: Mapping[str, Any] | None) -> list[str]:
@@ -274,8 +324,16 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
         return [number(cost["faster"]), noise, "no cap", number(cost["faster"]), noise]
     bias = "–"
     if cap["bias"] is not None:
-        bias = f"{cap['bias']:+.1%} [{cap['bias_interval'][0]:+.1%}, {cap['bias_interval'][1]:+.1%}]"
-    return [number(cost["faster"]), noise, bias, number(cap["faster"]), ratio(cap["at_equal_error"], cap["interval"])]
+        bias = (
+            f"{cap['bias']:+.1%} [{cap['bias_interval'][0]:+.1%}, {cap['bias_interval'][1]:+.1%}]"
+        )
+    return [
+        number(cost["faster"]),
+        noise,
+        bias,
+        number(cap["faster"]),
+        ratio(cap["at_equal_error"], cap["interval"]),
+    ]
 
 
 def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
@@ -283,7 +341,10 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
     from attnwarp_eval.document.write import markdown
 
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
-    partly = sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries) - certified
+    partly = (
+        sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries)
+        - certified
+    )
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
     costs = [entry["cost"] for entry in entries if "cost" in entry]
     lead = [
@@ -291,29 +352,37 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
         + (f", {partly} more but for what is not simulated" if partly else "")
         + f". Mitsuba {about['versions']['mitsuba']} as "
         f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
-        f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of docs/effects.md at 32 x 32 "
-        "from the source; **bound** is |d| + 2.33 SE of the picture's mean, which must stay below 1 %; the **smallest "
-        "difference** that would have been seen with 80 % chance is a share of the picture's mean, for the picture, an "
-        "8 x 8 block and a pixel.",
+        (
+            f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of"
+            " docs/effects.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
+            " picture's mean, which must stay below 1 %; the **smallest difference** that would"
+            " have been seen with 80 % chance is a share of the picture's mean, for the picture,"
+            " an 8 x 8 block and a pixel."
+        ),
     ]
     if costs:
         lead.append(
-            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in turn, {costs[0]['rounds']} "
-            "rounds. Everything on follows light until roulette ends it. **At equal noise**: the same times the ratio of "
-            "variances. Where a scene caps its bounces the plan leaves light out by the scene's own word, so that the two "
-            "pictures have other means and equal noise is not equal error: the **light changed by the cap** is the mean of "
-            "the plan's pictures against that of everything on without a cap. **At equal error** is therefore against "
-            "everything on within the cap, whose pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds "
-            "(of the light by Welch's test); above 1 the plan saves. An interval that holds 1 says that nothing was seen to "
-            "be saved."
+            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in"
+            f" turn, {costs[0]['rounds']} rounds. Everything on follows light until roulette ends"
+            " it. **At equal noise**: the same times the ratio of variances. Where a scene caps"
+            " its bounces the plan leaves light out by the scene's own word, so that the two"
+            " pictures have other means and equal noise is not equal error: the **light changed by"
+            " the cap** is the mean of the plan's pictures against that of everything on without a"
+            " cap. **At equal error** is therefore against everything on within the cap, whose"
+            " pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds (of the"
+            " light by Welch's test); above 1 the plan saves. An interval that holds 1 says that"
+            " nothing was seen to be saved."
         )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
     drawn = [entry for entry in entries if "largest_difference" in entry]
     if drawn:
         text = [
-            f"The plan ({PLAN_SAMPLES} samples), everything on within the scene's own cap on bounces ({FULL_SAMPLES}), and "
-            f"their difference as displayed, {AMPLIFIED:g} times (grey is none). What is left is noise, most of it "
-            "everything on's. The number is the largest difference of an 8 x 8 block, of 1.",
+            (
+                f"The plan ({PLAN_SAMPLES} samples), everything on within the scene's own cap on"
+                f" bounces ({FULL_SAMPLES}), and their difference as displayed, {AMPLIFIED:g} times"
+                " (grey is none). What is left is noise, most of it everything on's. The number is"
+                " the largest difference of an 8 x 8 block, of 1."
+            ),
         ]
         rows = [
             (f"**{e['scene']}** ({plan_words(e['plan'])}; {e['largest_difference']:.4f})",
@@ -321,11 +390,15 @@ def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str
             for e in drawn
         ]  # fmt: skip
         sections.append(Section("Side by side", text, gallery=Gallery(rows)))
-    return markdown(Report("What light does in each scene, and what of it is simulated", lead, sections))
+    return markdown(
+        Report("What light does in each scene, and what of it is simulated", lead, sections)
+    )
 
 
 def said_by(scene: Scene) -> dict[str, Any]:
-    """What a run keeps of a scene's effects: those its file calls for, with the words, and the plan."""
+    """What a run keeps of a scene's effects: those its file calls for, with the words, and the
+    plan.
+    """
     words = called_for(scene.spec)
     return {
         "needed": {name: text for name, text in words.items() if name not in NOT_SIMULATED},

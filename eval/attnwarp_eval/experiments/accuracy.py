@@ -1,9 +1,10 @@
-"""What accuracy of the truth itself costs in time: error against seconds of pictures, depth and visibility.
+"""What accuracy of the truth itself costs in time: error against seconds of pictures, depth and
+visibility.
 
-Every contestant is held against an answer that it does not share: pictures against the mean of many others at far more
-samples, depth and visibility against every triangle of the scene met one by one in float64. Seconds are taken in turn, in
-an order drawn anew each round; the first contestant runs twice a round, and the ratio of it to itself is what noise
-alone does on the machine.
+Every contestant is held against an answer that it does not share: pictures against the mean of many
+others at far more samples, depth and visibility against every triangle of the scene met one by one
+in float64. Seconds are taken in turn, in an order drawn anew each round; the first contestant runs
+twice a round, and the ratio of it to itself is what noise alone does on the machine.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ MAPS = (32, 128, 512)
 """Sizes of the depth maps whose test of visibility is held against rays."""
 
 WRONG = 1e-3
-"""A depth this far off, relatively, is that of another surface, or of no use; it is counted apart."""
+"""A depth this far off, relatively, is that of another surface, or of no use; it is counted
+apart."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,8 @@ class Contestant:
 
     Attributes:
         name: for a person.
-        error: in the panel's unit, with a 95 % interval where rounds differ (bootstrap over rounds), else three times itself.
+        error: in the panel's unit, with a 95 % interval where rounds differ (bootstrap over
+            rounds), else three times itself.
         seconds: of each round.
         more: further figures by name.
     """
@@ -67,7 +70,8 @@ class Panel:
         unit: of the error.
         contestants: the baseline first.
         again: seconds of the baseline's second run of each round.
-        efficiency: error's variance times seconds of each round, relative to the baseline's ("pictures" only).
+        efficiency: error's variance times seconds of each round, relative to the baseline's
+            ("pictures" only).
     """
 
     question: str
@@ -78,13 +82,19 @@ class Panel:
     squares: tuple[tuple[float, ...], ...] = ()
 
     def ratio(self, index: int | None) -> Ratio:
-        """Seconds of a contestant (None: the baseline's second run) over the baseline's, paired by round."""
+        """Seconds of a contestant (None: the baseline's second run) over the baseline's, paired by
+        round.
+        """
         seconds = self.again if index is None else self.contestants[index].seconds
         return time_ratio([seconds], [self.contestants[0].seconds])
 
     def at_equal_error(self, index: int) -> Ratio:
-        """Variance x seconds of a contestant over the baseline's, paired by round: what the same noise would take."""
-        products = [np.array(self.squares[k]) * np.array(self.contestants[k].seconds) for k in (index, 0)]
+        """Variance x seconds of a contestant over the baseline's, paired by round: what the same
+        noise would take.
+        """
+        products = [
+            np.array(self.squares[k]) * np.array(self.contestants[k].seconds) for k in (index, 0)
+        ]
         return time_ratio([products[0].tolist()], [products[1].tolist()])
 
 
@@ -94,10 +104,12 @@ def in_turn(
     seed: int = 0,
     before: Callable[[int], None] = lambda _: None,
 ) -> tuple[list[list[Any]], list[list[float]]]:
-    """Results and seconds of ``works`` and of the first of them again, each round in an order drawn anew.
+    """Results and seconds of ``works`` and of the first of them again, each round in an order drawn
+    anew.
 
     Args:
-        works: called with the number of the round. A first round, which compiles and fills caches, is not kept.
+        works: called with the number of the round. A first round, which compiles and fills caches,
+            is not kept.
         rounds: how many are kept.
         seed: of the order.
         before: called with the index of the work that comes next, untimed.
@@ -119,7 +131,8 @@ def in_turn(
     return results, seconds
 
 
-# Pictures ------------------------------------------------------------------------------------------------------------
+# Pictures
+# --------------------------------------------------------------------------------------------------
 
 
 def pictures(
@@ -131,14 +144,15 @@ def pictures(
     reference: tuple[int, int] = (16, 256),
     progress: Callable[[str], None] = lambda _: None,
 ) -> Panel:
-    """Error of the source's picture against a converged one, by samples a pixel, plan and Mitsuba's variant.
+    """Error of the source's picture against a converged one, by samples a pixel, plan and Mitsuba's
+    variant.
 
     Args:
         size: of the square picture.
         samples: a pixel.
         rounds: pictures of each contestant.
-        reference: how many pictures of how many samples the converged one is the mean of. Its own noise is estimated
-            from their spread and taken out of the errors.
+        reference: how many pictures of how many samples the converged one is the mean of. Its own
+            noise is estimated from their spread and taken out of the errors.
     """
     from attnwarp_eval.truth.llvm import LLVM, SCALAR, variant
     from attnwarp_eval.truth.mitsuba import render_plan, use
@@ -147,7 +161,9 @@ def pictures(
     small = scene.with_size(size, size)
     best = variant()
     contestants = [(f"plan, {spp} spp", plan(small, spp), best) for spp in samples]
-    contestants += [(f"everything on, {spp} spp", everything_on(small, spp), best) for spp in samples[-2:]]
+    contestants += [
+        (f"everything on, {spp} spp", everything_on(small, spp), best) for spp in samples[-2:]
+    ]
     if best == LLVM:
         contestants += [(f"plan, {spp} spp, scalar", plan(small, spp), SCALAR) for spp in samples]
     # The baseline is the plan at the second largest number of samples.
@@ -156,7 +172,10 @@ def pictures(
     progress(f"{scene.name}: converged picture")
     count, spp = reference
     made = np.stack(
-        [render_plan(small, small.source, plan(small, spp), 50_000 + k, made_by=best) for k in range(count)]
+        [
+            render_plan(small, small.source, plan(small, spp), 50_000 + k, made_by=best)
+            for k in range(count)
+        ]
     )
     truth = made.mean(0, dtype=np.float64)
     floor = float(made.var(0, ddof=1, dtype=np.float64).mean()) / count
@@ -179,19 +198,24 @@ def pictures(
         error = float(np.sqrt(max(square.mean(), 0.0))) / scale
         low, high = np.quantile(drawn, [0.025, 0.975])
         means = stack.mean((1, 2, 3)) / scale - 1
-        more = {"bias": float(means.mean()), "bias_error": float(means.std(ddof=1) / np.sqrt(rounds))}
+        more = {
+            "bias": float(means.mean()),
+            "bias_error": float(means.std(ddof=1) / np.sqrt(rounds)),
+        }
         out.append(Contestant(name, (error, float(low), float(high)), tuple(took), more))
         squares.append(tuple(np.clip(square, 1e-300, None).tolist()))
     unit = "RMS error of a pixel, share of the picture's mean"
     return Panel("pictures", scene.name, unit, tuple(out), tuple(seconds[-1]), tuple(squares))
 
 
-# Depth ---------------------------------------------------------------------------------------------------------------
+# Depth
+# --------------------------------------------------------------------------------------------------
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def every_triangle(origins: Array, directions: Array, corners: Array, limit: Array) -> Array:
-    """First hit of each ray with any of the triangles, all of them tried in float64 (Moeller & Trumbore 1997).
+    """First hit of each ray with any of the triangles, all of them tried in float64 (Moeller &
+    Trumbore 1997).
 
     Args:
         origins, directions: (N, 3); directions of any length, t counts in units of it.
@@ -227,7 +251,9 @@ def every_triangle(origins: Array, directions: Array, corners: Array, limit: Arr
 
 
 def _triangles(scene: Scene) -> list[Mesh]:
-    """The scene's triangles alone: spheres and rectangles are closed forms, where there is nothing to refine."""
+    """The scene's triangles alone: spheres and rectangles are closed forms, where there is nothing
+    to refine.
+    """
     from attnwarp_eval.scene.shapes import Box, Mesh
 
     meshes = [shape.mesh() if isinstance(shape, Box) else shape for shape in scene.shapes()]
@@ -235,14 +261,23 @@ def _triangles(scene: Scene) -> list[Mesh]:
     if not found:
         from attnwarp.errors import InputError
 
-        raise InputError(f"scene {scene.name}: it has no triangles, so that nothing is refined; take one with a mesh")
+        raise InputError(
+            f"scene {scene.name}: it has no triangles, so that nothing is refined; take one with a"
+            " mesh"
+        )
     return found
 
 
 def depth(
-    scene: Scene, *, size: int = 512, rays: int = 500, rounds: int = 9, progress: Callable[[str], None] = lambda _: None
+    scene: Scene,
+    *,
+    size: int = 512,
+    rays: int = 500,
+    rounds: int = 9,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Panel:
-    """Error of depth with the hit as Open3D has it (float32) and refined on its triangle's plane in float64.
+    """Error of depth with the hit as Open3D has it (float32) and refined on its triangle's plane in
+    float64.
 
     Args:
         size: of the square image that is traced.
@@ -265,7 +300,8 @@ def depth(
     raw = o3d.t.geometry.RaycastingScene(nthreads=0)
     for mesh in meshes:
         raw.add_triangles(
-            o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
+            o3d.core.Tensor(mesh.vertices.astype(np.float32)),
+            o3d.core.Tensor(mesh.faces.astype(np.uint32)),
         )
 
     def said(_: int) -> Array:
@@ -282,14 +318,19 @@ def depth(
 
         return work
 
-    progress(f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {rays} rays in float64")
+    progress(
+        f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {rays} rays in"
+        " float64"
+    )
     valid = np.flatnonzero(refined.trace(camera).valid.ravel())
     chosen = np.sort(np.random.default_rng(0).choice(valid, min(rays, len(valid)), replace=False))
     directions = (camera.directions() @ camera.rotation).reshape(-1, 3)[chosen]
     # Seen from the camera, so that its place takes no digits.
     corners = np.concatenate([(m.vertices - camera.position)[m.faces] for m in meshes])
     limit = np.full(len(chosen), np.inf)
-    exact = every_triangle(np.zeros_like(directions), np.ascontiguousarray(directions), corners, limit)
+    exact = every_triangle(
+        np.zeros_like(directions), np.ascontiguousarray(directions), corners, limit
+    )
 
     progress(f"{scene.name}: depth at {size} x {size}, {rounds} rounds")
     works = [traced(refined), traced(unrefined), said]
@@ -304,21 +345,31 @@ def depth(
         worst, half = float(kept.max()), float(np.median(kept))
         more = {"median": half, "p99": float(np.quantile(kept, 0.99)), "wrong": float(wrong.mean())}
         out.append(Contestant(name, (worst, worst, worst), tuple(took), more))
-    return Panel("depth", scene.name, "largest relative error of depth", tuple(out), tuple(seconds[-1]))
+    return Panel(
+        "depth", scene.name, "largest relative error of depth", tuple(out), tuple(seconds[-1])
+    )
 
 
-# Visibility ----------------------------------------------------------------------------------------------------------
+# Visibility
+# --------------------------------------------------------------------------------------------------
 
 
 def visibility(
-    scene: Scene, *, size: int = 512, points: int = 500, rounds: int = 5, maps: Sequence[int] = MAPS,
+    scene: Scene,
+    *,
+    size: int = 512,
+    points: int = 500,
+    rounds: int = 5,
+    maps: Sequence[int] = MAPS,
     progress: Callable[[str], None] = lambda _: None,
-) -> Panel:  # fmt: skip
-    """Whether surface points of the middle target are seen by the source: by rays, and by depth maps of the source.
+) -> Panel:
+    """Whether surface points of the middle target are seen by the source: by rays, and by depth
+    maps of the source.
 
-    A point is asked about when it faces the source and falls inside its image. A depth map answers with its nearest pixel
-    (visible when not more than 1 % behind it), or bilinearly in 1 / z (and then not where its four pixels spread by more
-    than 2 %). What a ray from the source meets first, of all triangles in float64, is right.
+    A point is asked about when it faces the source and falls inside its image. A depth map answers
+    with its nearest pixel (visible when not more than 1 % behind it), or bilinearly in 1 / z (and
+    then not where its four pixels spread by more than 2 %). What a ray from the source meets first,
+    of all triangles in float64, is right.
 
     Args:
         size: of the target, whose every pixel is a point.
@@ -348,12 +399,19 @@ def visibility(
 
         return work
 
-    progress(f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {points} points in float64")
-    chosen = np.sort(np.random.default_rng(1).choice(len(where), min(points, len(where)), replace=False))
+    progress(
+        f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {points} points in"
+        " float64"
+    )
+    chosen = np.sort(
+        np.random.default_rng(1).choice(len(where), min(points, len(where)), replace=False)
+    )
     away = where[chosen] - source.position
     corners = np.concatenate([(m.vertices - source.position)[m.faces] for m in meshes])
     # What lies within 1e-7 of the way before the point is its own surface, or one glued to it.
-    first = every_triangle(np.zeros_like(away), np.ascontiguousarray(away), corners, np.full(len(away), 1 - 1e-7))
+    first = every_triangle(
+        np.zeros_like(away), np.ascontiguousarray(away), corners, np.full(len(away), 1 - 1e-7)
+    )
     seen = ~np.isfinite(first)
 
     works: list[Callable[[int], Any]] = [by_rays]
@@ -361,7 +419,9 @@ def visibility(
     for pixels in maps:
         for bilinear in (False, True):
             works.append(by_map(pixels, bilinear))
-            names.append(f"depth map {pixels}, {'bilinear in 1/z, 2 %' if bilinear else 'nearest, 1 %'}")
+            names.append(
+                f"depth map {pixels}, {'bilinear in 1/z, 2 %' if bilinear else 'nearest, 1 %'}"
+            )
     progress(f"{scene.name}: visibility of {len(where)} points, {rounds} rounds")
     results, seconds = in_turn(works, rounds)
     out = []
@@ -369,9 +429,19 @@ def visibility(
         answer = got[0][chosen]
         right, answered = int((answer == seen).sum()), np.isfinite(answer)
         wrong = int((answer[answered] != seen[answered]).sum())
-        more = {"wrong": wrong / len(seen), "unanswered": float(1 - answered.mean()), "points": float(len(seen))}
+        more = {
+            "wrong": wrong / len(seen),
+            "unanswered": float(1 - answered.mean()),
+            "points": float(len(seen)),
+        }
         out.append(Contestant(name, _share(len(seen) - right, len(seen)), tuple(took), more))
-    return Panel("visibility", scene.name, "share of points not labelled rightly", tuple(out), tuple(seconds[-1]))
+    return Panel(
+        "visibility",
+        scene.name,
+        "share of points not labelled rightly",
+        tuple(out),
+        tuple(seconds[-1]),
+    )
 
 
 def _share(count: int, total: int) -> tuple[float, float, float]:
@@ -389,13 +459,19 @@ def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = local @ source.K.T
         xy = xy[..., :2] / xy[..., 2:]
-    inside = (local[..., 2] > 0) & (xy > 0).all(-1) & (xy[..., 0] < source.width) & (xy[..., 1] < source.height)
+    inside = (
+        (local[..., 2] > 0)
+        & (xy > 0).all(-1)
+        & (xy[..., 0] < source.width)
+        & (xy[..., 1] < source.height)
+    )
     facing = np.einsum("hwi,hwi->hw", np.nan_to_num(hits.normal), source.position - point) > 0
     return hits.valid & inside & facing
 
 
 def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) -> Array:
-    """1 where a point is not behind the depth map, 0 where it is, NaN where the map has no answer."""
+    """1 where a point is not behind the depth map, 0 where it is, NaN where the map has no
+    answer."""
     local = (points - camera.position) @ camera.rotation.T
     z = local[:, 2]
     x, y = ((local @ camera.K.T)[:, k] / z for k in (0, 1))
@@ -416,7 +492,8 @@ def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) ->
         return np.where(steady, (z <= 1.01 * surface).astype(float), np.nan)
 
 
-# All together --------------------------------------------------------------------------------------------------------
+# All together
+# --------------------------------------------------------------------------------------------------
 
 
 def measure(
@@ -425,7 +502,8 @@ def measure(
     """Every question on every scene that it makes sense for.
 
     Args:
-        names: scenes' names or paths; :data:`PICTURE_SCENES` and :data:`GEOMETRY_SCENES` if left out.
+        names: scenes' names or paths; :data:`PICTURE_SCENES` and :data:`GEOMETRY_SCENES` if left
+            out.
         rounds: of every timing.
         progress: told what is at work.
     """
@@ -462,21 +540,32 @@ def _read(path: Path) -> list[Panel]:
         found = []
         for said in json.loads(text)["panels"]:
             contestants = [
-                Contestant(c["name"], tuple(c["error"]), tuple(c["seconds"]), c["more"]) for c in said["contestants"]
+                Contestant(c["name"], tuple(c["error"]), tuple(c["seconds"]), c["more"])
+                for c in said["contestants"]
             ]
             squares = tuple(tuple(row) for row in said["squares"])
             found.append(
-                Panel(said["question"], said["scene"], said["unit"], tuple(contestants), tuple(said["again"]), squares)
+                Panel(
+                    said["question"],
+                    said["scene"],
+                    said["unit"],
+                    tuple(contestants),
+                    tuple(said["again"]),
+                    squares,
+                )
             )
     except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: it is no measurement of accuracy; name another folder with --out") from None
+        raise InputError(
+            f"{path}: it is no measurement of accuracy; name another folder with --out"
+        ) from None
     return found
 
 
 def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     """accuracy.md, accuracy.json and the figures below ``out``; their paths.
 
-    Panels of other scenes that are in ``accuracy.json`` already stay, so that scenes can be measured one by one.
+    Panels of other scenes that are in ``accuracy.json`` already stay, so that scenes can be
+    measured one by one.
 
     Raises:
         InputError: an ``accuracy.json`` of something else.
@@ -492,16 +581,21 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
 
     out.mkdir(parents=True, exist_ok=True)
     nan = float("nan")
-    merged = {(panel.question, panel.scene): panel for panel in [*_read(out / "accuracy.json"), *panels]}
+    merged = {
+        (panel.question, panel.scene): panel for panel in [*_read(out / "accuracy.json"), *panels]
+    }
     panels = list(merged.values())
 
     def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
         mean, low, high = panel.contestants[k].error
         if mean == 0 and high > 0:
-            # None wrong has no place on a logarithmic axis: shown at half a point, up to what none of so many excludes.
+            # None wrong has no place on a logarithmic axis: shown at half a point, up to what none
+            # of so many excludes.
             mean = 0.5 / panel.contestants[k].more["points"]
-        seconds = Interval(base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan)
+        seconds = Interval(
+            base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan
+        )
         return seconds, Interval(mean, low, high, 1, 1, 0, nan, nan)
 
     drawn = []
@@ -523,20 +617,39 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         ]  # fmt: skip
     about = environment()
     lead = [
-        f"Mitsuba {about['versions']['mitsuba']} as `{variant()}`, Open3D {about['versions']['open3d']}, "
-        f"{about['machine']['cores']} cores ({about['machine']['arch']}).",
-        "All contestants of a scene ran in turn in one process, in an order drawn anew each round. A ratio is the median "
-        "over rounds of the ratio to the first row within a round, with a 95 % bootstrap interval over rounds. The row "
-        "`again` is the first row against itself: inside its band nothing is called faster or slower.",
+        (
+            f"Mitsuba {about['versions']['mitsuba']} as `{variant()}`, Open3D"
+            f" {about['versions']['open3d']}, {about['machine']['cores']} cores"
+            f" ({about['machine']['arch']})."
+        ),
+        (
+            "All contestants of a scene ran in turn in one process, in an order drawn anew each"
+            " round. A ratio is the median over rounds of the ratio to the first row within a"
+            " round, with a 95 % bootstrap interval over rounds. The row `again` is the first row"
+            " against itself: inside its band nothing is called faster or slower."
+        ),
     ]
     files = [out / "accuracy.md", out / "accuracy.json", *(path for _, path in drawn)]
-    files[0].write_text(markdown(Report("Error of the truth itself, against time", lead, sections)), encoding="utf-8")
-    data = {"environment": about, "variant": variant(), "panels": [asdict(panel) for panel in panels]}
-    files[1].write_text(json.dumps(data, indent=1, allow_nan=False, default=float) + "\n", encoding="utf-8")
+    files[0].write_text(
+        markdown(Report("Error of the truth itself, against time", lead, sections)),
+        encoding="utf-8",
+    )
+    data = {
+        "environment": about,
+        "variant": variant(),
+        "panels": [asdict(panel) for panel in panels],
+    }
+    files[1].write_text(
+        json.dumps(data, indent=1, allow_nan=False, default=float) + "\n", encoding="utf-8"
+    )
     return files
 
 
-SHORT = {"pictures": "RMS error / mean", "depth": "largest relative error", "visibility": "not labelled rightly"}
+SHORT = {
+    "pictures": "RMS error / mean",
+    "depth": "largest relative error",
+    "visibility": "not labelled rightly",
+}
 TITLES = {
     "pictures": "Pictures: samples, plan and variant",
     "depth": "Depth: float32 hits and their refinement",
@@ -566,20 +679,40 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
             rows = []
             for k, c in enumerate(panel.contestants):
                 value, low, high = c.error
-                shown = number(value) if low == high else f"{number(value)} [{number(low)}, {number(high)}]"
+                shown = (
+                    number(value)
+                    if low == high
+                    else f"{number(value)} [{number(low)}, {number(high)}]"
+                )
                 if question == "pictures":
                     more = [f"{100 * c.more['bias']:+.2f} % ± {196 * c.more['bias_error']:.2f}",
                             "1" if k == 0 else ratio(panel.at_equal_error(k))]  # fmt: skip
                 elif question == "depth":
-                    more = [f"{c.more['median']:.1e}", f"{c.more['p99']:.1e}", f"{100 * c.more['wrong']:.2f} %"]
+                    more = [
+                        f"{c.more['median']:.1e}",
+                        f"{c.more['p99']:.1e}",
+                        f"{100 * c.more['wrong']:.2f} %",
+                    ]
                     shown = f"{value:.1e}"
                 else:
                     more = [f"{100 * c.more[key]:.1f} %" for key in ("wrong", "unanswered")]
                     shown = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
-                times = [number(1000 * float(np.median(c.seconds))), "1" if k == 0 else ratio(panel.ratio(k))]
+                times = [
+                    number(1000 * float(np.median(c.seconds))),
+                    "1" if k == 0 else ratio(panel.ratio(k)),
+                ]
                 rows.append([c.name, shown, *more, *times])
             blank = ["–"] * (1 + len(extra))
-            rows.append(["again", *blank, number(1000 * float(np.median(panel.again))), ratio(panel.ratio(None))])
-            section.tables.append(Table(["contestant", panel.unit, *extra, "ms", "time, ratio"], rows, panel.scene))
+            rows.append(
+                [
+                    "again",
+                    *blank,
+                    number(1000 * float(np.median(panel.again))),
+                    ratio(panel.ratio(None)),
+                ]
+            )
+            section.tables.append(
+                Table(["contestant", panel.unit, *extra, "ms", "time, ratio"], rows, panel.scene)
+            )
         sections.append(section)
     return sections

@@ -1,4 +1,6 @@
-"""What the truth of the scenes costs from nothing: meshes, geometry and pictures, timed with an empty cache."""
+"""What the truth of the scenes costs from nothing: meshes, geometry and pictures, timed with an
+empty cache.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ class SceneTime:
     Attributes:
         scene: its name.
         views: how many cameras were traced and rendered.
-        wall, cpu: stage -> seconds; "meshes" reads the file and meshes its bodies, "first picture" also loads the scene
-            into Mitsuba and compiles its integrators.
+        wall, cpu: stage -> seconds; "meshes" reads the file and meshes its bodies, "first picture"
+            also loads the scene into Mitsuba and compiles its integrators.
         variant: Mitsuba's.
     """
 
@@ -62,7 +64,8 @@ def measure(
 
     Args:
         names: scenes' names or paths.
-        views: the source and the targets that come first in the file, fewer where a scene has fewer.
+        views: the source and the targets that come first in the file, fewer where a scene has
+            fewer.
         geometry_size, size: of the square images of depth and ids, and of the pictures.
         spp: samples a pixel of the pictures.
         progress: told what is at work.
@@ -79,7 +82,9 @@ def measure(
         wall, cpu = dict.fromkeys(STAGES, 0.0), dict.fromkeys(STAGES, 0.0)
 
         @contextmanager
-        def stage(key: str, wall: dict[str, float] = wall, cpu: dict[str, float] = cpu) -> Iterator[None]:
+        def stage(
+            key: str, wall: dict[str, float] = wall, cpu: dict[str, float] = cpu
+        ) -> Iterator[None]:
             start, start_cpu = time.perf_counter(), time.process_time()
             yield
             wall[key] += time.perf_counter() - start
@@ -108,14 +113,20 @@ def measure(
 
 def to_dict(times: Sequence[SceneTime]) -> dict[str, Any]:
     """As JSON: every scene, and the sums over scenes."""
-    total = {kind: {stage: sum(getattr(t, kind)[stage] for t in times) for stage in STAGES} for kind in ("wall", "cpu")}
+    total = {
+        kind: {stage: sum(getattr(t, kind)[stage] for t in times) for stage in STAGES}
+        for kind in ("wall", "cpu")
+    }
     return {"scenes": [asdict(t) for t in times], "total": total}
 
 
 def columns_and_rows(times: Sequence[SceneTime]) -> tuple[list[str], list[list[str]]]:
     """A table of seconds: wall, with CPU in brackets."""
     columns = ["scene", "views", *(f"{stage}, s" for stage in STAGES), "variant"]
-    rows = [[t.scene, str(t.views), *(f"{t.wall[s]:.1f} ({t.cpu[s]:.1f})" for s in STAGES), t.variant] for t in times]
+    rows = [
+        [t.scene, str(t.views), *(f"{t.wall[s]:.1f} ({t.cpu[s]:.1f})" for s in STAGES), t.variant]
+        for t in times
+    ]
     total = to_dict(times)["total"]
     sums = [f"{total['wall'][s]:.1f} ({total['cpu'][s]:.1f})" for s in STAGES]
     return columns, [*rows, ["all", str(sum(t.views for t in times)), *sums, ""]]

@@ -1,7 +1,9 @@
-"""Metrics of depth, warps, masks and edited views: pure functions, arrays in and figures out, no I/O.
+"""Metrics of depth, warps, masks and edited views: pure functions, arrays in and figures out, no
+I/O.
 
-What each figure is stands in :data:`attnwarp_eval.metrics.registry.METRICS`, and at length in docs/metrics.md. A figure that is
-undefined (nothing to measure it on) is NaN, never 0, with a count beside it.
+What each figure is stands in :data:`attnwarp_eval.metrics.registry.METRICS`, and at length in
+docs/metrics.md. A figure that is undefined (nothing to measure it on) is NaN, never 0, with a count
+beside it.
 """
 
 from __future__ import annotations
@@ -17,9 +19,24 @@ from attnwarp_eval.metrics.consistency import (
     view_dependent,
 )
 from attnwarp_eval.metrics.depth import depth_error
-from attnwarp_eval.metrics.embedding import Similarity, clip_similarity, directional_similarity, image_similarity
+from attnwarp_eval.metrics.embedding import (
+    Similarity,
+    clip_similarity,
+    directional_similarity,
+    image_similarity,
+)
 from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
-from attnwarp_eval.metrics.image import EditPsnr, edit_psnr, image_error, ms_ssim, mse, perceptual, psnr, ssim, ssim_map
+from attnwarp_eval.metrics.image import (
+    EditPsnr,
+    edit_psnr,
+    image_error,
+    ms_ssim,
+    mse,
+    perceptual,
+    psnr,
+    ssim,
+    ssim_map,
+)
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error

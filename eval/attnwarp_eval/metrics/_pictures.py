@@ -11,18 +11,25 @@ from attnwarp_eval.metrics.arrays import Array, Mask
 from attnwarp_eval.metrics.arrays import mask as checked_mask
 
 
-def picture(value: Any, name: str, *, within: Mask | None = None, shape: tuple[int, ...] | None = None) -> Array:
-    """``value`` (array or CPU tensor) as an (H, W, 3) float64 picture whose values in ``within`` are in [0, 1].
+def picture(
+    value: Any, name: str, *, within: Mask | None = None, shape: tuple[int, ...] | None = None
+) -> Array:
+    """``value`` (array or CPU tensor) as an (H, W, 3) float64 picture whose values in ``within``
+    are in [0, 1].
 
-    What lies outside ``within`` may be anything, NaN included, and is 0 in the result, so that it cannot leak into one.
+    What lies outside ``within`` may be anything, NaN included, and is 0 in the result, so that it
+    cannot leak into one.
 
     Raises:
-        ValueError: not float32 or float64; another shape; in ``within`` a value that is not finite or outside [0, 1].
+        ValueError: not float32 or float64; another shape; in ``within`` a value that is not finite
+            or outside [0, 1].
     """
     array = np.asarray(value)
     if array.dtype not in (np.float32, np.float64):
         remedy = "; divide by 255" if array.dtype == np.uint8 else ""
-        raise ValueError(f"{name}: got {array.dtype}, expected float32 or float64 in [0, 1]{remedy}")
+        raise ValueError(
+            f"{name}: got {array.dtype}, expected float32 or float64 in [0, 1]{remedy}"
+        )
     check.shape(array, ("H", "W", 3), name)
     if shape is not None and array.shape[:2] != tuple(shape[:2]):
         got = " x ".join(map(str, array.shape[:2]))
@@ -34,8 +41,9 @@ def picture(value: Any, name: str, *, within: Mask | None = None, shape: tuple[i
     if bad.any():
         row, column, channel = (int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name}: {array[row, column, channel]:.6g} at row {row}, column {column}, channel {channel}; {int(bad.sum())} "
-            "values are NaN or outside [0, 1]. Clip it, or leave those pixels out with a mask"
+            f"{name}: {array[row, column, channel]:.6g} at row {row}, column {column}, channel"
+            f" {channel}; {int(bad.sum())} values are NaN or outside [0, 1]. Clip it, or leave"
+            " those pixels out with a mask"
         )
     return array
 
@@ -47,7 +55,9 @@ def region(value: Any, shape: tuple[int, ...], name: str = "mask") -> Mask:
     return checked_mask(value, shape[:2], name)
 
 
-def pair(image: Any, target: Any, mask: Any, names: tuple[str, str] = ("image", "target")) -> tuple[Array, Array, Mask]:
+def pair(
+    image: Any, target: Any, mask: Any, names: tuple[str, str] = ("image", "target")
+) -> tuple[Array, Array, Mask]:
     """Two pictures of one size and where they count, checked; see :func:`picture`."""
     first = np.asarray(image)
     check.shape(first, ("H", "W", 3), names[0])

@@ -1,4 +1,6 @@
-"""What checks and metrics share: checks at the door, and means that are NaN when there is nothing to average."""
+"""What checks and metrics share: checks at the door, and means that are NaN when there is nothing
+to average.
+"""
 
 from __future__ import annotations
 
@@ -46,6 +48,8 @@ def quantile(values: Array, q: float) -> float:
 
 
 def regions(edge: Mask | None, shape: tuple[int, ...]) -> dict[str, Mask]:
-    """The parts figures are given for, by suffix: everything and, where edges are known, the interior and the band."""
+    """The parts figures are given for, by suffix: everything and, where edges are known, the
+    interior and the band.
+    """
     whole = np.ones(shape, dtype=bool)
     return {"": whole} if edge is None else {"": whole, ".interior": ~edge, ".edge": edge}

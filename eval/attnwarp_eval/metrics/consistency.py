@@ -1,13 +1,16 @@
-"""Do two edited views agree about the colour of the same surface? Exactly, and as published work approximates it.
+"""Do two edited views agree about the colour of the same surface? Exactly, and as published work
+approximates it.
 
-Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at correspondences known
-from the scene itself. Published work has no such correspondences and takes optical flow between the unedited pictures
-instead (Lai et al. 2018, Learning Blind Video Temporal Consistency): :func:`optical_flow` and :func:`flow_consistency`
-do that, :func:`flow_error` says how far the flow is from the truth, and :func:`approximation_error` what it does to the
-figure. Both paths share everything but where they look.
+Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at
+correspondences known from the scene itself. Published work has no such correspondences and takes
+optical flow between the unedited pictures instead (Lai et al. 2018, Learning Blind Video Temporal
+Consistency): :func:`optical_flow` and :func:`flow_consistency` do that, :func:`flow_error` says how
+far the flow is from the truth, and :func:`approximation_error` what it does to the figure. Both
+paths share everything but where they look.
 
-Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light; at exact positions in float64
-(``cv2.remap`` rounds positions to 1/32 px, and the sampler of :mod:`attnwarp.warp.correspondence` is what is being judged).
+Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light; at exact
+positions in float64 (``cv2.remap`` rounds positions to 1/32 px, and the sampler of
+:mod:`attnwarp.warp.correspondence` is what is being judged).
 """
 
 from __future__ import annotations
@@ -32,7 +35,9 @@ FLOW_LEAST = 12
 """Smallest side in pixels that OpenCV's DIS takes; below it there is no flow."""
 
 FLOW_SLOPE, FLOW_SLACK = 0.01, 0.5
-"""The forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram, Brox & Keutzer 2010, section 3)."""
+"""The forward-backward check: |f + b|^2 <= 0.01 (|f|^2 + |b|^2) + 0.5 px^2 (Sundaram, Brox &
+Keutzer 2010, section 3).
+"""
 
 VIEW_DEPENDENT = 0.05
 """Tolerance of :func:`view_dependent` in linear light, above the noise of 8 samples a pixel."""
@@ -47,7 +52,8 @@ class Disagreement:
         linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
         srgb: (H, W, 3) the same of sRGB values.
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
-        candidates: number of pixels that could have been compared: those asked about that have a position.
+        candidates: number of pixels that could have been compared: those asked about that have a
+            position.
     """
 
     counted: Mask
@@ -57,8 +63,14 @@ class Disagreement:
     candidates: int
 
     def figures(self, prefix: str = "") -> dict[str, float]:
-        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN where nothing was counted."""
-        linear, srgb, delta_e = self.linear[self.counted], self.srgb[self.counted], self.delta_e[self.counted]
+        """The ``consistency.*`` figures, with ``prefix`` before each name; NaN where nothing was
+        counted.
+        """
+        linear, srgb, delta_e = (
+            self.linear[self.counted],
+            self.srgb[self.counted],
+            self.delta_e[self.counted],
+        )
         pixels = int(self.counted.sum())
         found = {
             "mae_linear": mean(np.abs(linear)),
@@ -77,17 +89,20 @@ def cross_view(
 ) -> Disagreement:
     """Disagreement of two pictures about the same surface points, at exact correspondences.
 
-    Counted are pixels of the target that the source certainly shows (``pair.visible``), that lie in neither view within
-    2 px of a depth or object edge (``pair.edge``), whose position has all four bilinear taps, and that ``exclude`` does not name.
-    Among them the pictures of a perfect, matt scene still differ: by what bilinear sampling cannot follow, by the area that
-    a pixel covers in either view, and by the noise of the renderer. That floor is the same function of the two TRUE
+    Counted are pixels of the target that the source certainly shows (``pair.visible``), that lie in
+    neither view within 2 px of a depth or object edge (``pair.edge``), whose position has all four
+    bilinear taps, and that ``exclude`` does not name. Among them the pictures of a perfect, matt
+    scene still differ: by what bilinear sampling cannot follow, by the area that a pixel covers in
+    either view, and by the noise of the renderer. That floor is the same function of the two TRUE
     pictures; a figure without its floor says little.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
         pair: :func:`attnwarp_eval.truth.two_view` of them.
-        mask: (H, W) bool of the target, pixels that are asked about, such as the edited object's; all if left out.
-        exclude: (H, W) bool of the target, pixels that may rightly differ, from :func:`view_dependent`.
+        mask: (H, W) bool of the target, pixels that are asked about, such as the edited object's;
+            all if left out.
+        exclude: (H, W) bool of the target, pixels that may rightly differ, from
+            :func:`view_dependent`.
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1] or has another size than its camera.
@@ -100,27 +115,39 @@ def cross_view(
     return _disagreement(source, target, pair.xy, kept, int(asked.sum()))
 
 
-def view_dependent(source_srgb: Any, target_srgb: Any, pair: TwoView, *, tolerance: float = VIEW_DEPENDENT) -> Mask:
-    """(H, W) bool: target pixels whose surface truly looks different from the source, such as highlights and reflections.
+def view_dependent(
+    source_srgb: Any, target_srgb: Any, pair: TwoView, *, tolerance: float = VIEW_DEPENDENT
+) -> Mask:
+    """(H, W) bool: target pixels whose surface truly looks different from the source, such as
+    highlights and reflections.
 
-    A pixel is one when its colour in the TRUE target leaves the range of the four taps around its position in the TRUE
-    source by more than ``tolerance``, in any channel of linear light. The range, and not their blend, so that a fine
-    texture that sampling cannot follow is no highlight. False where the source does not show the pixel.
+    A pixel is one when its colour in the TRUE target leaves the range of the four taps around its
+    position in the TRUE source by more than ``tolerance``, in any channel of linear light. The
+    range, and not their blend, so that a fine texture that sampling cannot follow is no highlight.
+    False where the source does not show the pixel.
 
     Args:
-        source_srgb, target_srgb: truth of the two views, unedited. An edit that makes a matt thing shiny has highlights
-            of its own: where its truth is known, ask for it too and join the two masks.
+        source_srgb, target_srgb: truth of the two views, unedited. An edit that makes a matt thing
+            shiny has highlights of its own: where its truth is known, ask for it too and join the
+            two masks.
         pair: as for :func:`cross_view`.
         tolerance: in linear light, of 1; above the noise of the pictures.
     """
     if not tolerance >= 0:
-        raise ValueError(f"tolerance: got {tolerance}, expected a number of linear light that is not negative")
+        raise ValueError(
+            f"tolerance: got {tolerance}, expected a number of linear light that is not negative"
+        )
     source, target = (to_linear(each) for each in _pictures(source_srgb, target_srgb, pair))
     ask = pair.visible & ~pair.edge & _has_taps(pair.xy, source.shape)
     column, row = np.floor(pair.xy[ask] - 0.5).astype(np.int64).T
     # The last pixel's centre has its second tap at weight 0, outside.
-    right, below = np.minimum(column + 1, source.shape[1] - 1), np.minimum(row + 1, source.shape[0] - 1)
-    taps = np.stack([source[row, column], source[row, right], source[below, column], source[below, right]])
+    right, below = (
+        np.minimum(column + 1, source.shape[1] - 1),
+        np.minimum(row + 1, source.shape[0] - 1),
+    )
+    taps = np.stack(
+        [source[row, column], source[row, right], source[below, column], source[below, right]]
+    )
     beyond = np.maximum(taps.min(axis=0) - target[ask], target[ask] - taps.max(axis=0))
     found = np.zeros(ask.shape, dtype=bool)
     found[ask] = (beyond > tolerance).any(axis=-1)
@@ -146,9 +173,11 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
     """Where OpenCV's optical flow finds each target pixel in the source picture.
 
     Args:
-        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as published work has it.
-        method: "dis", Dense Inverse Search (Kroeger et al. 2016) with the medium preset, or "farneback" (Farneback
-            2003) with five levels and a window of 15 px. Both see 8-bit grey.
+        source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size; the UNEDITED pictures, as
+            published work has it.
+        method: "dis", Dense Inverse Search (Kroeger et al. 2016) with the medium preset, or
+            "farneback" (Farneback 2003) with five levels and a window of 15 px. Both see 8-bit
+            grey.
 
     Returns:
         No flow at all, NaN and False everywhere, for pictures below 12 x 12 px.
@@ -169,14 +198,20 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
     inside = _has_taps(xy, shape)
     back = np.full((*shape, 2), np.nan)
     back[inside] = _sample(backward, xy[inside])
-    gap, length = ((forward + back) ** 2).sum(axis=-1), (forward**2).sum(axis=-1) + (back**2).sum(axis=-1)
+    gap, length = (
+        ((forward + back) ** 2).sum(axis=-1),
+        (forward**2).sum(axis=-1) + (back**2).sum(axis=-1),
+    )
     with np.errstate(invalid="ignore"):
         accepted = inside & (gap <= FLOW_SLOPE * length + FLOW_SLACK)
     return Flow(xy, accepted, method)
 
 
-def flow_consistency(source_srgb: Any, target_srgb: Any, flow: Flow, *, mask: Any = None) -> Disagreement:
-    """Disagreement of two edited pictures along the flow of the unedited ones, where the forward-backward check passes.
+def flow_consistency(
+    source_srgb: Any, target_srgb: Any, flow: Flow, *, mask: Any = None
+) -> Disagreement:
+    """Disagreement of two edited pictures along the flow of the unedited ones, where the
+    forward-backward check passes.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
@@ -199,14 +234,18 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
         mask: (H, W) bool of the target, pixels that are asked about; all if left out.
 
     Returns:
-        ``consistency.flow_epe_median``, ``_p95`` and ``flow_below_1px`` over all pixels that the source certainly shows,
-        away from edges; ``flow_epe_median_accepted`` and ``_p95_accepted`` over those of them that pass the
-        forward-backward check; ``flow_recall``, the share that passes; and ``flow_false``, of all that pass the share that
-        the source certainly does not show. NaN where there is nothing to measure.
+        ``consistency.flow_epe_median``, ``_p95`` and ``flow_below_1px`` over all pixels that the
+        source certainly shows, away from edges; ``flow_epe_median_accepted`` and ``_p95_accepted``
+        over those of them that pass the forward-backward check; ``flow_recall``, the share that
+        passes; and ``flow_false``, of all that pass the share that the source certainly does not
+        show. NaN where there is nothing to measure.
     """
     shape = pair.label.shape
     if flow.accepted.shape != shape:
-        raise ValueError(f"flow: got {flow.accepted.shape} pixels (H x W), expected {shape}, those of pair's target")
+        raise ValueError(
+            f"flow: got {flow.accepted.shape} pixels (H x W), expected {shape}, those of pair's"
+            " target"
+        )
     asked = region(mask, shape)
     seen = asked & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
     offset = np.hypot(*np.moveaxis(flow.xy - pair.xy, -1, 0))
@@ -225,7 +264,8 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
 
 
 def approximation_error(exact: Disagreement, flow: Disagreement) -> dict[str, float]:
-    """What flow in place of exact correspondences does to the figures: flow minus exact, and mean DeltaE as a ratio.
+    """What flow in place of exact correspondences does to the figures: flow minus exact, and mean
+    DeltaE as a ratio.
 
     NaN where either side counted nothing; the ratio too where the exact one is 0.
     """
@@ -247,10 +287,14 @@ def _pictures(source_srgb: Any, target_srgb: Any, pair: TwoView) -> tuple[Array,
 
 
 def _has_taps(xy: Array, shape: tuple[int, ...]) -> Mask:
-    """Positions with all four bilinear taps in a picture of (H, W): not beyond the outermost pixel centres; not NaN."""
+    """Positions with all four bilinear taps in a picture of (H, W): not beyond the outermost pixel
+    centres; not NaN.
+    """
     height, width = shape[:2]
     with np.errstate(invalid="ignore"):
-        inside: Mask = (xy >= 0.5).all(axis=-1) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] <= height - 0.5)
+        inside: Mask = (
+            (xy >= 0.5).all(axis=-1) & (xy[..., 0] <= width - 0.5) & (xy[..., 1] <= height - 0.5)
+        )
     return inside
 
 
@@ -259,10 +303,18 @@ def _sample(image: Array, xy: Array) -> Array:
     from scipy.ndimage import map_coordinates
 
     at = (xy[:, ::-1] - 0.5).T
-    return np.stack([map_coordinates(image[..., c], at, order=1, mode="nearest") for c in range(image.shape[-1])], -1)
+    return np.stack(
+        [
+            map_coordinates(image[..., c], at, order=1, mode="nearest")
+            for c in range(image.shape[-1])
+        ],
+        -1,
+    )
 
 
-def _disagreement(source: Array, target: Array, xy: Array, kept: Mask, candidates: int) -> Disagreement:
+def _disagreement(
+    source: Array, target: Array, xy: Array, kept: Mask, candidates: int
+) -> Disagreement:
     """Of sRGB pictures, at the pixels of ``kept`` whose position has taps."""
     from skimage.color import deltaE_ciede2000, rgb2lab
 
@@ -294,6 +346,15 @@ def _flow(here: npt.NDArray[np.uint8], there: npt.NDArray[np.uint8], method: Flo
         found = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(here, there, None)
     else:
         found = cv.calcOpticalFlowFarneback(
-            here, there, None, pyr_scale=0.5, levels=5, winsize=15, iterations=3, poly_n=7, poly_sigma=1.5, flags=0
+            here,
+            there,
+            None,
+            pyr_scale=0.5,
+            levels=5,
+            winsize=15,
+            iterations=3,
+            poly_n=7,
+            poly_sigma=1.5,
+            flags=0,
         )
     return found.astype(np.float64)

@@ -20,12 +20,13 @@ def depth_error(
         depth: (H, W) depth along the optical axis; NaN, infinite or not positive is undefined.
         true_depth: (H, W), NaN where there is no surface.
         normal, true_normal: (H, W, 3) world normals that face the camera, of any length.
-        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the band apart too.
+        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the
+            band apart too.
 
     Returns:
-        Figures of :data:`attnwarp_eval.metrics.registry.METRICS`. Means are over pixels with a surface and a depth; the delta
-        shares over all pixels with a surface: one without a depth is not within anything. NaN where there is nothing to
-        measure.
+        Figures of :data:`attnwarp_eval.metrics.registry.METRICS`. Means are over pixels with a
+        surface and a depth; the delta shares over all pixels with a surface: one without a depth is
+        not within anything. NaN where there is nothing to measure.
     """
     truth = floats(true_depth, ("H", "W"), "true_depth")
     estimate = floats(depth, truth.shape, "depth")

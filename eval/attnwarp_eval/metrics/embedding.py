@@ -1,7 +1,8 @@
-"""What is computed from embeddings of pictures and texts. Pure: arrays in, arrays out; no network, no file.
+"""What is computed from embeddings of pictures and texts. Pure: arrays in, arrays out; no network,
+no file.
 
-Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what the figures mean:
-keep its :class:`attnwarp.encoders.EncoderInfo` beside them.
+Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what
+the figures mean: keep its :class:`attnwarp.encoders.EncoderInfo` beside them.
 """
 
 from __future__ import annotations
@@ -12,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 TINY_NORM = 1e-6
-"""An embedding shorter than this has no direction: encoders compute in float32 with features of order 1 and give
-lengths of 1 to 100, of which this is the rounding."""
+"""An embedding shorter than this has no direction: encoders compute in float32 with features of
+order 1 and give lengths of 1 to 100, of which this is the rounding."""
 
 TINY_DISPLACEMENT = 1e-5
-"""Two unit embeddings closer than this are taken for one. The same picture in another batch, with other threads or in
-float64 moved its unit embedding by up to 1.2e-6 (ViT-B/32 and ViT-S/14 of random weights), and the direction of such a
-step means nothing."""
+"""Two unit embeddings closer than this are taken for one. The same picture in another batch, with
+other threads or in float64 moved its unit embedding by up to 1.2e-6 (ViT-B/32 and ViT-S/14 of
+random weights), and the direction of such a step means nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,57 +56,68 @@ def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
         text: (D,) or (1, D) of the one prompt, or (N, D), one for each picture.
 
     Returns:
-        One value a picture, undefined where an embedding is shorter than TINY_NORM. It is the plain cosine: neither
-        multiplied by 100 nor cut off at 0, as some call by the name of CLIP score.
+        One value a picture, undefined where an embedding is shorter than TINY_NORM. It is the plain
+        cosine: neither multiplied by 100 nor cut off at 0, as some call by the name of CLIP score.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
 
-    Source: A. Radford et al., "Learning Transferable Visual Models From Natural Language Supervision", ICML 2021.
+    Source: A. Radford et al., "Learning Transferable Visual Models From Natural Language
+        Supervision", ICML 2021.
     """
     pictures = _embeddings(images, "images")
     return Similarity(_cosine(_unit(pictures), _unit(_matching(text, pictures, "text"))))
 
 
 def directional_similarity(
-    images_before: npt.ArrayLike, images_after: npt.ArrayLike, text_before: npt.ArrayLike, text_after: npt.ArrayLike
+    images_before: npt.ArrayLike,
+    images_after: npt.ArrayLike,
+    text_before: npt.ArrayLike,
+    text_after: npt.ArrayLike,
 ) -> Similarity:
     """Cosine of the change of each picture with the change of the prompt.
 
     Args:
-        images_before, images_after: (N, D) embeddings, pair by pair of one view: the original and its edited render.
+        images_before, images_after: (N, D) embeddings, pair by pair of one view: the original and
+            its edited render.
         text_before, text_after: (D,), (1, D) or (N, D) of the prompts that describe them.
 
     Returns:
-        cos(I1 - I0, T1 - T0) of embeddings brought to unit length first, one a pair. Undefined where an embedding is
-        shorter than TINY_NORM, or a change smaller than TINY_DISPLACEMENT: nothing was changed, and 0 would say that
-        it was changed in a wrong direction.
+        cos(I1 - I0, T1 - T0) of embeddings brought to unit length first, one a pair. Undefined
+        where an embedding is shorter than TINY_NORM, or a change smaller than TINY_DISPLACEMENT:
+        nothing was changed, and 0 would say that it was changed in a wrong direction.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
 
-    Source: R. Gal et al., "StyleGAN-NADA: CLIP-Guided Domain Adaptation of Image Generators", SIGGRAPH 2022; as a
+    Source: R. Gal et al., "StyleGAN-NADA: CLIP-Guided Domain Adaptation of Image Generators",
+        SIGGRAPH 2022; as a
     metric of edits, T. Brooks, A. Holynski, A. A. Efros, "InstructPix2Pix", CVPR 2023.
     """
     after = _embeddings(images_after, "images_after")
     before = _embeddings(images_before, "images_before")
     if before.shape != after.shape:
-        raise ValueError(f"images_before: got shape {before.shape}, expected {after.shape}, as images_after")
+        raise ValueError(
+            f"images_before: got shape {before.shape}, expected {after.shape}, as images_after"
+        )
     change = _unit(after) - _unit(before)
-    wanted = _unit(_matching(text_after, after, "text_after")) - _unit(_matching(text_before, after, "text_before"))
+    wanted = _unit(_matching(text_after, after, "text_after")) - _unit(
+        _matching(text_before, after, "text_before")
+    )
     return Similarity(_cosine(_unit(change, TINY_DISPLACEMENT), _unit(wanted, TINY_DISPLACEMENT)))
 
 
 def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Similarity:
-    """Cosine of each render with the edited source view: how far the scene follows the one picture that was edited.
+    """Cosine of each render with the edited source view: how far the scene follows the one picture
+    that was edited.
 
     Args:
         source_edit: (D,) or (1, D) embedding of the edited source view.
         renders: (N, D) embeddings of the renders.
 
     Returns:
-        One value a render, undefined where an embedding is shorter than TINY_NORM. With DINO's class token it is the
-        DINO, with CLIP's picture embedding the CLIP single-image similarity.
+        One value a render, undefined where an embedding is shorter than TINY_NORM. With DINO's
+        class token it is the DINO, with CLIP's picture embedding the CLIP single-image similarity.
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
@@ -125,20 +137,23 @@ def _embeddings(value: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         raise ValueError(
-            f"{name}: {int(bad.sum())} of {len(array)} embeddings are NaN or infinite, row {int(bad.argmax())} first; "
-            "an encoder that computes in float16 overflows: let it compute in float32"
+            f"{name}: {int(bad.sum())} of {len(array)} embeddings are NaN or infinite, row"
+            f" {int(bad.argmax())} first; an encoder that computes in float16 overflows: let it"
+            " compute in float32"
         )
     return array.astype(np.float64)
 
 
-def _matching(value: npt.ArrayLike, pictures: npt.NDArray[np.float64], name: str) -> npt.NDArray[np.float64]:
+def _matching(
+    value: npt.ArrayLike, pictures: npt.NDArray[np.float64], name: str
+) -> npt.NDArray[np.float64]:
     """One embedding for all pictures, or one for each."""
     array = np.asarray(value)
     array = _embeddings(array[None] if array.ndim == 1 else array, name)
     if array.shape[1] != pictures.shape[1] or len(array) not in (1, len(pictures)):
         raise ValueError(
-            f"{name}: got shape {array.shape}, expected ({pictures.shape[1]},), (1, {pictures.shape[1]}) or "
-            f"{pictures.shape}; both must come from one encoder"
+            f"{name}: got shape {array.shape}, expected ({pictures.shape[1]},), (1,"
+            f" {pictures.shape[1]}) or {pictures.shape}; both must come from one encoder"
         )
     return array
 

@@ -1,4 +1,6 @@
-"""Did the edit do what it should, where it should, and leave the rest alone? Against the rendered truth of the edit."""
+"""Did the edit do what it should, where it should, and leave the rest alone? Against the rendered
+truth of the edit.
+"""
 
 from __future__ import annotations
 
@@ -10,37 +12,53 @@ import numpy as np
 
 from attnwarp_eval.metrics._pictures import picture, region
 from attnwarp_eval.metrics.arrays import Mask
-from attnwarp_eval.metrics.image import Distance, edit_psnr, ms_ssim, mse, perceptual, psnr_of_mse, ssim
+from attnwarp_eval.metrics.image import (
+    Distance,
+    edit_psnr,
+    ms_ssim,
+    mse,
+    perceptual,
+    psnr_of_mse,
+    ssim,
+)
 
 
 def fidelity(
-    image_srgb: Any, truth_srgb: Any, mask: Any, *, original_srgb: Any = None, distance: Distance | None = None
+    image_srgb: Any,
+    truth_srgb: Any,
+    mask: Any,
+    *,
+    original_srgb: Any = None,
+    distance: Distance | None = None,
 ) -> dict[str, float]:
     """The ``fidelity.*`` figures of an edited view against the truth of the edit.
 
-    Whole, ``.inside`` the edited object and ``.outside`` of it: a method that paints the object well and the rest of
-    the picture too shows it in the last alone. Pixels on the object's outline, one on each side, count in neither: the
-    mask is of pixel centres and a pixel shows the mean of its area, so the truth itself changes there. ``preserved_*``
-    is outside too, but against the picture before the edit: what the truth gets there is the best to be had, less than
-    perfect where an edited object throws another light, so put ``preserved_*`` of the truth beside it.
+    Whole, ``.inside`` the edited object and ``.outside`` of it: a method that paints the object
+    well and the rest of the picture too shows it in the last alone. Pixels on the object's outline,
+    one on each side, count in neither: the mask is of pixel centres and a pixel shows the mean of
+    its area, so the truth itself changes there. ``preserved_*`` is outside too, but against the
+    picture before the edit: what the truth gets there is the best to be had, less than perfect
+    where an edited object throws another light, so put ``preserved_*`` of the truth beside it.
 
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.
         truth_srgb: the same view of the scene as it should be after the edit
             (:meth:`attnwarp_eval.scene.scene.Scene.edited`).
-        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.truth.edits.edit_mask`). All True for an edit of the light,
-            which leaves nothing outside: those figures are NaN.
+        mask: (H, W) bool, the edited object (:func:`attnwarp_eval.truth.edits.edit_mask`). All True
+            for an edit of the light, which leaves nothing outside: those figures are NaN.
         original_srgb: the view before the edit; without it nothing is said about preservation.
-        distance: a perceptual distance; without it there is none. Inside and outside it is masked as
-            :func:`attnwarp_eval.metrics.perceptual` says.
+        distance: a perceptual distance; without it there is none. Inside and outside it is masked
+            as :func:`attnwarp_eval.metrics.perceptual` says.
 
     Returns:
-        ``mse``, ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and ``.outside``, ``ms_ssim`` whole, the
-        ``preserved_*`` figures, and the counts of pixels. PSNR divides by the region's pixels; SSIM counts windows
-        wholly inside the region. NaN where a region is empty, such as the inside of an object two pixels wide.
+        ``mse``, ``psnr``, ``ssim`` and ``distance`` of the whole picture, ``.inside`` and
+        ``.outside``, ``ms_ssim`` whole, the ``preserved_*`` figures, and the counts of pixels. PSNR
+        divides by the region's pixels; SSIM counts windows wholly inside the region. NaN where a
+        region is empty, such as the inside of an object two pixels wide.
 
     Raises:
-        ValueError: a picture that is not sRGB in [0, 1], pictures of different sizes, a mask that is not bool.
+        ValueError: a picture that is not sRGB in [0, 1], pictures of different sizes, a mask that
+            is not bool.
     """
     image = picture(image_srgb, "image_srgb")
     truth = picture(truth_srgb, "truth_srgb", shape=image.shape)
@@ -69,11 +87,15 @@ def fidelity(
 
 
 def nearest_answer(
-    images: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]], masks: Mapping[str, Any] | None = None
+    images: Mapping[str, Any],
+    answers: Mapping[str, Mapping[str, Any]],
+    masks: Mapping[str, Any] | None = None,
 ) -> tuple[str | None, dict[str, float]]:
-    """Which of an ambiguous edit's right answers a method gave: one for all views, the least mean MSE over them.
+    """Which of an ambiguous edit's right answers a method gave: one for all views, the least mean
+    MSE over them.
 
-    One answer for all, since a method that answers differently from view to view is not free to (docs/edits.md).
+    One answer for all, since a method that answers differently from view to view is not free to
+    (docs/edits.md).
 
     Args:
         images: (H, W, 3) sRGB by the view's name, the edited views.
@@ -81,7 +103,8 @@ def nearest_answer(
         masks: (H, W) bool by the view's name, the edited object.
 
     Returns:
-        The answer's name, None where nothing could be measured; and the PSNR in dB, pooled over the views, for each answer.
+        The answer's name, None where nothing could be measured; and the PSNR in dB, pooled over the
+        views, for each answer.
 
     Raises:
         ValueError: no answers, or one that does not have the views of ``images``.
@@ -91,7 +114,8 @@ def nearest_answer(
     for name, truth in answers.items():
         if set(truth) != set(images):
             raise ValueError(
-                f"answers[{name!r}]: got views {sorted(truth)}, expected those of images, {sorted(images)}"
+                f"answers[{name!r}]: got views {sorted(truth)}, expected those of images,"
+                f" {sorted(images)}"
             )
     found = {name: edit_psnr(images, truth, masks).pooled for name, truth in answers.items()}
     defined = {name: value for name, value in found.items() if not math.isnan(value)}
@@ -99,7 +123,9 @@ def nearest_answer(
 
 
 def _shrunk(part: Mask) -> Mask:
-    """Without the pixels that have one of the eight around them outside; the picture's border is no outline."""
+    """Without the pixels that have one of the eight around them outside; the picture's border is no
+    outline.
+    """
     from scipy.ndimage import binary_erosion
 
     kept: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)

@@ -1,8 +1,9 @@
 """How alike two pictures are: MSE, PSNR, SSIM, MS-SSIM, and the Edit PSNR of a set of views.
 
-Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions take values as they come: whether
-they are sRGB or linear is the caller's to name, and :func:`image_error` names it in its figures. Everything is summed in
-float64. With nothing to measure (an empty mask, a picture smaller than the window) a figure is NaN, never 0.
+Pictures are (H, W, 3) float32 or float64 in [0, 1], masks (H, W) bool. The functions take values as
+they come: whether they are sRGB or linear is the caller's to name, and :func:`image_error` names it
+in its figures. Everything is summed in float64. With nothing to measure (an empty mask, a picture
+smaller than the window) a figure is NaN, never 0.
 """
 
 from __future__ import annotations
@@ -20,10 +21,14 @@ from attnwarp_eval.metrics._pictures import pair
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, share
 
 Distance = Callable[[Array, Array], float]
-"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean over places."""
+"""A perceptual distance of two (H, W, 3) sRGB pictures in [0, 1]: 0 when they are equal, a mean
+over places.
+"""
 
 WINDOW = 11
-"""Side of SSIM's window in pixels; that of :data:`attnwarp.losses.SSIM_WINDOW`, not imported since it brings torch."""
+"""Side of SSIM's window in pixels; that of :data:`attnwarp.losses.SSIM_WINDOW`, not imported since
+it brings torch.
+"""
 
 MS_SSIM_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 """Exponents of the scales, finest first: Wang, Simoncelli & Bovik 2003, section 3.2."""
@@ -36,11 +41,13 @@ def mse(image: Any, target: Any, mask: Any = None) -> float:
     """Mean over the mask's pixels and channels of the squared difference; NaN for an empty mask.
 
     Args:
-        image, target: (H, W, 3) in [0, 1], of one size. What they hold outside the mask does not count, NaN included.
+        image, target: (H, W, 3) in [0, 1], of one size. What they hold outside the mask does not
+            count, NaN included.
         mask: (H, W) bool, the pixels that count; all if left out.
 
     Raises:
-        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0, 1].
+        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
+            1].
     """
     return _mse(*pair(image, target, mask))
 
@@ -48,30 +55,35 @@ def mse(image: Any, target: Any, mask: Any = None) -> float:
 def psnr(image: Any, target: Any, mask: Any = None) -> float:
     """-10 log10 of :func:`mse`, in dB: +inf where the pictures are equal, NaN for an empty mask.
 
-    The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to 0, gains
-    -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see :func:`edit_psnr`.
+    The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to
+    0, gains -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see
+    :func:`edit_psnr`.
     """
     return psnr_of_mse(mse(image, target, mask))
 
 
 def ssim(image: Any, target: Any, mask: Any = None) -> float:
-    """Mean structural similarity (Wang, Bovik, Sheikh & Simoncelli 2004) over windows and channels; at most 1.
+    """Mean structural similarity (Wang, Bovik, Sheikh & Simoncelli 2004) over windows and channels;
+    at most 1.
 
-    The windows are 11 x 11, Gaussian with sigma 1.5, and lie wholly inside the picture and, given a mask, wholly inside
-    the mask: a window that is partly outside would score what is not in question. The values are those of
-    :func:`attnwarp.losses.ssim`.
+    The windows are 11 x 11, Gaussian with sigma 1.5, and lie wholly inside the picture and, given a
+    mask, wholly inside the mask: a window that is partly outside would score what is not in
+    question. The values are those of :func:`attnwarp.losses.ssim`.
 
     Returns:
-        NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x 11 square.
+        NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
+        11 square.
     """
     found = ssim_map(image, target, mask)
     return mean(found[np.isfinite(found)])
 
 
 def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
-    """(H - 10, W - 10) similarity of each window, a mean over channels; NaN where it is not wholly inside the mask.
+    """(H - 10, W - 10) similarity of each window, a mean over channels; NaN where it is not wholly
+    inside the mask.
 
-    The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11 px.
+    The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
+    px.
     """
     first, second, inside = pair(image, target, mask)
     if min(inside.shape) < WINDOW:
@@ -81,7 +93,9 @@ def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
 
 
 def whole_windows(mask: Mask) -> Mask:
-    """(H - 10, W - 10) bool: the 11 x 11 windows that lie wholly inside a mask of at least that size."""
+    """(H - 10, W - 10) bool: the 11 x 11 windows that lie wholly inside a mask of at least that
+    size.
+    """
     # A window is whole when it holds no pixel outside: sums of an integral image are exact.
     outside = np.pad(np.cumsum(np.cumsum(~mask, axis=0), axis=1), ((1, 0), (1, 0)))
     columns: npt.NDArray[np.int64] = outside[WINDOW:] - outside[:-WINDOW]
@@ -92,14 +106,17 @@ def whole_windows(mask: Mask) -> Mask:
 def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003), in [0, 1].
 
-    Contrast and structure at five scales, each half the one before (means of 2 x 2 pixels; an odd last row or column
-    is dropped), and luminance at the coarsest, each averaged over windows and channels, then multiplied with the paper's
-    exponents. A mean below 0 (pictures that are each other's negatives) has no real power and counts as 0.
+    Contrast and structure at five scales, each half the one before (means of 2 x 2 pixels; an odd
+    last row or column is dropped), and luminance at the coarsest, each averaged over windows and
+    channels, then multiplied with the paper's exponents. A mean below 0 (pictures that are each
+    other's negatives) has no real power and counts as 0.
 
-    Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count as in :func:`ssim`.
+    Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count
+    as in :func:`ssim`.
 
     Returns:
-        NaN when some scale has no window: a side below 176 px, or a mask that holds no square of about that size.
+        NaN when some scale has no window: a side below 176 px, or a mask that holds no square of
+        about that size.
     """
     first, second, inside = pair(image, target, mask)
     product = 1.0
@@ -117,21 +134,26 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
 
 
 def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any = None) -> float:
-    """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN for an empty mask.
+    """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN
+    for an empty mask.
 
-    Outside the mask the picture is made equal to the target first, so that nothing there differs, and the distance is
-    divided by the share of the picture that the mask covers. For a distance that is a mean over places it then is the mean
-    over those of the mask, apart from what spills over the mask's border: networks see a neighbourhood of each place.
-    Pictures that are equal inside the mask are at distance 0, whatever stands outside.
+    Outside the mask the picture is made equal to the target first, so that nothing there differs,
+    and the distance is divided by the share of the picture that the mask covers. For a distance
+    that is a mean over places it then is the mean over those of the mask, apart from what spills
+    over the mask's border: networks see a neighbourhood of each place. Pictures that are equal
+    inside the mask are at distance 0, whatever stands outside.
 
     Args:
-        image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the mask may be anything; of
-            the target it is what the network sees around the mask, black where it is NaN or outside [0, 1].
-        distance: takes both pictures in float64. Of an encoder: ``lambda a, b: float(encoder.distance([a], [b])[0])``.
+        image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the
+            mask may be anything; of the target it is what the network sees around the mask, black
+            where it is NaN or outside [0, 1].
+        distance: takes both pictures in float64. Of an encoder: ``lambda a, b:
+            float(encoder.distance([a], [b])[0])``.
         mask: (H, W) bool, the pixels that count; all if left out.
 
     Raises:
-        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0, 1].
+        ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
+            1].
     """
     image, target, inside = pair(image_srgb, target_srgb, mask, ("image_srgb", "target_srgb"))
     covered = share(int(inside.sum()), inside.size)
@@ -145,8 +167,8 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
 def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str, float]:
     """The ``image.*`` figures of an sRGB picture against what it should be.
 
-    All are of the sRGB values, as the field has it, apart from those named ``_linear``, which are of linear light and so
-    weigh bright parts more.
+    All are of the sRGB values, as the field has it, apart from those named ``_linear``, which are
+    of linear light and so weigh bright parts more.
 
     Args:
         image_srgb, target_srgb: (H, W, 3), sRGB-encoded, in [0, 1].
@@ -170,8 +192,8 @@ class EditPsnr:
     """How closely the views of an edited scene follow the edited pictures that it was made from.
 
     Attributes:
-        views: the views that were measured, by name and in order. Methods that edit different views are not comparable
-            by this figure: fewer edited views are easier to follow.
+        views: the views that were measured, by name and in order. Methods that edit different views
+            are not comparable by this figure: fewer edited views are easier to follow.
         mse: of each view; NaN where it is undefined.
         psnr: of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
     """
@@ -182,12 +204,16 @@ class EditPsnr:
 
     @property
     def pooled(self) -> float:
-        """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of them are equal."""
+        """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of
+        them are equal.
+        """
         return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
 
     @property
     def mean_finite(self) -> float:
-        """Mean of the finite PSNRs; identical and undefined views are left out and counted, NaN when none is left."""
+        """Mean of the finite PSNRs; identical and undefined views are left out and counted, NaN
+        when none is left.
+        """
         return mean(np.array([value for value in self.psnr if math.isfinite(value)]))
 
     @property
@@ -208,7 +234,10 @@ class EditPsnr:
             "edit.views": len(self.views),
             "edit.views_identical": self.identical,
             "edit.views_undefined": self.undefined,
-            **{f"edit.psnr.{view}": value for view, value in zip(self.views, self.psnr, strict=True)},
+            **{
+                f"edit.psnr.{view}": value
+                for view, value in zip(self.views, self.psnr, strict=True)
+            },
             **{f"edit.mse.{view}": value for view, value in zip(self.views, self.mse, strict=True)},
         }
 
@@ -219,23 +248,29 @@ def edit_psnr(
     """Edit PSNR: edited pictures against renders of the edited scene, view by view.
 
     Args:
-        edited: (H, W, 3) in [0, 1] by the view's name, all views that were edited, in whatever stage.
+        edited: (H, W, 3) in [0, 1] by the view's name, all views that were edited, in whatever
+            stage.
         rendered: the same views of the scene that was fitted on them.
         masks: (H, W) bool by the view's name, the pixels that count, for all views or none.
 
     Raises:
-        ValueError: the three do not name the same views; a picture that :func:`mse` refuses, with the view's name.
+        ValueError: the three do not name the same views; a picture that :func:`mse` refuses, with
+            the view's name.
     """
     for name, other in (("rendered", rendered), ("masks", masks)):
         if other is not None and set(other) != set(edited):
             without, beyond = sorted(set(edited) - set(other)), sorted(set(other) - set(edited))
             said = [f"no view {without[0]!r}"] if without else []
             said += [f"a view {beyond[0]!r} that is not among the edited ones"] if beyond else []
-            raise ValueError(f"{name}: got {' and '.join(said)}, expected the {len(edited)} views of edited")
+            raise ValueError(
+                f"{name}: got {' and '.join(said)}, expected the {len(edited)} views of edited"
+            )
     errors = []
     for view, image in edited.items():
         mask = None if masks is None else masks[view]
-        errors.append(_mse(*pair(image, rendered[view], mask, (f"edited[{view!r}]", f"rendered[{view!r}]"))))
+        errors.append(
+            _mse(*pair(image, rendered[view], mask, (f"edited[{view!r}]", f"rendered[{view!r}]")))
+        )
     return EditPsnr(tuple(edited), tuple(errors), tuple(psnr_of_mse(error) for error in errors))
 
 
@@ -244,7 +279,9 @@ def _mse(image: Array, target: Array, inside: Mask) -> float:
 
 
 def psnr_of_mse(error: float) -> float:
-    """:func:`attnwarp.losses.psnr_of_mse`, +inf for 0, and NaN for NaN. To average views, average the error."""
+    """:func:`attnwarp.losses.psnr_of_mse`, +inf for 0, and NaN for NaN. To average views, average
+    the error.
+    """
     from attnwarp import losses
 
     return math.nan if math.isnan(error) else losses.psnr_of_mse(error)

@@ -1,7 +1,8 @@
 """Does the mask know what the source could not see?
 
-Truth has three classes for a pixel that shows a surface: visible, hidden (occluded, turned away) and ambiguous, and
-those whose point falls outside the source image or behind its camera. Ambiguous pixels are counted and not scored.
+Truth has three classes for a pixel that shows a surface: visible, hidden (occluded, turned away)
+and ambiguous, and those whose point falls outside the source image or behind its camera. Ambiguous
+pixels are counted and not scored.
 """
 
 from __future__ import annotations
@@ -30,13 +31,15 @@ COUNTS = (
     "ambiguous_accepted",
     "ambiguous_rejected",
 )
-"""The counts :func:`confusion` gives. "outside" is surface whose point is not in the source image, points behind the
-camera included; "behind" those alone. "empty" is background."""
+"""The counts :func:`confusion` gives. "outside" is surface whose point is not in the source image,
+points behind the camera included; "behind" those alone. "empty" is background."""
 
 Counts = dict[str, int]
 
 
-def confusion(accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None) -> Counts:
+def confusion(
+    accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None
+) -> Counts:
     """What a mask did with each class of pixel.
 
     Args:
@@ -52,11 +55,17 @@ def confusion(accepted: Any, label: Any, surface: Any, behind: Any = None, among
     truth = np.asarray(label)
     check.shape(truth, ("H", "W"), "label")
     if not np.isin(truth, (NONE, VISIBLE, HIDDEN, AMBIGUOUS)).all():
-        raise ValueError(f"label: got values {np.unique(truth).tolist()}, expected 0 to {AMBIGUOUS}")
+        raise ValueError(
+            f"label: got values {np.unique(truth).tolist()}, expected 0 to {AMBIGUOUS}"
+        )
     kept = mask(accepted, truth.shape, "accepted")
     has = mask(surface, truth.shape, "surface")
-    counted = np.ones(truth.shape, dtype=bool) if among is None else mask(among, truth.shape, "among")
-    back = np.zeros(truth.shape, dtype=bool) if behind is None else mask(behind, truth.shape, "behind")
+    counted = (
+        np.ones(truth.shape, dtype=bool) if among is None else mask(among, truth.shape, "among")
+    )
+    back = (
+        np.zeros(truth.shape, dtype=bool) if behind is None else mask(behind, truth.shape, "behind")
+    )
     outside = (truth == NONE) & has
     classes = {
         "visible": truth == VISIBLE,
@@ -73,11 +82,13 @@ def confusion(accepted: Any, label: Any, surface: Any, behind: Any = None, among
 
 
 def scores(counts: Mapping[str, int]) -> dict[str, float]:
-    """Precision, recall, F1 and both error rates from :func:`confusion`'s counts, summed over as many views as wished.
+    """Precision, recall, F1 and both error rates from :func:`confusion`'s counts, summed over as
+    many views as wished.
 
-    A mask that accepts nothing has no precision, and a view in which nothing is visible has no recall, no false
-    negative rate and no F1: NaN. Accepted background counts against precision and F1, and not in the false positive
-    rate, whose base is surface that the source does not show: a large sky would dilute it.
+    A mask that accepts nothing has no precision, and a view in which nothing is visible has no
+    recall, no false negative rate and no F1: NaN. Accepted background counts against precision and
+    F1, and not in the false positive rate, whose base is surface that the source does not show: a
+    large sky would dilute it.
     """
     tp, fn = counts["visible_accepted"], counts["visible_rejected"]
     unseen = counts["hidden_accepted"] + counts["outside_accepted"]
@@ -94,8 +105,11 @@ def scores(counts: Mapping[str, int]) -> dict[str, float]:
     }
 
 
-def mask_error(accepted: Any, label: Any, surface: Any, behind: Any = None, edge: Any = None) -> dict[str, float]:
-    """Scores and counts of a mask; with ``edge`` also for the interior and the band around edges apart.
+def mask_error(
+    accepted: Any, label: Any, surface: Any, behind: Any = None, edge: Any = None
+) -> dict[str, float]:
+    """Scores and counts of a mask; with ``edge`` also for the interior and the band around edges
+    apart.
 
     Args:
         accepted, label, surface, behind: as in :func:`confusion`.
@@ -130,19 +144,26 @@ class YawBin:
 
 
 def by_yaw(
-    rows: Iterable[tuple[float, Mapping[str, int]]], edges: Sequence[float] = (0, 15, 30, 60, 90, 120, 150, 180)
+    rows: Iterable[tuple[float, Mapping[str, int]]],
+    edges: Sequence[float] = (0, 15, 30, 60, 90, 120, 150, 180),
 ) -> list[YawBin]:
     """Counts of views, summed in bins of yaw.
 
     Args:
-        rows: yaw in degrees, of either sign and folded to [0, 180], and the counts of :func:`confusion`.
+        rows: yaw in degrees, of either sign and folded to [0, 180], and the counts of
+            :func:`confusion`.
         edges: ends of the bins, rising from 0 to 180.
 
     Returns:
         One entry for each bin, empty ones included: their scores are NaN.
     """
     ends = [float(edge) for edge in edges]
-    if len(ends) < 2 or ends[0] != 0 or ends[-1] != 180 or any(a >= b for a, b in itertools.pairwise(ends)):
+    if (
+        len(ends) < 2
+        or ends[0] != 0
+        or ends[-1] != 180
+        or any(a >= b for a, b in itertools.pairwise(ends))
+    ):
         raise ValueError(f"edges: got {list(edges)}, expected rising degrees from 0 to 180")
     sums = [dict.fromkeys(COUNTS, 0) for _ in ends[1:]]
     views = [0] * len(sums)

@@ -9,20 +9,25 @@ import numpy as np
 from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
 
 
-def endpoint_error(xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, image_px: Any = 1.0) -> dict[str, float]:
+def endpoint_error(
+    xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, image_px: Any = 1.0
+) -> dict[str, float]:
     """Distance between where a warp looks and where it should look.
 
     Args:
         xy: (H, W, 2) source positions of the warp, NaN where undefined.
         true_xy: (H, W, 2) exact source positions on the same grid.
         visible: (H, W) bool, pixels whose surface the source truly shows; only these are scored.
-        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the band apart too.
-        image_px: size of one unit of ``xy`` in image pixels, or (x, y) sizes: 8 on the 64 grid of a 512 image.
+        edge: (H, W) bool, the band around edges; given, every figure comes for the interior and the
+            band apart too.
+        image_px: size of one unit of ``xy`` in image pixels, or (x, y) sizes: 8 on the 64 grid of a
+            512 image.
 
     Returns:
-        Figures of :data:`attnwarp_eval.metrics.registry.METRICS` in image pixels, and ``_layer`` ones in the units of ``xy``. The
-        shares are of all visible pixels: one without a position is not within anything. Median, percentile and mean are
-        over those that have one, with ``coverage`` beside them. NaN where there is nothing to measure.
+        Figures of :data:`attnwarp_eval.metrics.registry.METRICS` in image pixels, and ``_layer``
+        ones in the units of ``xy``. The shares are of all visible pixels: one without a position is
+        not within anything. Median, percentile and mean are over those that have one, with
+        ``coverage`` beside them. NaN where there is nothing to measure.
     """
     truth = floats(true_xy, ("H", "W", 2), "true_xy")
     shape = truth.shape[:2]
@@ -30,7 +35,9 @@ def endpoint_error(xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, ima
     seen = mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
     if not np.isfinite(truth[seen]).all():
-        raise ValueError("true_xy: not finite in a visible pixel; positions and labels do not belong together")
+        raise ValueError(
+            "true_xy: not finite in a visible pixel; positions and labels do not belong together"
+        )
     offset = estimate - truth
     layer = np.hypot(offset[..., 0], offset[..., 1])
     scaled = offset * np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
@@ -56,11 +63,15 @@ def endpoint_error(xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, ima
     return figures
 
 
-def feature_error(warped: Any, exact: Any, accepted: Any, visible: Any, edge: Any = None) -> dict[str, float]:
-    """Error of warped features where the exact answer is known: sqrt(sum (warped - exact)^2 / sum exact^2).
+def feature_error(
+    warped: Any, exact: Any, accepted: Any, visible: Any, edge: Any = None
+) -> dict[str, float]:
+    """Error of warped features where the exact answer is known: sqrt(sum (warped - exact)^2 / sum
+    exact^2).
 
     Args:
-        warped: (C, h, w) features as warped; what stands outside ``accepted`` counts in ``feature_visible`` alone.
+        warped: (C, h, w) features as warped; what stands outside ``accepted`` counts in
+            ``feature_visible`` alone.
         exact: (C, h, w) the field at the target's own surface points
             (:meth:`attnwarp_eval.truth.features.SolidField.on_grid`).
         accepted: (h, w) bool, the warp's mask.
@@ -68,9 +79,9 @@ def feature_error(warped: Any, exact: Any, accepted: Any, visible: Any, edge: An
         edge: (h, w) bool, the band around edges.
 
     Returns:
-        ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible ones,
-        ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is injected. NaN where there is
-        nothing to measure.
+        ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible
+        ones, ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is
+        injected. NaN where there is nothing to measure.
     """
     truth = floats(exact, ("C", "H", "W"), "exact")
     shape = truth.shape[1:]

@@ -1,4 +1,6 @@
-"""A run's report: report.md, report.html (self-contained) and results.jsonl, made from its cells alone."""
+"""A run's report: report.md, report.html (self-contained) and results.jsonl, made from its cells
+alone.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,10 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
     Args:
         store: the run.
-        timings: False leaves out everything measured in seconds or memory, so that two runs of the same study on the
-            same code give the same bytes.
-        pictures: False leaves out the views' pictures, for a report that is kept beside the code or in a CI summary.
+        timings: False leaves out everything measured in seconds or memory, so that two runs of the
+            same study on the same code give the same bytes.
+        pictures: False leaves out the views' pictures, for a report that is kept beside the code or
+            in a CI summary.
 
     Returns:
         The files written, the one a person opens first at the end.

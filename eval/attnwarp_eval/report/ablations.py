@@ -61,8 +61,19 @@ CONTRASTS = {
         "occlusion.precision",
         "occlusion.recall",
     ],
-    "depth": ["depth.abs_rel", "depth.abs_rel.interior", "depth.bias_median.interior", "depth.normal_median"],
-    "fit": ["fit.psnr", "fit.ssim", "depth.abs_rel", "depth.abs_rel.interior", "depth.normal_median"],
+    "depth": [
+        "depth.abs_rel",
+        "depth.abs_rel.interior",
+        "depth.bias_median.interior",
+        "depth.normal_median",
+    ],
+    "fit": [
+        "fit.psnr",
+        "fit.ssim",
+        "depth.abs_rel",
+        "depth.abs_rel.interior",
+        "depth.normal_median",
+    ],
 }
 """What a variant's difference from the baseline is tested in."""
 
@@ -81,7 +92,10 @@ def _section(results: Results, ablation: dict[str, Any]) -> Section:
     missing = [name for name in names if not results.records(probe, name)]
     if missing:
         section.text.append(f"**Not measured:** {', '.join(missing)}.")
-    columns = {k.format(layer=results.layer): v.format(layer=results.layer) for k, v in COLUMNS[probe].items()}
+    columns = {
+        k.format(layer=results.layer): v.format(layer=results.layer)
+        for k, v in COLUMNS[probe].items()
+    }
     rows = []
     for name in names:
         work = results.counters(probe, name)
@@ -95,7 +109,9 @@ def _section(results: Results, ablation: dict[str, Any]) -> Section:
                 number(1000 * sum(steady.values()) / len(steady)) if steady else "–",
             ]
         )
-    section.tables.append(Table(["variant", *columns, "M splat-pixel pairs a view", ONCE], rows, timed=(ONCE,)))
+    section.tables.append(
+        Table(["variant", *columns, "M splat-pixel pairs a view", ONCE], rows, timed=(ONCE,))
+    )
     section.tables += _more(results, probe, names)
     if len(names) > 1:
         section.tables.append(_contrasts(results, probe, baseline, names[1:]))
@@ -113,7 +129,11 @@ def _more(results: Results, probe: str, names: list[str]) -> list[Table]:
         wanted = {"inside surfaces": "interior", "at edges": "edge"}
         columns = ["variant", "where", *(metric.removeprefix("depth.") for metric in PLACES)]
         rows = [
-            [name, place, *_figures(results, probe, name, [f"{metric}.{region}" for metric in PLACES])]
+            [
+                name,
+                place,
+                *_figures(results, probe, name, [f"{metric}.{region}" for metric in PLACES]),
+            ]
             for name in names
             for place, region in wanted.items()
         ]
@@ -138,7 +158,11 @@ def _more(results: Results, probe: str, names: list[str]) -> list[Table]:
 def _contrasts(results: Results, probe: str, baseline: str, names: list[str]) -> Table:
     metrics = [metric.format(layer=results.layer) for metric in CONTRASTS[probe]]
     found = [
-        (name, metric, paired(results.views(probe, baseline, metric), results.views(probe, name, metric)))
+        (
+            name,
+            metric,
+            paired(results.views(probe, baseline, metric), results.views(probe, name, metric)),
+        )
         for name in names
         for metric in metrics
     ]
@@ -148,14 +172,26 @@ def _contrasts(results: Results, probe: str, baseline: str, names: list[str]) ->
         specification = metric_of(metric)
         judged: str = "–"
         if specification.direction in ("higher", "lower"):
-            direction: Literal["higher", "lower"] = "higher" if specification.direction == "higher" else "lower"
+            direction: Literal["higher", "lower"] = (
+                "higher" if specification.direction == "higher" else "lower"
+            )
             judged = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
         if difference.views == 0:
             judged = "not measured"
         elif difference.mean == difference.low == difference.high == 0:
             judged = "same values"
         found_in = f"{difference.scenes}, {difference.views}"
-        rows.append([name, metric, spread(difference), judged, number(difference.detectable), number(p), found_in])
+        rows.append(
+            [
+                name,
+                metric,
+                spread(difference),
+                judged,
+                number(difference.detectable),
+                number(p),
+                found_in,
+            ]
+        )
     columns = [
         "variant",
         "metric",
@@ -165,4 +201,6 @@ def _contrasts(results: Results, probe: str, baseline: str, names: list[str]) ->
         "adjusted p",
         "scenes, views",
     ]
-    return Table(columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True)
+    return Table(
+        columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True
+    )

@@ -13,11 +13,15 @@ LARGEST_EPE = 1e-3
 """Pixels: the largest median endpoint error of the truth's own depth through the warp."""
 
 SMALLEST_SHARE = 0.99
-"""Of pixels whose surface point Mitsuba must find where the ray caster does. Rays on outlines may fall either way."""
+"""Of pixels whose surface point Mitsuba must find where the ray caster does. Rays on outlines may
+fall either way.
+"""
 
 
 def problems(results: Results) -> list[str]:
-    """What is wrong with the instrument in this run: one line a scene and figure; empty when it is calibrated."""
+    """What is wrong with the instrument in this run: one line a scene and figure; empty when it is
+    calibrated.
+    """
     found = []
     calibrated = set()
     for cell in results.cells:
@@ -30,11 +34,19 @@ def problems(results: Results) -> list[str]:
         tests: list[tuple[str, Callable[[float], bool], str]] = [
             ("warp.epe_median", lambda v: v < LARGEST_EPE, f"below {LARGEST_EPE:g} px"),
             ("occlusion.f1.exact", lambda v: v == 1, "1"),
-            ("calibration.mitsuba_agrees", lambda v: v >= SMALLEST_SHARE, f"at least {SMALLEST_SHARE:g}"),
+            (
+                "calibration.mitsuba_agrees",
+                lambda v: v >= SMALLEST_SHARE,
+                f"at least {SMALLEST_SHARE:g}",
+            ),
         ]
         for metric, passes, expected in tests:
             values = _values(cell["record"], metric)
-            found += [f"{cell['scene']}: {metric} is {number(v)}, expected {expected}" for v in values if not passes(v)]
+            found += [
+                f"{cell['scene']}: {metric} is {number(v)}, expected {expected}"
+                for v in values
+                if not passes(v)
+            ]
             if not values:
                 found.append(f"{cell['scene']}: {metric} is undefined in every view")
     return found
@@ -50,10 +62,14 @@ def calibration(results: Results) -> Section:
             continue
         record = cell["record"]
         worst = {
-            "warp.epe_median": max, "warp.epe_p95": max, "calibration.mitsuba_agrees": min, "occlusion.f1.exact": min,
-            "occlusion.f1": min, **{f"warp.feature_accepted.{size}": max for size in sizes},
+            "warp.epe_median": max,
+            "warp.epe_p95": max,
+            "calibration.mitsuba_agrees": min,
+            "occlusion.f1.exact": min,
+            "occlusion.f1": min,
+            **{f"warp.feature_accepted.{size}": max for size in sizes},
             **{f"warp.feature_accepted.interior.{size}": max for size in sizes},
-        }  # fmt: skip
+        }
         figures = [_worst(record, metric, pick) for metric, pick in worst.items()]
         passed = not any(line.startswith(f"{cell['scene']}: ") for line in bad)
         rows.append([cell["scene"], "passed" if passed else "FAILED", *figures])
@@ -69,15 +85,27 @@ def calibration(results: Results) -> Section:
         *(f"inside surfaces, {size}" for size in sizes),
     ]
     text = [
-        f"The truth's own depth goes through the same warp, whose median endpoint error must stay below {LARGEST_EPE:g} px; "
-        "the exact mask is scored against itself, which must give F1 = 1; and Mitsuba, which shares no code with the ray "
-        "caster, must find the same surface point (within 1e-4 of its distance) in at least "
-        f"{100 * SMALLEST_SHARE:g} % of a view's pixels. The worst view of each scene is shown.",
-        "What the rules lose on exact depth, and what bilinear sampling of a feature field costs at each size, are the "
-        "floor of everything below: at coarse grids most of it lies at edges, where taps reach across.",
+        (
+            "The truth's own depth goes through the same warp, whose median endpoint error must"
+            f" stay below {LARGEST_EPE:g} px; the exact mask is scored against itself, which must"
+            " give F1 = 1; and Mitsuba, which shares no code with the ray caster, must find the"
+            " same surface point (within 1e-4 of its distance) in at least"
+            f" {100 * SMALLEST_SHARE:g} % of a view's pixels. The worst view of each scene is"
+            " shown."
+        ),
+        (
+            "What the rules lose on exact depth, and what bilinear sampling of a feature field"
+            " costs at each size, are the floor of everything below: at coarse grids most of it"
+            " lies at edges, where taps reach across."
+        ),
     ]
     if bad:
-        text.insert(0, "**The instrument is not calibrated; nothing below can be trusted:** " + "; ".join(bad) + ".")
+        text.insert(
+            0,
+            "**The instrument is not calibrated; nothing below can be trusted:** "
+            + "; ".join(bad)
+            + ".",
+        )
     return Section("Calibration", text, [Table(columns, rows)])
 
 
@@ -88,5 +116,7 @@ def _values(record: dict[str, Any], metric: str) -> list[float]:
 
 def _worst(record: dict[str, Any], metric: str, pick: Callable[[list[float]], float]) -> str:
     values = _values(record, metric)
-    absent = sum(metric in view["metrics"] and view["metrics"][metric] is None for view in record["views"])
+    absent = sum(
+        metric in view["metrics"] and view["metrics"][metric] is None for view in record["views"]
+    )
     return (number(pick(values)) if values else "–") + (f" ({absent} undefined)" if absent else "")

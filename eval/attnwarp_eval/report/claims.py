@@ -10,7 +10,14 @@ from typing import Any, Literal
 import yaml
 
 from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics.intervals import ByView, Interval, agreement, benjamini_hochberg, interval, paired
+from attnwarp_eval.statistics.intervals import (
+    ByView,
+    Interval,
+    agreement,
+    benjamini_hochberg,
+    interval,
+    paired,
+)
 
 Verdict = Literal["holds", "does not hold", "can't tell"]
 
@@ -48,8 +55,13 @@ class Claim:
                 for low, high in self.compare_yaw
             }
             # Different views cannot be paired; their means can, scene by scene.
-            means = [{s: {"mean": _interval({s: v}).mean} for s, v in table.items()} for table in tables.values()]
-            return Measured(metric, {name: _interval(t) for name, t in tables.items()}, means[0], means[1])
+            means = [
+                {s: {"mean": _interval({s: v}).mean} for s, v in table.items()}
+                for table in tables.values()
+            ]
+            return Measured(
+                metric, {name: _interval(t) for name, t in tables.items()}, means[0], means[1]
+            )
         first = results.views(self.probe, a, metric, self.yaw)
         if b is None:
             zero = {scene: dict.fromkeys(views, 0.0) for scene, views in first.items()}
@@ -92,7 +104,10 @@ def load_claims() -> list[Claim]:
 
 
 def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
-    return {k: tuple(map(tuple, v)) if k == "compare_yaw" else tuple(v) if k == "yaw" else v for k, v in entry.items()}
+    return {
+        k: tuple(map(tuple, v)) if k == "compare_yaw" else tuple(v) if k == "yaw" else v
+        for k, v in entry.items()
+    }
 
 
 def judge(results: Results, claims: list[Claim]) -> list[Finding]:

@@ -15,7 +15,9 @@ def effects(results: Results) -> list[Section]:
         if said is None:
             continue
         planned = said["plan"]
-        beyond = [f"{name} ({words})" for name, words in said["needed"].items() if name not in USUAL]
+        beyond = [
+            f"{name} ({words})" for name, words in said["needed"].items() if name not in USUAL
+        ]
         rows.append(
             [
                 cell["scene"],
@@ -30,10 +32,27 @@ def effects(results: Results) -> list[Section]:
     if not rows:
         return []
     text = [
-        "Depth, visibility and correspondences are cast with rays, without any light. The true pictures are rendered as "
-        "each scene's plan says: only what it calls for is simulated. A run does not prove its plans; `attnwarp-eval "
-        "scenes effects NAME --prove` holds one against a rendering with everything on, and reports/effects in the "
-        "repository has that for every scene that ships.",
+        (
+            "Depth, visibility and correspondences are cast with rays, without any light. The true"
+            " pictures are rendered as each scene's plan says: only what it calls for is simulated."
+            " A run does not prove its plans; `attnwarp-eval scenes effects NAME --prove` holds one"
+            " against a rendering with everything on, and reports/effects in the repository has"
+            " that for every scene that ships."
+        ),
     ]
-    columns = ["scene", "effects", "and", "not simulated", "plan", "everything on would be", "because"]
-    return [Section("What light does in these scenes, and what of it is simulated", text, [Table(columns, rows)])]
+    columns = [
+        "scene",
+        "effects",
+        "and",
+        "not simulated",
+        "plan",
+        "everything on would be",
+        "because",
+    ]
+    return [
+        Section(
+            "What light does in these scenes, and what of it is simulated",
+            text,
+            [Table(columns, rows)],
+        )
+    ]

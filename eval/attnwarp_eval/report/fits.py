@@ -22,7 +22,9 @@ CURVES: dict[str, tuple[str, Callable[[dict[str, Any]], float | None]]] = {
 TIMED = ("CPU seconds", "seconds", "CPU seconds to 28 dB")
 
 
-def fits(results: Results, root: Path, number: Callable[[float | None], str], *, timings: bool) -> list[Section]:
+def fits(
+    results: Results, root: Path, number: Callable[[float | None], str], *, timings: bool
+) -> list[Section]:
     """The section of the fits, none if nothing was fitted.
 
     Args:
@@ -34,7 +36,8 @@ def fits(results: Results, root: Path, number: Callable[[float | None], str], *,
     own: dict[str, str] = {}
     for cell in results.cells:
         if cell["probe"] == "fit" and cell["record"] is not None:
-            # Variants that look at one fit in different ways share its curve; the first gives it its name.
+            # Variants that look at one fit in different ways share its curve; the first gives it
+            # its name.
             how = canonical_json({**cell["record"]["spec"]["fit"], "seed": cell["seed"]})
             own.setdefault(how, cell["variants"][0])
     names = list(dict.fromkeys(own.values()))
@@ -45,7 +48,9 @@ def fits(results: Results, root: Path, number: Callable[[float | None], str], *,
         for scene, seed, record in results.records("fit", name):
             last = record["curve"][-1]
             views = [view["metrics"] for view in record["views"]]
-            reached = next((p["cpu_seconds"] for p in record["curve"] if p["psnr"] and p["psnr"] >= 28), None)
+            reached = next(
+                (p["cpu_seconds"] for p in record["curve"] if p["psnr"] and p["psnr"] >= 28), None
+            )
             rows.append(
                 [
                     name,
@@ -63,22 +68,36 @@ def fits(results: Results, root: Path, number: Callable[[float | None], str], *,
                 ]
             )
     columns = [
-        "fit", "scene", "PSNR", "pooled PSNR", "SSIM", "AbsRel", "normal, deg", "splats", "iterations", *TIMED,
-    ]  # fmt: skip
+        "fit",
+        "scene",
+        "PSNR",
+        "pooled PSNR",
+        "SSIM",
+        "AbsRel",
+        "normal, deg",
+        "splats",
+        "iterations",
+        *TIMED,
+    ]
     how, size = results.study["fit"], results.study["size"]
     fitted = how["views"] - -(-how["views"] // 8)
     text = [
-        f"Every fit begins with the same {how['points']} points per scene, scattered about the surfaces by "
-        f"{number(how['noise'])} of their spacing, and sees {fitted} of {how['views']} true pictures at {size} x "
-        f"{size} px; every 8th is held out, and measured. PSNR is a mean over views, pooled PSNR that of their mean "
-        "squared error. Depth in this table and in the curves is median depth, by intersection for 2D splats and at "
-        "the ray's peak for 3D ones; other ways to read depth off the same splats stand in the tables above.",
+        (
+            f"Every fit begins with the same {how['points']} points per scene, scattered about the"
+            f" surfaces by {number(how['noise'])} of their spacing, and sees {fitted} of"
+            f" {how['views']} true pictures at {size} x {size} px; every 8th is held out, and"
+            " measured. PSNR is a mean over views, pooled PSNR that of their mean squared error."
+            " Depth in this table and in the curves is median depth, by intersection for 2D splats"
+            " and at the ray's peak for 3D ones; other ways to read depth off the same splats"
+            " stand in the tables above."
+        ),
     ]
     section = Section("Fits", text, [Table(columns, rows, timed=TIMED)])
     if timings:
         section.text.append(
-            "Curves: means over scenes at each evaluation, 95 % intervals over scenes, against the CPU seconds of the "
-            "iterations, those of all threads together (evaluations and files are not in them)."
+            "Curves: means over scenes at each evaluation, 95 % intervals over scenes, against the"
+            " CPU seconds of the iterations, those of all threads together (evaluations and files"
+            " are not in them)."
         )
         section.figures.append(_curves(results, root, names))
     return [section]
@@ -101,7 +120,9 @@ def _curves(results: Results, root: Path, names: list[str]) -> Picture:
 def _curve(
     results: Results, name: str, pick: Callable[[dict[str, Any]], float | None]
 ) -> tuple[list[float], list[Interval]]:
-    """CPU seconds and values at the evaluations that every scene has, without the one before the first iteration."""
+    """CPU seconds and values at the evaluations that every scene has, without the one before the
+    first iteration.
+    """
     curves = [
         (f"{scene}/{seed}", {p["iteration"]: p for p in record["curve"]})
         for scene, seed, record in results.records("fit", name)
@@ -111,5 +132,7 @@ def _curve(
     values = []
     for k in common:
         found = {scene: pick(curve[k]) for scene, curve in curves}
-        values.append(interval({scene: [math.nan if v is None else v] for scene, v in found.items()}))
+        values.append(
+            interval({scene: [math.nan if v is None else v] for scene, v in found.items()})
+        )
     return seconds, values

@@ -1,4 +1,5 @@
-"""What accuracy costs in time: error against seconds, taken in turn where the study asked for that."""
+"""What accuracy costs in time: error against seconds, taken in turn where the study asked for
+that."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ STAGES = {"depth": "render", "warp": "pair"}
 
 
 def fronts(results: Results, root: Path) -> list[Section]:
-    """The section of fronts, with its figures written below ``root``; nothing where the study names none.
+    """The section of fronts, with its figures written below ``root``; nothing where the study names
+    none.
 
     Args:
         results: of the run.
@@ -35,36 +37,47 @@ def fronts(results: Results, root: Path) -> list[Section]:
         path = root / "figures" / f"front-{index}.svg"
         label = f"{metric} ({metric_of(metric).unit})"
         with figures.drawing(path) as (axes,):
-            kept = figures.cost_front(axes, points, x="seconds a view", y=label, title=wanted["title"])
+            kept = figures.cost_front(
+                axes, points, x="seconds a view", y=label, title=wanted["title"]
+            )
         section.figures.append(Picture(f"figures/{path.name}", wanted["title"]))
         columns = ["variant", label, "ms a view", "time, ratio", "verdict", "on the front"]
-        marked = [[*row, ("yes" if row[0] in kept else "no") if row[0] in points else "–"] for row in rows]
+        marked = [
+            [*row, ("yes" if row[0] in kept else "no") if row[0] in points else "–"] for row in rows
+        ]
         section.tables.append(Table(columns, marked, wanted["title"]))
     return [section] if section.tables else []
 
 
 def _text(results: Results) -> list[str]:
     what = (
-        "Seconds are those of the method alone: a render of the target for depth; render, correspondence, mask and "
-        "feature grids for a warp. The source's render serves all targets and is not in them, nor are set-up and checks. "
-        "A point is on the front when nothing cheaper is as good, by the means: look at the intervals before believing a "
-        "close one."
+        "Seconds are those of the method alone: a render of the target for depth; render,"
+        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
+        " and is not in them, nor are set-up and checks. A point is on the front when nothing"
+        " cheaper is as good, by the means: look at the intervals before believing a close one."
     )
-    timed = next((c["record"] for c in results.cells if c["probe"] == "timing" and c["record"]), None)
+    timed = next(
+        (c["record"] for c in results.cells if c["probe"] == "timing" and c["record"]), None
+    )
     if timed is None:
         return [
             what,
-            "These seconds come from one pass over the views, each variant at another time, and are for orientation: a "
-            "study with a `timing` probe takes them in turn.",
+            (
+                "These seconds come from one pass over the views, each variant at another time, and"
+                " are for orientation: a study with a `timing` probe takes them in turn."
+            ),
         ]
     spec, threads = timed["spec"], timed["cost"]["threads"]
     return [
         what,
-        f"All contestants ran in turn in one process, {spec['rounds']} rounds in an order drawn anew each round, on view "
-        f"{spec['views'][0]} of each scene with {threads} renderer thread{'s' if threads != 1 else ''}; a ratio is the "
-        "median over rounds of the ratio to the first contestant within a round, with a bootstrap interval over rounds. "
-        "The row `again` is the first contestant against itself: what noise alone does on this machine. Inside that band "
-        "nothing is called faster or slower.",
+        (
+            f"All contestants ran in turn in one process, {spec['rounds']} rounds in an order drawn"
+            f" anew each round, on view {spec['views'][0]} of each scene with {threads} renderer"
+            f" thread{'s' if threads != 1 else ''}; a ratio is the median over rounds of the ratio"
+            " to the first contestant within a round, with a bootstrap interval over rounds. The"
+            " row `again` is the first contestant against itself: what noise alone does on this"
+            " machine. Inside that band nothing is called faster or slower."
+        ),
     ]
 
 
@@ -96,7 +109,11 @@ def _points(
             once = results.cost(probe, name, "steady")
             if not once:
                 continue
-            seconds, text, judged = interval({scene: [v] for scene, v in once.items()}), "one pass", "–"
+            seconds, text, judged = (
+                interval({scene: [v] for scene, v in once.items()}),
+                "one pass",
+                "–",
+            )
         points[name] = (seconds, quality)
         rows.append([name, spread(quality), number(1000 * seconds.mean), text, judged])
     if noise:

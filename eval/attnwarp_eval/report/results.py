@@ -22,7 +22,8 @@ class Results:
 
     Attributes:
         study: the resolved study as plain JSON.
-        cells: one entry an expected cell, with its record under "record" (None where it is not done).
+        cells: one entry an expected cell, with its record under "record" (None where it is not
+            done).
         failures: the table of failed cells.
     """
 
@@ -43,7 +44,11 @@ class Results:
                     record = store.read(cell["id"])
                 except StoreError as error:
                     # One damaged file must not cost the report of the others.
-                    labels = {"scene": cell["scene"], "variant": cell["variants"][0], "probe": cell["probe"]}
+                    labels = {
+                        "scene": cell["scene"],
+                        "variant": cell["variants"][0],
+                        "probe": cell["probe"],
+                    }
                     failures.append({**labels, "error": str(error)})
             cells.append({**cell, "record": record})
         return cls(kept["study"], cells, failures)
@@ -53,12 +58,18 @@ class Results:
         return {name: Variant.model_validate(said) for name, said in self.study["variants"].items()}
 
     def variant_like(self, said: Mapping[str, Any], probe: str) -> str | None:
-        """The name of the measured variant that means what ``said`` means, written as a study writes a variant."""
+        """The name of the measured variant that means what ``said`` means, written as a study
+        writes a variant.
+        """
         wanted = Variant.model_validate(dict(said))
         for name, variant in self._variants.items():
             same = variant.settings() == wanted.settings() and variant.geometry == wanted.geometry
             # Splats are sampled or fitted; each probe knows one of the two.
-            same &= variant.fit == wanted.fit if probe == "fit" else self._splats(variant) == self._splats(wanted)
+            same &= (
+                variant.fit == wanted.fit
+                if probe == "fit"
+                else self._splats(variant) == self._splats(wanted)
+            )
             if same and self.records(probe, name):
                 return name
         return None
@@ -68,9 +79,15 @@ class Results:
 
     @property
     def layer(self) -> int:
-        """The feature grid that tables show: an eighth of the image, as in a diffusion UNet, or the next there is."""
+        """The feature grid that tables show: an eighth of the image, as in a diffusion UNet, or the
+        next there is.
+        """
         size, sizes = self.study["size"], self.study["feature_sizes"]
-        return size // 8 if size // 8 in sizes else max((s for s in sizes if s < size), default=max(sizes))
+        return (
+            size // 8
+            if size // 8 in sizes
+            else max((s for s in sizes if s < size), default=max(sizes))
+        )
 
     @property
     def measured(self) -> int:
@@ -99,13 +116,22 @@ class Results:
                 if yaw is not None and not yaw[0] <= view["yaw"] <= yaw[1]:
                     continue
                 value = view["metrics"].get(metric)
-                table.setdefault(scene, {})[f"{view['view']}/{seed}"] = math.nan if value is None else float(value)
+                table.setdefault(scene, {})[f"{view['view']}/{seed}"] = (
+                    math.nan if value is None else float(value)
+                )
         return table
 
-    def counts(self, probe: str, variant: str, region: str = "") -> list[tuple[float, dict[str, int]]]:
-        """(yaw, confusion counts) of every view of a variant: everywhere, or in ".interior" or ".edge"."""
+    def counts(
+        self, probe: str, variant: str, region: str = ""
+    ) -> list[tuple[float, dict[str, int]]]:
+        """(yaw, confusion counts) of every view of a variant: everywhere, or in ".interior" or
+        ".edge".
+        """
         return [
-            (float(view["yaw"]), {name: int(view["metrics"][f"occlusion.{name}{region}"]) for name in COUNTS})
+            (
+                float(view["yaw"]),
+                {name: int(view["metrics"][f"occlusion.{name}{region}"]) for name in COUNTS},
+            )
             for _, _, record in self.records(probe, variant)
             for view in record["views"]
         ]
@@ -120,7 +146,8 @@ class Results:
         return {scene: sum(v) / len(v) for scene, v in found.items()}
 
     def rounds(self, stage: str, variant: str | None) -> list[list[float]]:
-        """Seconds taken in turn by the timing probe: a list of rounds for each scene and seed, empty if there are none.
+        """Seconds taken in turn by the timing probe: a list of rounds for each scene and seed,
+        empty if there are none.
 
         Args:
             stage: "render" or "pair".
@@ -128,7 +155,11 @@ class Results:
         """
         found = []
         for cell in self.cells:
-            if cell["probe"] != "timing" or cell["record"] is None or (variant and variant not in cell["variants"]):
+            if (
+                cell["probe"] != "timing"
+                or cell["record"] is None
+                or (variant and variant not in cell["variants"])
+            ):
                 continue
             index = cell["variants"].index(variant) if variant else -1
             found.append([float(s) for s in cell["record"]["cost"]["rounds"][stage][index]])
@@ -137,7 +168,9 @@ class Results:
     @property
     def timing_baseline(self) -> str | None:
         """The first contestant of the timing probe."""
-        return next((c["variants"][0] for c in self.cells if c["probe"] == "timing" and c["record"]), None)
+        return next(
+            (c["variants"][0] for c in self.cells if c["probe"] == "timing" and c["record"]), None
+        )
 
     def counters(self, probe: str, variant: str) -> Counter[str]:
         """Work counters summed over a variant's cells."""
@@ -147,7 +180,9 @@ class Results:
         return total
 
     def lines(self, timings: bool = True) -> Iterable[str]:
-        """results.jsonl: one line a (cell, figure of quality), sorted, so that a diff of two runs can be read."""
+        """results.jsonl: one line a (cell, figure of quality), sorted, so that a diff of two runs
+        can be read.
+        """
         rows = []
         for cell in self.cells:
             record = cell["record"]

@@ -1,4 +1,6 @@
-"""Which metric can see what, and what it costs: right results of known edits against results with one known flaw."""
+"""Which metric can see what, and what it costs: right results of known edits against results with
+one known flaw.
+"""
 
 from __future__ import annotations
 
@@ -50,9 +52,24 @@ _CHANGED = ("wrong_object", "blurred", "noisy", "misplaced")
 ROWS = (
     Row("embedding.clip_similarity", "CLIP, prompt", _EDIT, "embedding.clip_similarity"),
     Row("embedding.clip_directional", "CLIP, direction", _EDIT, "embedding.clip_directional"),
-    Row("embedding.clip_image", "CLIP, source edit", (*_EDIT, "inconsistent"), "embedding.clip_image"),
-    Row("embedding.dino_image", "DINO, source edit", (*_EDIT, "inconsistent"), "embedding.dino_image"),
-    Row("consistency.delta_e", "consistency, dE00", ("inconsistent", "noisy", "misplaced"), "consistency.delta_e"),
+    Row(
+        "embedding.clip_image",
+        "CLIP, source edit",
+        (*_EDIT, "inconsistent"),
+        "embedding.clip_image",
+    ),
+    Row(
+        "embedding.dino_image",
+        "DINO, source edit",
+        (*_EDIT, "inconsistent"),
+        "embedding.dino_image",
+    ),
+    Row(
+        "consistency.delta_e",
+        "consistency, dE00",
+        ("inconsistent", "noisy", "misplaced"),
+        "consistency.delta_e",
+    ),
     Row("fidelity.preserved_mse", "rest unchanged, PSNR", _CHANGED, "fidelity.mse"),
     Row("fidelity.preserved_ssim", "rest unchanged, SSIM", _CHANGED, "fidelity.ssim"),
     Row("fidelity.mse", "truth, PSNR", _ALL, "fidelity.mse"),
@@ -69,7 +86,8 @@ Values = Mapping[str, float | None]
 
 
 def sensitivity(results: Results, root: Path, *, timings: bool = True) -> list[Section]:
-    """The section, with its figures written below ``root``; nothing where the study has no such probe.
+    """The section, with its figures written below ``root``; nothing where the study has no such
+    probe.
 
     Args:
         results: of the run.
@@ -88,7 +106,11 @@ def sensitivity(results: Results, root: Path, *, timings: bool = True) -> list[S
 
 
 def _records(results: Results) -> list[tuple[str, dict[str, Any]]]:
-    return [(c["scene"], c["record"]) for c in results.cells if c["probe"] == "sensitivity" and c["record"] is not None]
+    return [
+        (c["scene"], c["record"])
+        for c in results.cells
+        if c["probe"] == "sensitivity" and c["record"] is not None
+    ]
 
 
 def _views(records: Sequence[tuple[str, dict[str, Any]]]) -> Iterator[tuple[str, str, Values]]:
@@ -108,10 +130,11 @@ def _value(values: Values, key: str, condition: str) -> float:
 
 
 def beats(key: str, right: float, flawed: float) -> float:
-    """1 where a metric ranks the right result above the flawed one, 0 below, 0.5 where it cannot tell them apart.
+    """1 where a metric ranks the right result above the flawed one, 0 below, 0.5 where it cannot
+    tell them apart.
 
-    Values that differ by no more than two runs of the metric may (its ``atol`` and ``rtol``) are told apart by nothing
-    but the machine. NaN where either is undefined.
+    Values that differ by no more than two runs of the metric may (its ``atol`` and ``rtol``) are
+    told apart by nothing but the machine. NaN where either is undefined.
     """
     if not (math.isfinite(right) and math.isfinite(flawed)):
         return math.nan
@@ -123,9 +146,11 @@ def beats(key: str, right: float, flawed: float) -> float:
 
 
 def share(records: Sequence[tuple[str, dict[str, Any]]], key: str, condition: str) -> Interval:
-    """Of the edits and views, those in which a metric ranks the right result above one with a flaw; ties are half.
+    """Of the edits and views, those in which a metric ranks the right result above one with a flaw;
+    ties are half.
 
-    A mean over scenes with its interval. 1: it sees the flaw every time; 0.5: blind; below: it prefers the flaw.
+    A mean over scenes with its interval. 1: it sees the flaw every time; 0.5: blind; below: it
+    prefers the flaw.
     """
     table: dict[str, list[float]] = {}
     for scene, _, values in _views(records):
@@ -138,9 +163,9 @@ def curve(values: Values, key: str) -> tuple[float, float]:
     """How a metric follows the strength of an edit in one view.
 
     Returns:
-        Spearman's rank correlation of strength and metric, signed so that 1 is the right way, 0 for a metric that does
-        not change; and 1 or 0: whether each step up in strength moves it the right way by more than its tolerance. NaN
-        with fewer than three strengths that are defined.
+        Spearman's rank correlation of strength and metric, signed so that 1 is the right way, 0 for
+        a metric that does not change; and 1 or 0: whether each step up in strength moves it the
+        right way by more than its tolerance. NaN with fewer than three strengths that are defined.
     """
     from scipy import stats
 
@@ -173,14 +198,20 @@ def _flaws(
     edits = {(scene, name.rpartition("/")[0]) for scene, name, _ in _views(records)}
     views = sum(len(record["views"]) for _, record in records)
     text = [
-        f"{len(edits)} right results of edits in {len(records)} scenes, {views} pairs of a result and a view. Each is "
-        "compared with results that a method may have given in its place, each with one flaw. The figure: the share in "
-        "which a metric ranks the right result above the flawed one. **1: it sees the flaw. 0.5: blind to it. Below 0.5: "
-        "it prefers the flaw.** Differences within a metric's tolerance count as half.",
-        "Framed: what a metric is meant to see. Metrics against the truth compare with the right result itself and lose "
-        "only where nothing of a view shows the flaw; of the others, which a person has without a truth, a figure "
-        "is news. Wrong colours, weak edits and blur are alike in all views, the source included: a metric of "
-        "consistency should be blind to them.",
+        (
+            f"{len(edits)} right results of edits in {len(records)} scenes, {views} pairs of a"
+            " result and a view. Each is compared with results that a method may have given in its"
+            " place, each with one flaw. The figure: the share in which a metric ranks the right"
+            " result above the flawed one. **1: it sees the flaw. 0.5: blind to it. Below 0.5: it"
+            " prefers the flaw.** Differences within a metric's tolerance count as half."
+        ),
+        (
+            "Framed: what a metric is meant to see. Metrics against the truth compare with the"
+            " right result itself and lose only where nothing of a view shows the flaw; of the"
+            " others, which a person has without a truth, a figure is news. Wrong colours, weak"
+            " edits and blur are alike in all views, the source included: a metric of consistency"
+            " should be blind to them."
+        ),
         "Encoders: " + _encoders(results, spec) + ".",
     ]
     if len(records) < len(results.study["scenes"]):
@@ -190,23 +221,34 @@ def _flaws(
     path = root / "figures" / "sensitivity.svg"
     with figures.drawing(path, height=0.8 + 0.34 * len(rows), width=9.6) as (axes,):
         figures.heatmap(
-            axes, means, rows=[row.title for row in rows], columns=[c.title for c in FLAWS], framed=framed,
+            axes,
+            means,
+            rows=[row.title for row in rows],
+            columns=[c.title for c in FLAWS],
+            framed=framed,
             title="share in which the right result is ranked above the flawed one",
-        )  # fmt: skip
+        )
     drawn = Picture(
-        "figures/sensitivity.svg", "Which metric can see what: 1 sees the flaw, 0.5 is blind, below 0.5 prefers it."
+        "figures/sensitivity.svg",
+        "Which metric can see what: 1 sees the flaw, 0.5 is blind, below 0.5 prefers it.",
     )
     count = len(records)
     table = [[row.title, *(spread(shares[row.key][c.name], count) for c in FLAWS)] for row in rows]
     columns = ["metric", *(c.title for c in FLAWS)]
     return Section(
-        "Which metric can see what", text, [Table(columns, table, "Shares with intervals", folded=True)], [drawn]
+        "Which metric can see what",
+        text,
+        [Table(columns, table, "Shares with intervals", folded=True)],
+        [drawn],
     )
 
 
 def _encoders(results: Results, spec: Mapping[str, Any]) -> str:
     named = results.study["encoders"]
-    found = [f"{kind} `{named[kind]}` ({known['weights_sha256'][:12]})" for kind, known in spec["encoders"].items()]
+    found = [
+        f"{kind} `{named[kind]}` ({known['weights_sha256'][:12]})"
+        for kind, known in spec["encoders"].items()
+    ]
     return ", ".join(found) or "none, so what needs one is left out"
 
 
@@ -216,7 +258,9 @@ def _strengths(records: list[tuple[str, dict[str, Any]]], rows: list[Row], root:
         by_scene: dict[str, list[tuple[float, float]]] = {}
         for scene, _, values in _views(records):
             by_scene.setdefault(scene, []).append(curve(values, row.key))
-        rank, steps = (interval({s: [pair[i] for pair in v] for s, v in by_scene.items()}) for i in (0, 1))
+        rank, steps = (
+            interval({s: [pair[i] for pair in v] for s, v in by_scene.items()}) for i in (0, 1)
+        )
         table.append([row.title, spread(rank, len(records)), spread(steps, len(records))])
         if ".inside" not in row.key:
             drawn.append((row, [_mean(records, row.key, name) for name in STEPS]))
@@ -227,16 +271,23 @@ def _strengths(records: list[tuple[str, dict[str, Any]]], rows: list[Row], root:
         for where, (row, means) in zip(axes, drawn, strict=False):
             unit = metric_of(row.key).unit
             line = figures.Line(row.title, STRENGTHS, means)
-            better = "less is better" if metric_of(row.key).direction == "lower" else "more is better"
+            better = (
+                "less is better" if metric_of(row.key).direction == "lower" else "more is better"
+            )
             label = row.title.replace("PSNR", "MSE")
-            figures.lines(where, [line], x="strength", y=unit, title=f"{label} ({better})", legend=False)
+            figures.lines(
+                where, [line], x="strength", y=unit, title=f"{label} ({better})", legend=False
+            )
         for where in axes[len(drawn) :]:
             where.axis("off")
     text = [
-        "The right result at part of its strength, blended with the view before the edit in linear light. Rank "
-        "correlation: Spearman's, between strength and metric, 1 when every step moves it the right way, 0 for none. "
-        "The share beside it: edits and views in which each of the four steps is seen, beyond the metric's tolerance. "
-        "At strength 0 nothing has changed, and a direction of change is undefined.",
+        (
+            "The right result at part of its strength, blended with the view before the edit in"
+            " linear light. Rank correlation: Spearman's, between strength and metric, 1 when every"
+            " step moves it the right way, 0 for none. The share beside it: edits and views in"
+            " which each of the four steps is seen, beyond the metric's tolerance. At strength 0"
+            " nothing has changed, and a direction of change is undefined."
+        ),
     ]
     said = ["metric", "rank correlation with strength", "share with every step seen"]
     caption = "Means over scenes against the strength of the edit, with 95 % intervals over scenes."
@@ -277,18 +328,31 @@ def _costs(
     apart = [
         (
             "without the truth",
-            {row.title: points[row.title] for row in rows if row.title in points and row.meant != _ALL},
+            {
+                row.title: points[row.title]
+                for row in rows
+                if row.title in points and row.meant != _ALL
+            },
         ),
         (
             "against the truth",
-            {row.title: points[row.title] for row in rows if row.title in points and row.meant == _ALL},
+            {
+                row.title: points[row.title]
+                for row in rows
+                if row.title in points and row.meant == _ALL
+            },
         ),
     ]
     kept: list[str] = []
     with figures.drawing(path, columns=2, height=4.2, width=11.5) as axes:
         for where, (title, some) in zip(axes, apart, strict=True):
             kept += figures.cost_front(
-                where, some, x="seconds a picture", y="missed: 1 - discriminating power", title=title, log=False
+                where,
+                some,
+                x="seconds a picture",
+                y="missed: 1 - discriminating power",
+                title=title,
+                log=False,
             )
     table = [
         [
@@ -296,21 +360,31 @@ def _costs(
             number(1000 * points[row.title][0].mean),
             number(seen[row.title]),
             "yes" if row.title in kept else "no",
-            ", ".join(c.title for c in FLAWS if c.name in row.meant) if row.meant != _ALL else "all",
+            (
+                ", ".join(c.title for c in FLAWS if c.name in row.meant)
+                if row.meant != _ALL
+                else "all"
+            ),
         ]
         for row in rows
         if row.title in points
     ]
     text = [
-        f"Milliseconds of one {spec['size']} x {spec['size']} px picture: median of {spec['rounds']} rounds in which all "
-        "metrics took turns in one process, on one thread, in an order drawn anew; mean over scenes. What is made once for "
-        "all pictures is in none of them: truth, correspondences, the embeddings of the prompts, of the edited source "
-        "view and of the view before the edit. Discriminating power: the mean share over the flaws that a metric is "
-        "meant for. A metric is on the front when nothing cheaper of its kind sees as much.",
+        (
+            f"Milliseconds of one {spec['size']} x {spec['size']} px picture: median of"
+            f" {spec['rounds']} rounds in which all metrics took turns in one process, on one"
+            " thread, in an order drawn anew; mean over scenes. What is made once for all pictures"
+            " is in none of them: truth, correspondences, the embeddings of the prompts, of the"
+            " edited source view and of the view before the edit. Discriminating power: the mean"
+            " share over the flaws that a metric is meant for. A metric is on the front when"
+            " nothing cheaper of its kind sees as much."
+        ),
     ]
     columns = ["metric", "ms a picture", "discriminating power", "on the front", "meant for"]
     drawn = Picture("figures/sensitivity-cost.svg", "What a metric misses against what it costs.")
-    return Section("What a metric costs and what it can see", text, [Table(columns, table)], [drawn])
+    return Section(
+        "What a metric costs and what it can see", text, [Table(columns, table)], [drawn]
+    )
 
 
 def _point(value: float) -> Interval:

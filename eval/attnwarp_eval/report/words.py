@@ -17,11 +17,17 @@ def number(value: float | None, digits: int = 3) -> str:
     if abs(value) >= 10**digits:
         return f"{value:.0f}"
     text = f"{value:.{digits}g}"
-    return text if "e" in text else f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+    return (
+        text
+        if "e" in text
+        else f"{value:.{max(0, digits - 1 - math.floor(math.log10(abs(value))))}f}"
+    )
 
 
 def spread(value: Interval, scenes: int | None = None) -> str:
-    """Mean ± half of the 95 % interval, with what was undefined, and the scenes measured where they are not all."""
+    """Mean ± half of the 95 % interval, with what was undefined, and the scenes measured where they
+    are not all.
+    """
     if not math.isfinite(value.mean):
         return "–"
     notes = [f"{value.undefined} undefined"] if value.undefined else []

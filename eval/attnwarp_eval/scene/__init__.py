@@ -1,1 +1,3 @@
-"""Scenes: what a file of scenes/ says, and the geometry, materials, lights, cameras and edits that follow."""
+"""Scenes: what a file of scenes/ says, and the geometry, materials, lights, cameras and edits that
+follow.
+"""

@@ -20,10 +20,11 @@ Width = Annotated[float, Field(ge=0)]
 
 
 class RingSpec(Spec):
-    """``count`` copies of a part about the upright through ``about``, over ``sweep`` degrees from where it stands.
+    """``count`` copies of a part about the upright through ``about``, over ``sweep`` degrees from
+    where it stands.
 
-    ``jitter`` (0 to 1) turns each by up to that share of the step and makes it smaller by up to half that share;
-    ``lift`` raises each above the one before.
+    ``jitter`` (0 to 1) turns each by up to that share of the step and makes it smaller by up to
+    half that share; ``lift`` raises each above the one before.
     """
 
     count: int = Field(ge=1, le=500)
@@ -37,8 +38,9 @@ class RingSpec(Spec):
 class _PartSpec(Spec):
     """What every part may say.
 
-    ``color`` multiplies the object's texture; ``mirror`` doubles the part across y = 0; ``blend: false`` is a sharp
-    joint, a number a joint of that width; ``carve`` takes the part away from the blended parts before it.
+    ``color`` multiplies the object's texture; ``mirror`` doubles the part across y = 0; ``blend:
+    false`` is a sharp joint, a number a joint of that width; ``carve`` takes the part away from the
+    blended parts before it.
     """
 
     mirror: bool = False
@@ -81,7 +83,10 @@ class BlockPart(_TurnedPart):
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> BlockPart:
         if 2 * self.round > min(self.size):
-            raise ValueError(f"got round {self.round}, expected at most half the smallest size, {min(self.size) / 2}")
+            raise ValueError(
+                f"got round {self.round}, expected at most half the smallest size,"
+                f" {min(self.size) / 2}"
+            )
         return self
 
 
@@ -97,7 +102,9 @@ class DiscPart(_TurnedPart):
     def _room_for_the_edges(self) -> DiscPart:
         if self.round > min(self.radius, self.height / 2):
             most = min(self.radius, self.height / 2)
-            raise ValueError(f"got round {self.round}, expected at most {most} (the radius, or half the height)")
+            raise ValueError(
+                f"got round {self.round}, expected at most {most} (the radius, or half the height)"
+            )
         return self
 
 
@@ -120,12 +127,15 @@ class TubePart(_PartSpec):
     @model_validator(mode="after")
     def _a_radius_a_point(self) -> TubePart:
         if len(self.radii) != len(self.points):
-            raise ValueError(f"got {len(self.radii)} radii for {len(self.points)} points, expected one for each")
+            raise ValueError(
+                f"got {len(self.radii)} radii for {len(self.points)} points, expected one for each"
+            )
         return self
 
 
 PartSpec = Annotated[
-    EllipsoidPart | CapsulePart | TorusPart | BlockPart | DiscPart | TubePart, Field(discriminator="type")
+    EllipsoidPart | CapsulePart | TorusPart | BlockPart | DiscPart | TubePart,
+    Field(discriminator="type"),
 ]
 
 
@@ -139,7 +149,9 @@ class ReliefSpec(Spec):
 
 
 class BodySpec(Spec):
-    """A body of blended parts (signed distances), meshed by marching cubes. ``mirror`` doubles a part across y = 0."""
+    """A body of blended parts (signed distances), meshed by marching cubes. ``mirror`` doubles a
+    part across y = 0.
+    """
 
     type: Literal["body"]
     parts: tuple[PartSpec, ...] = Field(min_length=1)
@@ -153,12 +165,16 @@ class BodySpec(Spec):
     @model_validator(mode="after")
     def _something_to_carve(self) -> BodySpec:
         if self.parts[0].carve:
-            raise ValueError("got a body whose first part carves, expected something to carve from before it")
+            raise ValueError(
+                "got a body whose first part carves, expected something to carve from before it"
+            )
         return self
 
     def solid(self) -> list[shapes.Part]:
         """The parts, copies and mirror images included."""
-        return [copy for spec in self.parts for part in _parts(spec) for copy in _ring(part, spec.ring)]
+        return [
+            copy for spec in self.parts for part in _parts(spec) for copy in _ring(part, spec.ring)
+        ]
 
     def surface(self) -> shapes.Relief | None:
         """The relief."""
@@ -170,7 +186,9 @@ class BodySpec(Spec):
 
     def contains(self, point: npt.NDArray[np.float64]) -> bool:
         """Whether a (3,) point in the body's own coordinates is inside; needs no meshing."""
-        return bool(shapes.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0)
+        return bool(
+            shapes.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0
+        )
 
 
 def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
@@ -182,7 +200,9 @@ def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
 
         if isinstance(spec, CapsulePart | TubePart):
             points, radii = (
-                ((spec.start, spec.end), spec.radii) if isinstance(spec, CapsulePart) else (spec.points, spec.radii)
+                ((spec.start, spec.end), spec.radii)
+                if isinstance(spec, CapsulePart)
+                else (spec.points, spec.radii)
             )
             for k in range(len(points) - 1):
                 yield shapes.Capsule(
@@ -193,12 +213,24 @@ def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
         center, pitch, yaw, roll = flip(spec.center), spec.pitch, spec.yaw * side, spec.roll * side
         match spec:
             case EllipsoidPart():
-                yield shapes.Ellipsoid(center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve)
+                yield shapes.Ellipsoid(
+                    center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
+                )
             case TorusPart():
-                yield shapes.Torus(center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve)
+                yield shapes.Torus(
+                    center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
+                )
             case BlockPart():
                 yield shapes.Block(
-                    center, spec.size, spec.round, pitch, yaw, roll, color=color, blend=blend, carve=carve
+                    center,
+                    spec.size,
+                    spec.round,
+                    pitch,
+                    yaw,
+                    roll,
+                    color=color,
+                    blend=blend,
+                    carve=carve,
                 )
             case DiscPart():
                 yield shapes.Disc(
@@ -212,9 +244,15 @@ def _ring(part: shapes.Part, ring: RingSpec | None) -> Iterator[shapes.Part]:
         yield part
         return
     # A full turn ends where it begins; part of one has a copy at both of its ends.
-    step = ring.sweep / (ring.count if abs(ring.sweep) >= 360 or ring.count == 1 else ring.count - 1)
-    cells = np.stack(np.meshgrid(np.arange(ring.count), [0, 1], indexing="ij"), axis=-1).reshape(-1, 2)
-    dice = lattice_noise(np.column_stack([cells, np.full(len(cells), 77)]).astype(float), ring.seed).reshape(-1, 2)
+    step = ring.sweep / (
+        ring.count if abs(ring.sweep) >= 360 or ring.count == 1 else ring.count - 1
+    )
+    cells = np.stack(np.meshgrid(np.arange(ring.count), [0, 1], indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    dice = lattice_noise(
+        np.column_stack([cells, np.full(len(cells), 77)]).astype(float), ring.seed
+    ).reshape(-1, 2)
     for k in range(ring.count):
         angle = step * (k + ring.jitter * (dice[k, 0] - 0.5))
         size = 1 - 0.5 * ring.jitter * dice[k, 1]
@@ -228,12 +266,18 @@ def _ring(part: shapes.Part, ring: RingSpec | None) -> Iterator[shapes.Part]:
         match part:
             case shapes.Capsule():
                 yield replace(
-                    part, start=turn(part.start), end=turn(part.end), radii=(part.radii[0] * size, part.radii[1] * size)
+                    part,
+                    start=turn(part.start),
+                    end=turn(part.end),
+                    radii=(part.radii[0] * size, part.radii[1] * size),
                 )
             case shapes.Ellipsoid():
                 x, y, z = part.radii
                 yield replace(
-                    part, center=turn(part.center), yaw=part.yaw + angle, radii=(x * size, y * size, z * size)
+                    part,
+                    center=turn(part.center),
+                    yaw=part.yaw + angle,
+                    radii=(x * size, y * size, z * size),
                 )
             case _:
                 yield replace(part, center=turn(part.center), yaw=part.yaw + angle)

@@ -1,4 +1,6 @@
-"""Edits with truth: what an instruction does to a scene, so that the edited scene can be rendered from everywhere."""
+"""Edits with truth: what an instruction does to a scene, so that the edited scene can be rendered
+from everywhere.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,10 @@ def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
         said = _recolored(said, change.recolor, met)
         missing = sorted(set(change.recolor) - met)
         if missing:
-            raise ValueError(f"recolor: {item.name!r} has no colour {missing[0]!r}; it has {', '.join(_colors(said))}")
+            raise ValueError(
+                f"recolor: {item.name!r} has no colour {missing[0]!r}; it has"
+                f" {', '.join(_colors(said))}"
+            )
     if change.texture is not None:
         said["texture"] = change.texture.model_dump(mode="json")
     if change.paint is not None:
@@ -109,11 +114,16 @@ def _colors(said: Any) -> list[str]:
 
 
 def _painted(texture: dict[str, Any], paint: str) -> dict[str, Any]:
-    """The texture in shades of one colour: each of its colours keeps its lightness relative to the lightest."""
+    """The texture in shades of one colour: each of its colours keeps its lightness relative to the
+    lightest.
+    """
     colors = _colors(texture)
     light = {color: float(LUMINANCE @ np.array(linear_rgb(color))) for color in colors}
     brightest = max(light.values()) or 1.0
-    shades = {color: _hex(np.array(linear_rgb(paint)) * (light[color] or 1e-3) / brightest) for color in colors}
+    shades = {
+        color: _hex(np.array(linear_rgb(paint)) * (light[color] or 1e-3) / brightest)
+        for color in colors
+    }
     painted: dict[str, Any] = _recolored(texture, shades, set())
     return painted
 
@@ -128,13 +138,19 @@ def problems(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
     for k, edit in enumerate(spec.edits):
         if edit.name in seen:
             yield (
-                f"edits[{k}].name: {edit.name!r} is also the name of edits[{seen[edit.name]}]; rename one",
+                (
+                    f"edits[{k}].name: {edit.name!r} is also the name of edits[{seen[edit.name]}];"
+                    " rename one"
+                ),
                 ("edits", k),
             )
         seen[edit.name] = k
         names = [answer.name for answer in edit.answers]
         if len(set(names)) < len(names):
-            yield f"edits[{k}].answers: two of them have one name ({', '.join(names)}); rename one", ("edits", k)
+            yield (
+                f"edits[{k}].answers: two of them have one name ({', '.join(names)}); rename one",
+                ("edits", k),
+            )
         for answer in edit.answers or (None,):
             try:
                 result = apply(spec, edit, answer)
@@ -142,7 +158,10 @@ def problems(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
                 yield f"edits[{k}]: {error.errors(include_url=False)[0]['msg']}", ("edits", k)
                 continue
             except ValueError as error:
-                yield f"edits[{k}]: {error}; objects are {', '.join(o.name for o in spec.objects)}", ("edits", k)
+                yield (
+                    f"edits[{k}]: {error}; objects are {', '.join(o.name for o in spec.objects)}",
+                    ("edits", k),
+                )
                 continue
             for message, _ in contradictions(result):
                 yield f"edits[{k}]: makes a scene that contradicts itself: {message}", ("edits", k)

@@ -20,7 +20,9 @@ from attnwarp_eval.scene.transport import contradictions
 
 
 def scene_folders() -> list[Path]:
-    """Where scenes are looked for by name: ``./scenes``, then those of the package (in a checkout: its ``scenes``)."""
+    """Where scenes are looked for by name: ``./scenes``, then those of the package (in a checkout:
+    its ``scenes``).
+    """
     folders = [Path.cwd() / "scenes", (Path(__file__).parents[1] / "scenes").resolve()]
     return [f for k, f in enumerate(folders) if f.is_dir() and f not in folders[:k]]
 
@@ -34,8 +36,8 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     """A scene by name (``"bear"``) or by file (``"my/scene.yaml"``).
 
     Raises:
-        SceneError: the file is missing or says something that cannot be used; the message names the file, the line
-            where it can, what came and the remedy.
+        SceneError: the file is missing or says something that cannot be used; the message names the
+            file, the line where it can, what came and the remedy.
     """
     text = os.fspath(name_or_path)
     path = Path(text).expanduser()
@@ -48,8 +50,9 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
             return _read(folder / f"{text}.yaml")
     known = list_scenes()
     raise SceneError(
-        f"no scene named {text!r}{suggest(text, known)}; known scenes: {', '.join(known) or 'none'}; "
-        "a file of your own is named by its path, such as my/scene.yaml"
+        f"no scene named {text!r}{suggest(text, known)}; known scenes:"
+        f" {', '.join(known) or 'none'}; a file of your own is named by its path, such as"
+        " my/scene.yaml"
     )
 
 
@@ -80,7 +83,9 @@ def _read(path: Path) -> Scene:
         spec = SceneSpec.model_validate(data)
     except ValidationError as error:
         # A misspelt key comes first: what is missing then is often only its right spelling.
-        problems = sorted(error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden")
+        problems = sorted(
+            error.errors(include_url=False), key=lambda p: p["type"] != "extra_forbidden"
+        )
         first = problems[0]
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
         loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
@@ -98,7 +103,9 @@ def _refuse_duplicate_keys(node: yaml.Node, path: Path) -> None:
             line = key.start_mark.line + 1
             if key.value in seen:
                 raise SceneError(
-                    f"the key {key.value!r} stands here and on line {seen[key.value]}; keep one", path, line
+                    f"the key {key.value!r} stands here and on line {seen[key.value]}; keep one",
+                    path,
+                    line,
                 )
             seen[key.value] = line
             _refuse_duplicate_keys(value, path)
@@ -108,7 +115,9 @@ def _refuse_duplicate_keys(node: yaml.Node, path: Path) -> None:
 
 
 def _line(node: yaml.Node, loc: Sequence[int | str]) -> int:
-    """Line (from 1) of the deepest node that ``loc`` leads to; the tags that unions put into a loc lead nowhere."""
+    """Line (from 1) of the deepest node that ``loc`` leads to; the tags that unions put into a loc
+    lead nowhere.
+    """
     line = node.start_mark.line + 1
     for step in loc:
         if isinstance(node, yaml.MappingNode):
@@ -116,7 +125,9 @@ def _line(node: yaml.Node, loc: Sequence[int | str]) -> int:
                 if key.value == step:
                     line, node = key.start_mark.line + 1, value
                     break
-        elif isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value):
+        elif (
+            isinstance(node, yaml.SequenceNode) and isinstance(step, int) and step < len(node.value)
+        ):
             node = node.value[step]
             line = node.start_mark.line + 1
     return line
@@ -129,12 +140,21 @@ def _explain(problem: Any) -> str:
         _, owner = _follow(problem["loc"][:-1])
         allowed = list(owner.model_fields) if owner else []
         key = str(problem["loc"][-1])
-        return f"{place}: unknown key {key!r}{suggest(key, allowed)}; allowed here: {', '.join(allowed)}"
+        return (
+            f"{place}: unknown key {key!r}{suggest(key, allowed)}; allowed here:"
+            f" {', '.join(allowed)}"
+        )
     if kind == "missing":
         return f"{place}: is missing; add it (docs/scenes.md says what each key means)"
     if kind == "union_tag_invalid":
-        came, allowed = problem["ctx"]["tag"], [tag.strip("' ") for tag in problem["ctx"]["expected_tags"].split(",")]
-        return f"{place}.type: got {came!r}{suggest(came, allowed)}; expected one of {', '.join(allowed)}"
+        came, allowed = (
+            problem["ctx"]["tag"],
+            [tag.strip("' ") for tag in problem["ctx"]["expected_tags"].split(",")],
+        )
+        return (
+            f"{place}.type: got {came!r}{suggest(came, allowed)}; expected one of"
+            f" {', '.join(allowed)}"
+        )
     if kind == "union_tag_not_found":
         return f"{place}: says no type; add 'type: ...' (docs/scenes.md lists the types)"
     message = problem["msg"].removeprefix("Value error, ")
@@ -146,7 +166,8 @@ def _explain(problem: Any) -> str:
 def _follow(loc: Sequence[int | str]) -> tuple[str, type[BaseModel] | None]:
     """A pydantic location as a person would write it, and the model at its end.
 
-    Unions put the tag of the member they chose into the location; it picks the model and is left out of the path.
+    Unions put the tag of the member they chose into the location; it picks the model and is left
+    out of the path.
     """
     place = ""
     annotation: Any = SceneSpec
@@ -155,12 +176,18 @@ def _follow(loc: Sequence[int | str]) -> tuple[str, type[BaseModel] | None]:
             place += f"[{step}]"
             continue
         models = _models(annotation)
-        tagged = [m for m in models if len(models) > 1 and step in get_args(m.model_fields["type"].annotation)]
+        tagged = [
+            m
+            for m in models
+            if len(models) > 1 and step in get_args(m.model_fields["type"].annotation)
+        ]
         if tagged:
             annotation = tagged[0]
             continue
         place += f".{step}" if place else step
-        annotation = next((m.model_fields[step].annotation for m in models if step in m.model_fields), None)
+        annotation = next(
+            (m.model_fields[step].annotation for m in models if step in m.model_fields), None
+        )
     models = _models(annotation)
     return place, models[0] if len(models) == 1 else None
 
@@ -172,7 +199,9 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _check(scene: Scene, root: yaml.Node) -> None:
-    """What no single field can say: names that clash, files that are missing, cameras that cannot be."""
+    """What no single field can say: names that clash, files that are missing, cameras that cannot
+    be.
+    """
 
     def refuse(message: str, *loc: int | str) -> None:
         raise SceneError(message, scene.path, _line(root, loc))
@@ -180,35 +209,67 @@ def _check(scene: Scene, root: yaml.Node) -> None:
     names: dict[str, int] = {}
     for k, item in enumerate(scene.spec.objects):
         if item.name in names:
-            refuse(f"objects[{k}].name: {item.name!r} is also the name of objects[{names[item.name]}]; rename one",
-                   "objects", k, "name")  # fmt: skip
+            refuse(
+                f"objects[{k}].name: {item.name!r} is also the name of objects[{names[item.name]}];"
+                " rename one",
+                "objects",
+                k,
+                "name",
+            )
         names[item.name] = k
         if isinstance(item.shape, ScatterSpec):
             on = item.shape.on
-            grounds = [o.name for o in scene.spec.objects if isinstance(o.shape, TerrainSpec | RectangleSpec)]
+            grounds = [
+                o.name
+                for o in scene.spec.objects
+                if isinstance(o.shape, TerrainSpec | RectangleSpec)
+            ]
             here = ("objects", k, "shape")
             if on is not None and on not in grounds:
-                refuse(f"objects[{k}].shape.on: got {on!r}{suggest(on, grounds)}; expected the name of a terrain or "
-                       f"a rectangle of this scene: {', '.join(grounds) or 'there is none'}", *here, "on")  # fmt: skip
+                refuse(
+                    f"objects[{k}].shape.on: got {on!r}{suggest(on, grounds)}; expected the name of"
+                    " a terrain or a rectangle of this scene:"
+                    f" {', '.join(grounds) or 'there is none'}",
+                    *here,
+                    "on",
+                )
             if not len(item.shape.places()):
-                refuse(f"objects[{k}].shape.avoid: leaves no room for any of the {item.shape.count}; make it smaller "
-                       "or the radius larger", *here, "avoid")  # fmt: skip
+                refuse(
+                    f"objects[{k}].shape.avoid: leaves no room for any of the {item.shape.count};"
+                    " make it smaller or the radius larger",
+                    *here,
+                    "avoid",
+                )
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
             where = ("objects", k, "shape", "file")
             if path.suffix.lower() not in shapes.MESH_SUFFIXES:
                 near = suggest(path.suffix.lower(), shapes.MESH_SUFFIXES)
-                refuse(f"objects[{k}].shape.file: {item.shape.file!r} is not of a known mesh format{near}; "
-                       f"one of {', '.join(shapes.MESH_SUFFIXES)}", *where)  # fmt: skip
+                refuse(
+                    f"objects[{k}].shape.file: {item.shape.file!r} is not of a known mesh"
+                    f" format{near}; one of {', '.join(shapes.MESH_SUFFIXES)}",
+                    *where,
+                )
             if not path.is_file():
                 there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-                refuse(f"objects[{k}].shape.file: there is no file {path}{suggest(path.name, there)}; "
-                       "the path counts from the folder of the scene file", *where)  # fmt: skip
+                refuse(
+                    f"objects[{k}].shape.file: there is no file {path}{suggest(path.name, there)}; "
+                    "the path counts from the folder of the scene file",
+                    *where,
+                )
     skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
     if len(skies) > 1:
-        refuse(f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one", "lights", skies[1])
+        refuse(
+            f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one",
+            "lights",
+            skies[1],
+        )
     if not scene.spec.lights and not any(item.emission for item in scene.spec.objects):
-        refuse("lights: there is none, and no object has an 'emission'; add a sun, a sky, a point or a spot", "lights")
+        refuse(
+            "lights: there is none, and no object has an 'emission'; add a sun, a sky, a point or a"
+            " spot",
+            "lights",
+        )
     for message, at_fault in contradictions(scene.spec):
         refuse(message, *at_fault)
     for message, spot in edits.problems(scene.spec):
@@ -219,14 +280,23 @@ def _check(scene: Scene, root: yaml.Node) -> None:
         for camera, loc in cameras:
             if holds(camera.position):
                 at = ", ".join(f"{x:.4g}" for x in camera.position)
-                refuse(f"{'.'.join(map(str, loc))}: the camera {camera.name!r} at ({at}) is inside the object "
-                       f"{item.name!r}; change its yaw, height or radius, or move the object", *loc)  # fmt: skip
+                refuse(
+                    f"{'.'.join(map(str, loc))}: the camera {camera.name!r} at ({at}) is inside the"
+                    f" object {item.name!r}; change its yaw, height or radius, or move the object",
+                    *loc,
+                )
 
 
-def _check_cameras(scene: Scene, refuse: Callable[..., None]) -> list[tuple[Camera, tuple[int | str, ...]]]:
+def _check_cameras(
+    scene: Scene, refuse: Callable[..., None]
+) -> list[tuple[Camera, tuple[int | str, ...]]]:
     orbit = scene.spec.cameras
     if min(orbit.size) < 1:
-        refuse(f"cameras.size: got {list(orbit.size)}, expected at least [1, 1] (width, height)", "cameras", "size")
+        refuse(
+            f"cameras.size: got {list(orbit.size)}, expected at least [1, 1] (width, height)",
+            "cameras",
+            "size",
+        )
     seen: dict[str, str] = {}
     cameras = []
     for k, view in enumerate([orbit.source, *orbit.targets]):
@@ -234,7 +304,11 @@ def _check_cameras(scene: Scene, refuse: Callable[..., None]) -> list[tuple[Came
         place = f"cameras.targets[{k - 1}]" if k else "cameras.source"
         name = view_name(view, k)
         if name in seen:
-            refuse(f"{place}: the camera name {name!r} is also that of {seen[name]}; give one of them a 'name'", *loc)
+            refuse(
+                f"{place}: the camera name {name!r} is also that of {seen[name]}; give one of them"
+                " a 'name'",
+                *loc,
+            )
         seen[name] = place
         try:
             cameras.append((orbit_camera(orbit, view, k), loc))

@@ -1,6 +1,8 @@
-"""What a scene file may say about light beyond sun, sky and diffuse surfaces: materials, lamps, fog, lens, effects.
+"""What a scene file may say about light beyond sun, sky and diffuse surfaces: materials, lamps,
+fog, lens, effects.
 
-All of it is a description; :mod:`attnwarp_eval.scene.transport` says what light transport it calls for.
+All of it is a description; :mod:`attnwarp_eval.scene.transport` says what light transport it calls
+for.
 """
 
 from __future__ import annotations
@@ -14,11 +16,14 @@ from attnwarp_eval.scene.textures import Color, Spec
 Vector = tuple[float, float, float]
 Positive = Annotated[float, Field(gt=0)]
 
-# Materials -----------------------------------------------------------------------------------------------------------
+# Materials
+# --------------------------------------------------------------------------------------------------
 
 
 class DiffuseMaterial(Spec):
-    """Scatters light evenly; its colour is the object's texture. What an object is unless it says otherwise."""
+    """Scatters light evenly; its colour is the object's texture. What an object is unless it says
+    otherwise.
+    """
 
     type: Literal["diffuse"] = "diffuse"
 
@@ -31,7 +36,8 @@ class MirrorMaterial(Spec):
 
 
 class MetalMaterial(Spec):
-    """A conductor with measured indices of refraction; ``roughness`` 0 is polished, above that GGX."""
+    """A conductor with measured indices of refraction; ``roughness`` 0 is polished, above that
+    GGX."""
 
     type: Literal["metal"]
     metal: Literal["Ag", "Al", "Au", "Cr", "Cu", "W"] = "Al"
@@ -47,8 +53,8 @@ class MetalMaterial(Spec):
 class PlasticMaterial(Spec):
     """A diffuse base in the object's texture under a rough (GGX) dielectric coat.
 
-    A smooth coat would be diffuse and specular at once, and light through it could not be counted once: see
-    docs/effects.md.
+    A smooth coat would be diffuse and specular at once, and light through it could not be counted
+    once: see docs/effects.md.
     """
 
     type: Literal["plastic"]
@@ -59,8 +65,8 @@ class PlasticMaterial(Spec):
 class InteriorSpec(Spec):
     """What fills a glass object: light is scattered and absorbed inside (subsurface scattering).
 
-    ``sigma_t`` is the extinction per scene unit, ``albedo`` times ``tint`` the share that is scattered, ``g`` the mean
-    cosine of the scattering angle (Henyey-Greenstein).
+    ``sigma_t`` is the extinction per scene unit, ``albedo`` times ``tint`` the share that is
+    scattered, ``g`` the mean cosine of the scattering angle (Henyey-Greenstein).
     """
 
     sigma_t: Positive
@@ -70,9 +76,11 @@ class InteriorSpec(Spec):
 
 
 class GlassMaterial(Spec):
-    """A dielectric. ``thin`` means a pane without thickness, which shifts nothing; ``roughness`` above 0 is frosted.
+    """A dielectric. ``thin`` means a pane without thickness, which shifts nothing; ``roughness``
+    above 0 is frosted.
 
-    ``abbe`` tells how strongly real glass of this kind disperses. Dispersion is not simulated; it is named.
+    ``abbe`` tells how strongly real glass of this kind disperses. Dispersion is not simulated; it
+    is named.
     """
 
     type: Literal["glass"]
@@ -91,20 +99,25 @@ class GlassMaterial(Spec):
     @model_validator(mode="after")
     def _a_pane_has_no_inside(self) -> GlassMaterial:
         if self.thin and (self.roughness or self.interior):
-            raise ValueError("got thin glass with roughness or an interior, but a thin pane has neither; drop 'thin'")
+            raise ValueError(
+                "got thin glass with roughness or an interior, but a thin pane has neither; drop"
+                " 'thin'"
+            )
         return self
 
 
 def _roughness(value: float) -> float:
     if 0 < value < 0.01:
         raise ValueError(
-            f"got {value}, expected 0 (smooth) or at least 0.01: below that rendering only makes noise of it"
+            f"got {value}, expected 0 (smooth) or at least 0.01: below that rendering only makes"
+            " noise of it"
         )
     return value
 
 
 Material = Annotated[
-    DiffuseMaterial | MirrorMaterial | MetalMaterial | PlasticMaterial | GlassMaterial, Field(discriminator="type")
+    DiffuseMaterial | MirrorMaterial | MetalMaterial | PlasticMaterial | GlassMaterial,
+    Field(discriminator="type"),
 ]
 
 TEXTURED = (DiffuseMaterial, PlasticMaterial)
@@ -112,17 +125,22 @@ TEXTURED = (DiffuseMaterial, PlasticMaterial)
 
 
 class EmissionSpec(Spec):
-    """Light that a surface sends out evenly, in radiance. Rectangles shine where they face, closed shapes outward."""
+    """Light that a surface sends out evenly, in radiance. Rectangles shine where they face, closed
+    shapes outward.
+    """
 
     radiance: Positive
     color: Color = "#ffffff"
 
 
-# Lights --------------------------------------------------------------------------------------------------------------
+# Lights
+# --------------------------------------------------------------------------------------------------
 
 
 class PointSpec(Spec):
-    """A lamp without size. ``intensity`` in power per solid angle: at distance d it gives intensity / d^2."""
+    """A lamp without size. ``intensity`` in power per solid angle: at distance d it gives intensity
+    / d^2.
+    """
 
     type: Literal["point"]
     position: Vector
@@ -131,7 +149,9 @@ class PointSpec(Spec):
 
 
 class SpotSpec(Spec):
-    """A lamp without size that shines into a cone about ``target``, falling off from ``beam`` to ``cutoff`` degrees."""
+    """A lamp without size that shines into a cone about ``target``, falling off from ``beam`` to
+    ``cutoff`` degrees.
+    """
 
     type: Literal["spot"]
     position: Vector
@@ -142,7 +162,8 @@ class SpotSpec(Spec):
     beam: float | None = Field(None, gt=0, lt=90)
 
 
-# Medium, lens, effects -----------------------------------------------------------------------------------------------
+# Medium, lens, effects
+# --------------------------------------------------------------------------------------------------
 
 
 class BoundsSpec(Spec):
@@ -153,13 +174,16 @@ class BoundsSpec(Spec):
 
 
 class MediumSpec(InteriorSpec):
-    """Homogeneous fog in a ``box``; without one it fills the smallest box about all objects, lamps and cameras."""
+    """Homogeneous fog in a ``box``; without one it fills the smallest box about all objects, lamps
+    and cameras.
+    """
 
     box: BoundsSpec | None = None
 
 
 class LensSpec(Spec):
-    """A thin lens. ``aperture`` is its radius; sharp is what lies ``focus`` away along the optical axis.
+    """A thin lens. ``aperture`` is its radius; sharp is what lies ``focus`` away along the optical
+    axis.
 
     Without ``focus`` that is the point the cameras look at.
     """
@@ -169,9 +193,23 @@ class LensSpec(Spec):
 
 
 Effect = Literal[
-    "geometry", "direct", "shadows", "interreflection", "glossy", "specular", "refraction", "medium", "subsurface",
-    "caustics", "environment", "depth_of_field", "textures", "motion", "polarisation", "dispersion",
-]  # fmt: skip
+    "geometry",
+    "direct",
+    "shadows",
+    "interreflection",
+    "glossy",
+    "specular",
+    "refraction",
+    "medium",
+    "subsurface",
+    "caustics",
+    "environment",
+    "depth_of_field",
+    "textures",
+    "motion",
+    "polarisation",
+    "dispersion",
+]
 """Everything that light may do and a scene may call for, simulated or not."""
 
 EFFECTS: tuple[Effect, ...] = get_args(Effect)
@@ -181,14 +219,33 @@ NOT_SIMULATED: tuple[Effect, ...] = ("motion", "polarisation", "dispersion")
 
 
 class EffectsSpec(Spec):
-    """``pin``: what the scene is about, so it must be there and is simulated. ``forbid``: what it must not need."""
+    """``pin``: what the scene is about, so it must be there and is simulated. ``forbid``: what it
+    must not need.
+    """
 
     pin: tuple[Effect, ...] = ()
     forbid: tuple[Effect, ...] = ()
 
 
 __all__ = [
-    "EFFECTS", "NOT_SIMULATED", "TEXTURED", "BoundsSpec", "DiffuseMaterial", "Effect", "EffectsSpec", "EmissionSpec",
-    "GlassMaterial", "InteriorSpec", "LensSpec", "Material", "MediumSpec", "MetalMaterial", "MirrorMaterial",
-    "PlasticMaterial", "PointSpec", "Positive", "SpotSpec", "Vector",
-]  # fmt: skip
+    "EFFECTS",
+    "NOT_SIMULATED",
+    "TEXTURED",
+    "BoundsSpec",
+    "DiffuseMaterial",
+    "Effect",
+    "EffectsSpec",
+    "EmissionSpec",
+    "GlassMaterial",
+    "InteriorSpec",
+    "LensSpec",
+    "Material",
+    "MediumSpec",
+    "MetalMaterial",
+    "MirrorMaterial",
+    "PlasticMaterial",
+    "PointSpec",
+    "Positive",
+    "SpotSpec",
+    "Vector",
+]

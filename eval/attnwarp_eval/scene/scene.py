@@ -36,13 +36,19 @@ from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 Array = npt.NDArray[np.float64]
 
 SCENE_PROTOCOL = 1
-"""Raised whenever the same file would mean another world (shapes, textures, lights); part of every content hash."""
+"""Raised whenever the same file would mean another world (shapes, textures, lights); part of every
+content hash.
+"""
 
 
 class SceneError(InputError):
-    """A scene file that cannot be used: names the file, the line where it can, what came, and the remedy."""
+    """A scene file that cannot be used: names the file, the line where it can, what came, and the
+    remedy.
+    """
 
-    def __init__(self, message: str, path: Path | str | None = None, line: int | None = None) -> None:
+    def __init__(
+        self, message: str, path: Path | str | None = None, line: int | None = None
+    ) -> None:
         self.path = path
         self.line = line
         place = "" if path is None else f"{path}:{line}: " if line else f"{path}: "
@@ -62,7 +68,10 @@ class Scene:
         self.path = path
 
     def __repr__(self) -> str:
-        return f"Scene({self.name!r}, {len(self.spec.objects)} objects, 1 + {len(self.spec.cameras.targets)} cameras)"
+        return (
+            f"Scene({self.name!r}, {len(self.spec.objects)} objects, 1 +"
+            f" {len(self.spec.cameras.targets)} cameras)"
+        )
 
     @property
     def name(self) -> str:
@@ -93,7 +102,9 @@ class Scene:
     def cameras(self) -> list[Camera]:
         """The source, then the targets."""
         orbit = self.spec.cameras
-        return [orbit_camera(orbit, view, k) for k, view in enumerate([orbit.source, *orbit.targets])]
+        return [
+            orbit_camera(orbit, view, k) for k, view in enumerate([orbit.source, *orbit.targets])
+        ]
 
     @property
     def source(self) -> Camera:
@@ -114,7 +125,9 @@ class Scene:
         for camera in self.cameras:
             if camera.name == name:
                 return camera
-        raise SceneError(f"no camera {name!r}{suggest(name, [c.name for c in self.cameras])}", self.path)
+        raise SceneError(
+            f"no camera {name!r}{suggest(name, [c.name for c in self.cameras])}", self.path
+        )
 
     @property
     def edits(self) -> tuple[EditSpec, ...]:
@@ -132,7 +145,8 @@ class Scene:
                 return edit
         known = [edit.name for edit in self.edits]
         raise SceneError(
-            f"no edit {name!r}{suggest(name, known)}; {self.name} has {', '.join(known) or 'none'}", self.path
+            f"no edit {name!r}{suggest(name, known)}; {self.name} has {', '.join(known) or 'none'}",
+            self.path,
         )
 
     def edited(self, name: str, answer: str | None = None) -> Scene:
@@ -152,12 +166,15 @@ class Scene:
             raise SceneError(str(error), self.path) from error
 
     def with_size(self, width: int, height: int) -> Scene:
-        """The same scene with images of ``width`` x ``height``; the vertical field of view stays."""
+        """The same scene with images of ``width`` x ``height``; the vertical field of view
+        stays."""
         cameras = self.spec.cameras.model_copy(update={"size": (int(width), int(height))})
         return Scene(self.spec.model_copy(update={"cameras": cameras}), self.path)
 
     def shapes(self) -> list[Shape]:
-        """Everything that has a surface, in world coordinates, each with its object's index as ``object_id``."""
+        """Everything that has a surface, in world coordinates, each with its object's index as
+        ``object_id``.
+        """
         return [shape for k, item in enumerate(self.spec.objects) for shape in self._build(item, k)]
 
     def _build(self, item: ObjectSpec, object_id: int) -> Iterator[Shape]:
@@ -171,12 +188,16 @@ class Scene:
                 u = u - n * (u @ n)
                 u /= np.linalg.norm(u)
                 v = np.cross(n, u)
-                yield Rectangle(np.array(spec.center), u * spec.size[0] / 2, v * spec.size[1] / 2, object_id)
+                yield Rectangle(
+                    np.array(spec.center), u * spec.size[0] / 2, v * spec.size[1] / 2, object_id
+                )
             case BoxSpec():
                 axes = _turn_z(spec.yaw) @ _turn_y(spec.pitch)
                 for k in range(spec.repeat.count if spec.repeat else 1):
                     step = np.array(spec.repeat.step) * k if spec.repeat else np.zeros(3)
-                    yield Box(np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id)
+                    yield Box(
+                        np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id
+                    )
             case BodySpec():
                 yield _placed(spec.mesh(), _turn_z(spec.yaw), spec.scale, spec.position, object_id)
             case MeshSpec():
@@ -185,8 +206,12 @@ class Scene:
                     mesh = shapes.read_mesh(path)
                 except ValueError as error:
                     raise SceneError(str(error), self.path) from error
-                upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
-                yield _placed(mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id)
+                upright = (
+                    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) if spec.up == "y" else np.eye(3)
+                )
+                yield _placed(
+                    mesh, _turn_z(spec.yaw) @ upright, spec.scale, spec.position, object_id
+                )
             case TerrainSpec():
                 yield replace(spec.mesh(), object_id=object_id)
             case ScatterSpec():
@@ -209,7 +234,9 @@ class Scene:
 
     @functools.cached_property
     def world_hash(self) -> str:
-        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, fog, protocol versions."""
+        """SHA-256 of all that decides what a camera would see: objects, mesh files, lights, fog,
+        protocol versions.
+        """
         files = {
             item.shape.file: hashlib.sha256(self.mesh_path(item.shape).read_bytes()).hexdigest()
             for item in self.spec.objects
@@ -220,11 +247,14 @@ class Scene:
 
     @functools.cached_property
     def content_hash(self) -> str:
-        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the protocol versions.
+        """SHA-256 of everything the scene says (canonical JSON), the mesh files' bytes and the
+        protocol versions.
 
         Edits are left out: they are other scenes, with hashes of their own.
         """
-        return content_key("scene", self.world_hash, self.spec.model_dump(mode="json", exclude={"edits"}))
+        return content_key(
+            "scene", self.world_hash, self.spec.model_dump(mode="json", exclude={"edits"})
+        )
 
 
 def _turn_z(degrees: float) -> Array:
@@ -244,14 +274,20 @@ def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int
 
 def view_name(view: ViewSpec, index: int) -> str:
     """The camera's name: its own, else 'source' for the first and 'yaw030' for the others."""
-    return view.name or ("source" if index == 0 else f"yaw{view.yaw:03g}".replace(".", "p").replace("-", "m"))
+    return view.name or (
+        "source" if index == 0 else f"yaw{view.yaw:03g}".replace(".", "p").replace("-", "m")
+    )
 
 
 def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
     """The camera of a view: the source has index 0, the targets those after it."""
     look_at = view.look_at or orbit.look_at
     radius, yaw = view.radius or orbit.radius, math.radians(view.yaw)
-    position = (orbit.look_at[0] + radius * math.cos(yaw), orbit.look_at[1] + radius * math.sin(yaw), view.height)
+    position = (
+        orbit.look_at[0] + radius * math.cos(yaw),
+        orbit.look_at[1] + radius * math.sin(yaw),
+        view.height,
+    )
     return Camera.look_at(
         position,
         look_at,
@@ -263,7 +299,9 @@ def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
 
 
 def inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
-    """A test whether a point is inside the object. A body is asked by its distance, which needs no meshing."""
+    """A test whether a point is inside the object. A body is asked by its distance, which needs no
+    meshing.
+    """
     spec = item.shape
     if isinstance(spec, BodySpec):
         R, offset = _turn_z(spec.yaw), np.array(spec.position)

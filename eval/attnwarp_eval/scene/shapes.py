@@ -1,7 +1,8 @@
-"""What a scene is made of: spheres, rectangles and boxes in closed form, triangle meshes, signed-distance bodies.
+"""What a scene is made of: spheres, rectangles and boxes in closed form, triangle meshes,
+signed-distance bodies.
 
-Everything is float64 and in world coordinates. Meshes are what bodies become; a body's mesh, not its distance
-function, is the truth that everything is measured against.
+Everything is float64 and in world coordinates. Meshes are what bodies become; a body's mesh, not
+its distance function, is the truth that everything is measured against.
 """
 
 from __future__ import annotations
@@ -23,13 +24,17 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MESHING_PROTOCOL = 2
-"""Raised whenever the same description of a body would give other vertices; part of every cache key."""
+"""Raised whenever the same description of a body would give other vertices; part of every cache
+key.
+"""
 
 BLOCK = 8
 """Lattice points along the side of the blocks that are sampled, or left out, together."""
 
 DEGENERATE_AREA = 1e-12
-"""Triangles whose area is below this times their longest edge squared have no usable plane and are dropped."""
+"""Triangles whose area is below this times their longest edge squared have no usable plane and are
+dropped.
+"""
 
 
 class MeshNotice(UserWarning):
@@ -46,7 +51,9 @@ class Sphere:
 
     def moved(self, scale: float, offset: npt.ArrayLike) -> Sphere:
         """The shape in a world whose points p became ``scale`` * p + ``offset``."""
-        return replace(self, center=self.center * scale + np.asarray(offset, float), radius=self.radius * scale)
+        return replace(
+            self, center=self.center * scale + np.asarray(offset, float), radius=self.radius * scale
+        )
 
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of the axis-aligned bounding box."""
@@ -59,7 +66,9 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """A two-sided flat rectangle: ``center`` (3,) and the half edges ``u``, ``v`` (3,), perpendicular."""
+    """A two-sided flat rectangle: ``center`` (3,) and the half edges ``u``, ``v`` (3,),
+    perpendicular.
+    """
 
     center: Array
     u: Array
@@ -74,7 +83,12 @@ class Rectangle:
 
     def moved(self, scale: float, offset: npt.ArrayLike) -> Rectangle:
         """The shape in a world whose points p became ``scale`` * p + ``offset``."""
-        return replace(self, center=self.center * scale + np.asarray(offset, float), u=self.u * scale, v=self.v * scale)
+        return replace(
+            self,
+            center=self.center * scale + np.asarray(offset, float),
+            u=self.u * scale,
+            v=self.v * scale,
+        )
 
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of the axis-aligned bounding box."""
@@ -97,7 +111,9 @@ class Box:
 
     def moved(self, scale: float, offset: npt.ArrayLike) -> Box:
         """The shape in a world whose points p became ``scale`` * p + ``offset``."""
-        return replace(self, center=self.center * scale + np.asarray(offset, float), half=self.half * scale)
+        return replace(
+            self, center=self.center * scale + np.asarray(offset, float), half=self.half * scale
+        )
 
     def bounds(self) -> Array:
         """(2, 3) lower and upper corner of the axis-aligned bounding box."""
@@ -109,7 +125,9 @@ class Box:
         return bool((np.abs((point - self.center) @ self.axes) < self.half).all())
 
     def rectangles(self) -> list[Rectangle]:
-        """The six faces, their normals (u x v) outward, in the order -x, +x, -y, +y, -z, +z of the box's axes."""
+        """The six faces, their normals (u x v) outward, in the order -x, +x, -y, +y, -z, +z of the
+        box's axes.
+        """
         faces = []
         for axis in range(3):
             for sign in (-1.0, 1.0):
@@ -128,7 +146,11 @@ class Box:
             c, u, v = side.center, side.u, side.v
             vertices.append([c - u - v, c + u - v, c + u + v, c - u + v])
             faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
-        return Mesh(np.array(vertices).reshape(-1, 3), np.array(faces, dtype=np.int64), object_id=self.object_id)
+        return Mesh(
+            np.array(vertices).reshape(-1, 3),
+            np.array(faces, dtype=np.int64),
+            object_id=self.object_id,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +160,8 @@ class Mesh:
     Args:
         vertices: (V, 3).
         faces: (F, 3) indices into ``vertices``.
-        normals: (V, 3) unit vertex normals for smooth shading, or None for flat shading. Geometry never uses them.
+        normals: (V, 3) unit vertex normals for smooth shading, or None for flat shading. Geometry
+            never uses them.
         tint: (V, 3) linear RGB that multiplies the object's texture, or None.
     """
 
@@ -166,10 +189,12 @@ class Mesh:
         return np.stack([used.min(0), used.max(0)])
 
     def contains(self, point: Array) -> bool:
-        """Whether the (3,) ``point`` lies inside, by the generalised winding number; never outside the bounding box.
+        """Whether the (3,) ``point`` lies inside, by the generalised winding number; never outside
+        the bounding box.
 
-        A solid angle of more than half the sphere counts as inside, so small holes and a few duplicated faces do
-        not change the answer (Jacobson et al. 2013; triangle angles after Van Oosterom and Strackee 1983).
+        A solid angle of more than half the sphere counts as inside, so small holes and a few
+        duplicated faces do not change the answer (Jacobson et al. 2013; triangle angles after Van
+        Oosterom and Strackee 1983).
         """
         low, high = self.bounds()
         if (point < low).any() or (point > high).any():
@@ -179,7 +204,10 @@ class Mesh:
         numerator = np.einsum("ij,ij->i", a, np.cross(b, c))
         dot = np.einsum
         denominator = (
-            la * lb * lc + dot("ij,ij->i", a, b) * lc + dot("ij,ij->i", b, c) * la + dot("ij,ij->i", c, a) * lb
+            la * lb * lc
+            + dot("ij,ij->i", a, b) * lc
+            + dot("ij,ij->i", b, c) * la
+            + dot("ij,ij->i", c, a) * lb
         )
         winding = np.arctan2(numerator, denominator).sum() / (2 * np.pi)
         return bool(abs(winding) > 0.5)
@@ -190,10 +218,14 @@ class Mesh:
         Duplicated faces and holes stay: ray casting and rendering take them as they are.
 
         Raises:
-            ValueError: no triangle is left, a vertex is not finite, or a face names a vertex that does not exist.
+            ValueError: no triangle is left, a vertex is not finite, or a face names a vertex that
+                does not exist.
         """
         if self.faces.size and (self.faces.min() < 0 or self.faces.max() >= len(self.vertices)):
-            raise ValueError(f"{name}: a face names vertex {int(self.faces.max())}, but there are {len(self.vertices)}")
+            raise ValueError(
+                f"{name}: a face names vertex {int(self.faces.max())}, but there are"
+                f" {len(self.vertices)}"
+            )
         used = np.unique(self.faces)
         bad = used[~np.isfinite(self.vertices[used]).all(axis=1)] if self.faces.size else used
         if bad.size:
@@ -209,7 +241,8 @@ class Mesh:
             return self
         dropped = np.flatnonzero(~keep)
         warnings.warn(
-            f"{name}: dropped {dropped.size} of {len(keep)} triangles without area (first: face {int(dropped[0])})",
+            f"{name}: dropped {dropped.size} of {len(keep)} triangles without area (first: face"
+            f" {int(dropped[0])})",
             MeshNotice,
             stacklevel=2,
         )
@@ -219,7 +252,8 @@ class Mesh:
 Shape = Sphere | Rectangle | Box | Mesh
 
 
-# Signed-distance bodies ----------------------------------------------------------------------------------------------
+# Signed-distance bodies
+# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -228,7 +262,8 @@ class _Part:
 
     Attributes:
         color: linear RGB.
-        blend: True to join it to the parts before it in the body's own width, False for a sharp joint, or a width.
+        blend: True to join it to the parts before it in the body's own width, False for a sharp
+            joint, or a width.
         carve: it is taken away from the blended parts before it.
     """
 
@@ -237,7 +272,9 @@ class _Part:
     carve: bool = field(default=False, kw_only=True)
 
     def row(self) -> list[float]:
-        """What the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the body's), shape."""
+        """What the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
+        body's), shape.
+        """
         mode = 2.0 if self.carve else float(bool(self.blend))
         width = -1.0 if isinstance(self.blend, bool) else float(self.blend)
         shape = [*self._shape(), *([0.0] * 13)]
@@ -261,7 +298,9 @@ def _turn(yaw: float, pitch: float, roll: float) -> list[float]:
 
 @dataclass(frozen=True)
 class Ellipsoid(_Part):
-    """An ellipsoid with its ``radii`` along its own x, y, z: rolled about x, pitched about y, then turned about z."""
+    """An ellipsoid with its ``radii`` along its own x, y, z: rolled about x, pitched about y, then
+    turned about z.
+    """
 
     center: tuple[float, float, float]
     radii: tuple[float, float, float]
@@ -303,7 +342,9 @@ class Capsule(_Part):
 
 @dataclass(frozen=True)
 class Torus(_Part):
-    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z; turned as an :class:`Ellipsoid` is."""
+    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z; turned as an
+    :class:`Ellipsoid` is.
+    """
 
     center: tuple[float, float, float]
     radii: tuple[float, float]
@@ -325,7 +366,9 @@ class Torus(_Part):
 
 @dataclass(frozen=True)
 class Block(_Part):
-    """A box of ``size`` along its own x, y, z with edges rounded by ``round``; turned as an :class:`Ellipsoid` is."""
+    """A box of ``size`` along its own x, y, z with edges rounded by ``round``; turned as an
+    :class:`Ellipsoid` is.
+    """
 
     center: tuple[float, float, float]
     size: tuple[float, float, float]
@@ -349,7 +392,9 @@ class Block(_Part):
 
 @dataclass(frozen=True)
 class Disc(_Part):
-    """An upright cylinder of ``radius`` and ``height``, edges rounded by ``round``; turned as an Ellipsoid is."""
+    """An upright cylinder of ``radius`` and ``height``, edges rounded by ``round``; turned as an
+    Ellipsoid is.
+    """
 
     center: tuple[float, float, float]
     radius: float
@@ -377,7 +422,8 @@ Part = Ellipsoid | Capsule | Torus | Block | Disc
 
 @dataclass(frozen=True)
 class Relief:
-    """Noise that moves a body's surface out and in by up to ``depth``, with features of ``size``."""
+    """Noise that moves a body's surface out and in by up to ``depth``, with features of
+    ``size``."""
 
     depth: float
     size: float
@@ -400,7 +446,8 @@ def _part_distance(x: float, y: float, z: float, part: Array) -> float:
     x, z = part[9] * x - part[10] * z, part[10] * x + part[9] * z
     y, z = part[13] * y + part[14] * z, part[13] * z - part[14] * y
     if part[0] == 0.0:
-        # Ellipsoid: |q|(|q| - 1) / |q / r| with q = p / r, a bound of the distance (Quilez, "ellipsoid - distance").
+        # Ellipsoid: |q|(|q| - 1) / |q / r| with q = p / r, a bound of the distance (Quilez,
+        # "ellipsoid - distance").
         qx, qy, qz = x / part[6], y / part[7], z / part[8]
         k0 = math.sqrt(qx * qx + qy * qy + qz * qz)
         k1 = math.sqrt((qx / part[6]) ** 2 + (qy / part[7]) ** 2 + (qz / part[8]) ** 2)
@@ -456,11 +503,14 @@ def _table(parts: Sequence[Part]) -> Array:
     return np.array([part.row() for part in parts], dtype=np.float64)
 
 
-def body_distance(parts: Sequence[Part], blend: float, points: npt.ArrayLike, relief: Relief | None = None) -> Array:
+def body_distance(
+    parts: Sequence[Part], blend: float, points: npt.ArrayLike, relief: Relief | None = None
+) -> Array:
     """Signed distance bound of a body, negative inside.
 
-    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend`` or their own; the others
-    (eyes, a nose) are joined sharply. A part that carves is taken away from the blended ones before it.
+    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend`` or their
+    own; the others (eyes, a nose) are joined sharply. A part that carves is taken away from the
+    blended ones before it.
 
     Args:
         parts: at least one.
@@ -498,20 +548,27 @@ def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
     return (weights.T @ colors) / weights.sum(0)[:, None]
 
 
-def mesh_body(parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None = None) -> Mesh:
-    """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the distance.
+def mesh_body(
+    parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None = None
+) -> Mesh:
+    """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the
+    distance.
 
     Args:
         parts, blend, relief: see :func:`body_distance`.
         resolution: cells along the longest side of the bounding box.
 
     Returns:
-        A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by content.
+        A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by
+        content.
     """
-    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours are no part of
+    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours
+    # are no part of
     # it: a body painted otherwise is the same mesh.
     bare = [replace(part, color=(1.0, 1.0, 1.0)) for part in parts]
-    key = content_key("body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief))
+    key = content_key(
+        "body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief)
+    )
     stored = read_arrays("meshes", key)
     if stored is None:
         stored = _march(parts, blend, resolution, relief)
@@ -527,7 +584,9 @@ def _lattice_of(parts: Sequence[Part], resolution: int) -> tuple[Array, Array, f
     return low, high, float((high - low).max() / resolution)
 
 
-def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None) -> dict[str, npt.NDArray]:
+def _march(
+    parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None
+) -> dict[str, npt.NDArray]:
     from skimage.measure import marching_cubes
 
     low, high, step = _lattice_of(parts, resolution)
@@ -541,14 +600,20 @@ def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief 
     axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
     volume = _sample(axes, distance, depth)
     if volume.min() >= 0:
-        raise ValueError(f"body: no part is thick enough to be seen at resolution {resolution}; raise it")
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent")
+        raise ValueError(
+            f"body: no part is thick enough to be seen at resolution {resolution}; raise it"
+        )
+    vertices, faces, _, _ = marching_cubes(
+        volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent"
+    )
     vertices = vertices.astype(np.float64) + low
 
     def gradient(points: Array) -> Array:
         e = 1e-4 * step
         shifts = np.eye(3) * e
-        return np.stack([(distance(points + s) - distance(points - s)) / (2 * e) for s in shifts], axis=-1)
+        return np.stack(
+            [(distance(points + s) - distance(points - s)) / (2 * e) for s in shifts], axis=-1
+        )
 
     for _ in range(2):
         g = gradient(vertices)
@@ -575,14 +640,17 @@ def _march(parts: Sequence[Part], blend: float, resolution: int, relief: Relief 
 def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float) -> Array:
     """The distance at every point of a lattice near its zero; farther off, the right sign.
 
-    Blocks of the lattice whose middle is farther from the surface than they reach, with half as much to spare since
-    the distance is only a bound, take the middle's value: no triangle comes from them.
+    Blocks of the lattice whose middle is farther from the surface than they reach, with half as
+    much to spare since the distance is only a bound, take the middle's value: no triangle comes
+    from them.
     """
     step = float(axes[0][1] - axes[0][0])
     volume = np.empty([len(axis) for axis in axes])
     starts = [np.arange(0, len(axis), BLOCK) for axis in axes]
-    middles = np.meshgrid(*(axis[0] + step * (s + (BLOCK - 1) / 2) for axis, s in zip(axes, starts, strict=True)),
-                          indexing="ij")  # fmt: skip
+    middles = np.meshgrid(
+        *(axis[0] + step * (s + (BLOCK - 1) / 2) for axis, s in zip(axes, starts, strict=True)),
+        indexing="ij",
+    )
     coarse = distance(np.stack(middles, -1).reshape(-1, 3)).reshape(middles[0].shape)
     reach = 1.5 * step * BLOCK * math.sqrt(3) / 2 + depth
     for i, x0 in enumerate(starts[0]):
@@ -593,12 +661,15 @@ def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float)
             volume[xs, ys] = row
             near = np.flatnonzero(np.repeat(np.abs(coarse[i, j]) <= reach, BLOCK)[: len(axes[2])])
             if near.size:
-                points = np.stack(np.meshgrid(axes[0][xs], axes[1][ys], axes[2][near], indexing="ij"), -1)
+                points = np.stack(
+                    np.meshgrid(axes[0][xs], axes[1][ys], axes[2][near], indexing="ij"), -1
+                )
                 volume[xs, ys, near] = distance(points.reshape(-1, 3)).reshape(points.shape[:-1])
     return volume
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
+# Files
+# --------------------------------------------------------------------------------------------------
 
 # No .gltf: it keeps its vertices in another file, which a hash of its own bytes would not see.
 MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
@@ -607,8 +678,8 @@ MESH_SUFFIXES = (".ply", ".obj", ".glb", ".stl", ".off")
 def read_mesh(path: Path) -> Mesh:
     """A triangle mesh from a file (.ply, .obj, .glb, .stl, .off), all its parts joined.
 
-    Vertex colours, where the file has them, become the tint (taken as sRGB). Degenerate triangles are dropped with
-    a :class:`MeshNotice`.
+    Vertex colours, where the file has them, become the tint (taken as sRGB). Degenerate triangles
+    are dropped with a :class:`MeshNotice`.
 
     Raises:
         ValueError: the format is not known, or the file holds no triangles.
@@ -616,7 +687,10 @@ def read_mesh(path: Path) -> Mesh:
     from attnwarp_eval._open3d import open3d
 
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise ValueError(f"{path}: mesh format {path.suffix!r} is not read; use one of {', '.join(MESH_SUFFIXES)}")
+        raise ValueError(
+            f"{path}: mesh format {path.suffix!r} is not read; use one of"
+            f" {', '.join(MESH_SUFFIXES)}"
+        )
     o3d = open3d()
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         # Post-processing off: it would merge vertices and reorder faces behind the user's back.
@@ -624,7 +698,9 @@ def read_mesh(path: Path) -> Mesh:
     vertices = np.asarray(mesh.vertices, dtype=np.float64).copy()
     faces = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3).copy()
     if not len(faces):
-        raise ValueError(f"{path}: holds no triangles (a point cloud, or a damaged file?); export it as a mesh")
+        raise ValueError(
+            f"{path}: holds no triangles (a point cloud, or a damaged file?); export it as a mesh"
+        )
     tint = None
     if mesh.has_vertex_colors():
         from attnwarp_eval.colors import to_linear

@@ -1,7 +1,7 @@
 """What may stand in a scene file: objects, lights, cameras, edits, as pydantic models.
 
-docs/scenes.md describes the format. Positions are in scene units (metres in the scenes that come with the package),
-angles in degrees, colours sRGB '#rrggbb', z up.
+docs/scenes.md describes the format. Positions are in scene units (metres in the scenes that come
+with the package), angles in degrees, colours sRGB '#rrggbb', z up.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ class Repeat(Spec):
 
 
 class BoxSpec(Spec):
-    """A box of ``size`` (x, y, z), turned by ``yaw`` about the upright and tilted by ``pitch`` about its own y."""
+    """A box of ``size`` (x, y, z), turned by ``yaw`` about the upright and tilted by ``pitch``
+    about its own y.
+    """
 
     type: Literal["box"]
     center: Vector
@@ -64,7 +66,9 @@ class BoxSpec(Spec):
 
 
 class MeshSpec(Spec):
-    """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright axis."""
+    """A mesh from a file, its path relative to the scene file. ``up`` names the file's upright
+    axis.
+    """
 
     type: Literal["mesh"]
     file: str
@@ -75,14 +79,16 @@ class MeshSpec(Spec):
 
 
 ShapeSpec = Annotated[
-    SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec | TerrainSpec | ScatterSpec, Field(discriminator="type")
+    SphereSpec | RectangleSpec | BoxSpec | BodySpec | MeshSpec | TerrainSpec | ScatterSpec,
+    Field(discriminator="type"),
 ]
 
 
 class ObjectSpec(Spec):
     """One object: its index in the list is its object id.
 
-    ``texture`` colours diffuse and plastic things; mirrors, metal and glass have a ``tint``, and what shines is black.
+    ``texture`` colours diffuse and plastic things; mirrors, metal and glass have a ``tint``, and
+    what shines is black.
     """
 
     name: str = Field(min_length=1)
@@ -97,16 +103,27 @@ class ObjectSpec(Spec):
         shows = isinstance(self.material, TEXTURED) and self.emission is None
         said = "texture" in self.model_fields_set
         if shows and not said:
-            raise ValueError(f"got no texture, but {self.material.type} things need one; add 'texture: {{type: ...}}'")
+            raise ValueError(
+                f"got no texture, but {self.material.type} things need one; add 'texture: {{type:"
+                " ...}'"
+            )
         if said and not isinstance(self.material, TEXTURED):
-            raise ValueError(f"got a texture, but {self.material.type} shows none; use the material's 'tint' instead")
+            raise ValueError(
+                f"got a texture, but {self.material.type} shows none; use the material's 'tint'"
+                " instead"
+            )
         if self.emission is not None and not isinstance(self.material, DiffuseMaterial):
-            raise ValueError(f"got emission and the material {self.material.type}; what shines has no other material")
+            raise ValueError(
+                f"got emission and the material {self.material.type}; what shines has no other"
+                " material"
+            )
         return self
 
 
 class SunSpec(Spec):
-    """Parallel light. ``irradiance`` on a surface that faces it; a white one then shows irradiance / pi."""
+    """Parallel light. ``irradiance`` on a surface that faces it; a white one then shows irradiance
+    / pi.
+    """
 
     type: Literal["sun"]
     elevation: float = Field(gt=0, le=90)
@@ -116,7 +133,9 @@ class SunSpec(Spec):
 
 
 class SkySpec(Spec):
-    """Light from all around, and what a camera sees where it hits nothing: a ramp from ``horizon`` to ``zenith``."""
+    """Light from all around, and what a camera sees where it hits nothing: a ramp from ``horizon``
+    to ``zenith``.
+    """
 
     type: Literal["sky"]
     horizon: Color
@@ -130,7 +149,9 @@ LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discrimina
 class ViewSpec(Spec):
     """One camera on the orbit; what it leaves out comes from ``cameras``."""
 
-    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")  # it becomes part of file names
+    name: str | None = Field(
+        None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
+    )  # it becomes part of file names
     yaw: float
     height: float
     radius: Positive | None = None
@@ -139,7 +160,9 @@ class ViewSpec(Spec):
 
 
 class CamerasSpec(Spec):
-    """An orbit about the upright through ``look_at``: horizontal ``radius``, vertical ``fov``, one source, targets."""
+    """An orbit about the upright through ``look_at``: horizontal ``radius``, vertical ``fov``, one
+    source, targets.
+    """
 
     look_at: Vector
     radius: Positive
@@ -153,7 +176,8 @@ class CamerasSpec(Spec):
 class AppearanceSpec(Spec):
     """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
 
-    ``bounces: unlimited`` follows light until it is gone; every surface and every scattering counts as a bounce.
+    ``bounces: unlimited`` follows light until it is gone; every surface and every scattering counts
+        as a bounce.
     """
 
     bounces: Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"] = 1
@@ -163,8 +187,8 @@ class AppearanceSpec(Spec):
 class ObjectChange(Spec):
     """What an edit does to one object. Its shape stays.
 
-    ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its colours shades of
-    one, but for those of its parts that ``keep`` lists.
+    ``recolor`` replaces colours by others wherever the object says them; ``paint`` makes all its
+    colours shades of one, but for those of its parts that ``keep`` lists.
     """
 
     object: str
@@ -178,7 +202,9 @@ class ObjectChange(Spec):
     def _one_way_of_colouring(self) -> ObjectChange:
         said = [name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)]
         if not said:
-            raise ValueError("got a change that changes nothing; add a texture, a material, recolor or paint")
+            raise ValueError(
+                "got a change that changes nothing; add a texture, a material, recolor or paint"
+            )
         if self.paint and (self.recolor or self.texture):
             raise ValueError("got paint beside recolor or texture; keep one of them")
         return self
@@ -211,7 +237,10 @@ class EditSpec(Spec):
     def _does_something(self) -> EditSpec:
         own = bool(self.changes) or self.lights is not None
         if own == bool(self.answers):
-            raise ValueError("got an edit with both or neither of its own changes (or lights) and answers; keep one")
+            raise ValueError(
+                "got an edit with both or neither of its own changes (or lights) and answers;"
+                " keep one"
+            )
         return self
 
     @property

@@ -1,4 +1,6 @@
-"""Uneven ground, and the small things that lie and grow on it: meshes made from a few numbers and a seed."""
+"""Uneven ground, and the small things that lie and grow on it: meshes made from a few numbers and a
+seed.
+"""
 
 from __future__ import annotations
 
@@ -23,8 +25,9 @@ FOCUS = 2.2
 
 
 class TerrainSpec(Spec):
-    """Uneven ground: noise of ``height`` up and down with features of ``feature``, level within ``level[0]`` of the
-    middle and in full relief from ``level[1]`` on. The mesh is finest in the middle."""
+    """Uneven ground: noise of ``height`` up and down with features of ``feature``, level within
+    ``level[0]`` of the middle and in full relief from ``level[1]`` on. The mesh is finest in the
+    middle."""
 
     type: Literal["terrain"]
     center: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -40,7 +43,8 @@ class TerrainSpec(Spec):
     def _ordered(self) -> TerrainSpec:
         if not 0 <= self.level[0] <= self.level[1]:
             raise ValueError(
-                f"got level {list(self.level)}, expected [radius of the level middle, radius of the relief]"
+                f"got level {list(self.level)}, expected [radius of the level middle, radius of the"
+                " relief]"
             )
         return self
 
@@ -68,7 +72,9 @@ class TerrainSpec(Spec):
         xy = np.stack([x.ravel() + self.center[0], y.ravel() + self.center[1]], axis=-1)
         vertices = np.column_stack([xy, self.height_at(xy)])
         step = 1e-4 * self.feature
-        slope = [(self.height_at(xy + d) - self.height_at(xy - d)) / (2 * step) for d in np.eye(2) * step]
+        slope = [
+            (self.height_at(xy + d) - self.height_at(xy - d)) / (2 * step) for d in np.eye(2) * step
+        ]
         normals = np.stack([-slope[0], -slope[1], np.ones(len(xy))], axis=-1)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         k = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
@@ -79,11 +85,13 @@ class TerrainSpec(Spec):
 
 
 class ScatterSpec(Spec):
-    """``count`` small things strewn evenly between two radii about ``center``, on the object named ``on``.
+    """``count`` small things strewn evenly between two radii about ``center``, on the object named
+    ``on``.
 
     Attributes:
         kind: stones, tufts of grass, flowers, or fallen leaves.
-        size: smallest and largest; a stone's radius, the height of grass and flowers, the length of a leaf.
+        size: smallest and largest; a stone's radius, the height of grass and flowers, the length of
+            a leaf.
         radius: [inner, outer] of the ring that they lie in.
         avoid: discs [x, y, radius] that stay free.
         colors: each thing takes one of them; they multiply the object's texture.
@@ -113,7 +121,9 @@ class ScatterSpec(Spec):
         dice = self._dice(3)
         inner, outer = self.radius
         r = np.sqrt(inner**2 + dice[:, 0] * (outer**2 - inner**2))  # even over the area
-        xy = np.stack([r * np.cos(2 * np.pi * dice[:, 1]), r * np.sin(2 * np.pi * dice[:, 1])], axis=-1)
+        xy = np.stack(
+            [r * np.cos(2 * np.pi * dice[:, 1]), r * np.sin(2 * np.pi * dice[:, 1])], axis=-1
+        )
         xy += np.array(self.center[:2])
         free = np.ones(len(xy), dtype=bool)
         for x, y, radius in self.avoid:
@@ -121,8 +131,11 @@ class ScatterSpec(Spec):
         return xy[free]
 
     def _dice(self, columns: int, salt: int = 0) -> Array:
-        # The hash behind the textures: the same numbers on every machine and with every version of numpy.
-        grid = np.stack(np.meshgrid(np.arange(self.count), np.arange(columns), indexing="ij"), axis=-1).reshape(-1, 2)
+        # The hash behind the textures: the same numbers on every machine and with every version of
+        # numpy.
+        grid = np.stack(
+            np.meshgrid(np.arange(self.count), np.arange(columns), indexing="ij"), axis=-1
+        ).reshape(-1, 2)
         cells = np.column_stack([grid, np.full(len(grid), 1000 + salt)]).astype(np.float64)
         return lattice_noise(cells, self.seed).reshape(self.count, columns)
 
@@ -137,7 +150,9 @@ class ScatterSpec(Spec):
         """
         xy = self.places()
         if not len(xy):
-            raise ValueError("avoid leaves no room for any of them; make it smaller or the radius larger")
+            raise ValueError(
+                "avoid leaves no room for any of them; make it smaller or the radius larger"
+            )
         dice = self._dice(12, 1)[: len(xy)]
         z = height(xy)
         build = {"stones": _stone, "grass": _tuft, "flowers": _flower, "leaves": _leaf}[self.kind]
@@ -148,7 +163,9 @@ class ScatterSpec(Spec):
         start = 0
         for k, roll in enumerate(dice):
             size = self.size[0] + roll[0] * (self.size[1] - self.size[0])
-            color = palette[min(int(roll[1] * len(palette)), len(palette) - 1)] * (0.75 + 0.25 * roll[2])
+            color = palette[min(int(roll[1] * len(palette)), len(palette) - 1)] * (
+                0.75 + 0.25 * roll[2]
+            )
             for points, triangles, shade in build(size, roll[3:], color):
                 vertices.append(points + np.array([xy[k, 0], xy[k, 1], z[k]]))
                 faces.append(triangles + start)
@@ -158,7 +175,9 @@ class ScatterSpec(Spec):
 
 
 Piece = tuple[Array, npt.NDArray[np.int64], Array]
-"""Vertices, faces and colours (a vertex's, or one for all) of a piece of a thing that stands at the origin."""
+"""Vertices, faces and colours (a vertex's, or one for all) of a piece of a thing that stands at the
+origin.
+"""
 
 STEM = np.array(linear_rgb("#4d7a35"))
 HEART = np.array(linear_rgb("#e8b93a"))
@@ -168,7 +187,11 @@ def _stone(size: float, dice: Array, color: Array) -> Iterator[Piece]:
     points, faces = _ball()
     turn = 2 * np.pi * dice[0]
     bumps = 0.75 + 0.5 * fractal_noise(np.ascontiguousarray(1.2 * points + 50 * dice[1]), 2, 5)
-    points = points * bumps[:, None] * [size, size * (0.6 + 0.4 * dice[2]), size * (0.45 + 0.3 * dice[3])]
+    points = (
+        points
+        * bumps[:, None]
+        * [size, size * (0.6 + 0.4 * dice[2]), size * (0.45 + 0.3 * dice[3])]
+    )
     yield _about(points, turn) + np.array([0, 0, 0.15 * size]), faces, color
 
 
@@ -203,12 +226,24 @@ def _flower(size: float, dice: Array, color: Array) -> Iterator[Piece]:
         leaf = np.array([[0, 0, 0], [0.6, -0.42, 0.25], [1, 0, 0.15], [0.6, 0.42, 0.25]]) * petal
         yield _about(leaf, a) + top, np.array([[0, 1, 2], [0, 2, 3]]), color
     points, faces = _ball()
-    yield points * [0.3 * petal, 0.3 * petal, 0.2 * petal] + top + [0, 0, 0.08 * petal], faces, HEART
+    yield (
+        points * [0.3 * petal, 0.3 * petal, 0.2 * petal] + top + [0, 0, 0.08 * petal],
+        faces,
+        HEART,
+    )
 
 
 def _leaf(size: float, dice: Array, color: Array) -> Iterator[Piece]:
     curl = 0.1 + 0.25 * dice[1]
-    leaf = np.array([[-0.5, 0, curl * 0.5], [0, -0.28, curl], [0, 0, 0.06], [0, 0.28, curl], [0.5, 0, curl * 0.7]])
+    leaf = np.array(
+        [
+            [-0.5, 0, curl * 0.5],
+            [0, -0.28, curl],
+            [0, 0, 0.06],
+            [0, 0.28, curl],
+            [0.5, 0, curl * 0.7],
+        ]
+    )
     faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 2], [2, 4, 3]])
     yield _about(leaf * size, 2 * np.pi * dice[0]) + np.array([0, 0, 0.01 * size]), faces, color
 

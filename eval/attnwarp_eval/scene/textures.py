@@ -1,7 +1,7 @@
 """Procedural albedo: a colour for every point of space.
 
-A texture is a pure function of the world position, so the same surface point has the same colour in every view,
-whatever mesh or picture it is baked into for rendering.
+A texture is a pure function of the world position, so the same surface point has the same colour in
+every view, whatever mesh or picture it is baked into for rendering.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ Array = npt.NDArray[np.float64]
 
 def _hex(value: Any) -> str:
     if value is None:
-        raise ValueError("got nothing; an unquoted # starts a YAML comment, so write the colour in quotes: '#c08040'")
+        raise ValueError(
+            "got nothing; an unquoted # starts a YAML comment, so write the colour in quotes:"
+            " '#c08040'"
+        )
     text = str(value)
     if len(text) != 7 or text[0] != "#" or any(c not in "0123456789abcdefABCDEF" for c in text[1:]):
         raise ValueError(f"got {value!r}, expected an sRGB colour in quotes such as '#c08040'")
@@ -55,14 +58,19 @@ def linear_rgb(color: str) -> tuple[float, float, float]:
 
 
 LATER: dict[str, JsonValue] = {"later": True}
-"""``Field(default, json_schema_extra=LATER)``: a key that the format did not have at first. While it keeps its default
-it is left out of what is hashed, so that files written before it mean, and are called, what they always did."""
+"""``Field(default, json_schema_extra=LATER)``: a key that the format did not have at first. While
+it keeps its default it is left out of what is hashed, so that files written before it mean, and are
+called, what they always did."""
 
 
 class Spec(BaseModel):
-    """Base of everything a scene file says: unknown keys and numbers that are not finite are refused."""
+    """Base of everything a scene file says: unknown keys and numbers that are not finite are
+    refused.
+    """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True
+    )
 
     @model_serializer(mode="wrap")
     def _leave_out_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -74,7 +82,9 @@ class Spec(BaseModel):
 
 
 class _Texture(Spec):
-    variation: float = Field(0.0, ge=0, le=1)  # share by which a fine noise brightens or darkens the colour
+    variation: float = Field(
+        0.0, ge=0, le=1
+    )  # share by which a fine noise brightens or darkens the colour
     grain: float = Field(0.1, gt=0)  # size of that noise, scene units
 
 
@@ -113,7 +123,9 @@ class Noise(_Texture):
 
 
 class Bricks(_Texture):
-    """Courses of bricks (``size``: length, height) with mortar between, for upright walls; offset from row to row."""
+    """Courses of bricks (``size``: length, height) with mortar between, for upright walls; offset
+    from row to row.
+    """
 
     type: Literal["bricks"]
     colors: tuple[Color, ...] = Field(min_length=1)
@@ -123,7 +135,9 @@ class Bricks(_Texture):
 
 
 class Rings(_Texture):
-    """Rings of the given colours, each ``size`` wide, about the upright through ``center``: the year rings of wood."""
+    """Rings of the given colours, each ``size`` wide, about the upright through ``center``: the
+    year rings of wood.
+    """
 
     type: Literal["rings"]
     colors: tuple[Color, ...] = Field(min_length=2)
@@ -135,26 +149,36 @@ class Rings(_Texture):
 Texture = Annotated[Plain | Checker | Stripes | Noise | Bricks | Rings, Field(discriminator="type")]
 
 
-def albedo(texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: npt.ArrayLike) -> Array:
+def albedo(
+    texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: npt.ArrayLike
+) -> Array:
     """(N, 3) linear RGB albedo in [0, 0.9] at (N, 3) world ``points``."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     match texture:
         case Plain():
             color = np.tile(linear_rgb(texture.color), (len(points), 1))
         case Checker():
-            # Shifted so that surfaces at round coordinates, a ground at z = 0 above all, lie inside a layer of cubes.
+            # Shifted so that surfaces at round coordinates, a ground at z = 0 above all, lie inside
+            # a layer of cubes.
             cell = np.floor(points / texture.size + 0.37).sum(axis=1).astype(np.int64) % 2
             color = _palette(texture.colors)[cell]
         case Stripes():
             axis = np.asarray(texture.direction) / np.linalg.norm(texture.direction)
             height = points @ axis / texture.size + 0.37
             if texture.wobble:
-                height = height + texture.wobble * (2 * fractal_noise(points / (3 * texture.size), 2, 11) - 1)
-            color = _palette(texture.colors)[np.floor(height).astype(np.int64) % len(texture.colors)]
+                height = height + texture.wobble * (
+                    2 * fractal_noise(points / (3 * texture.size), 2, 11) - 1
+                )
+            color = _palette(texture.colors)[
+                np.floor(height).astype(np.int64) % len(texture.colors)
+            ]
         case Noise():
             ramp = _palette(texture.colors)
-            # The middle of the noise's range is stretched over the whole ramp; its extremes are rare.
-            value = np.clip(1.8 * (fractal_noise(points / texture.size, texture.octaves, 3) - 0.5) + 0.5, 0, 1)
+            # The middle of the noise's range is stretched over the whole ramp; its extremes are
+            # rare.
+            value = np.clip(
+                1.8 * (fractal_noise(points / texture.size, texture.octaves, 3) - 0.5) + 0.5, 0, 1
+            )
             at = value * (len(ramp) - 1)
             low = np.minimum(at.astype(np.int64), len(ramp) - 2)
             part = (at - low)[:, None]
@@ -163,7 +187,9 @@ def albedo(texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: 
             away = points[:, :2] - np.array(texture.center)
             ring = np.linalg.norm(away, axis=-1) / texture.size + 0.37
             if texture.wobble:
-                ring = ring + texture.wobble * (2 * fractal_noise(points / (6 * texture.size), 3, 13) - 1)
+                ring = ring + texture.wobble * (
+                    2 * fractal_noise(points / (6 * texture.size), 3, 13) - 1
+                )
             color = _palette(texture.colors)[np.floor(ring).astype(np.int64) % len(texture.colors)]
         case Bricks():
             length, height = texture.size
@@ -175,10 +201,19 @@ def albedo(texture: Plain | Checker | Stripes | Noise | Bricks | Rings, points: 
             color = _palette(texture.colors)[
                 np.minimum((shade * len(texture.colors)).astype(np.int64), len(texture.colors) - 1)
             ]
-            joint = ((along - brick) * length < texture.joint) | (points[:, 2] - row * height < texture.joint)
-            color = np.where(joint[:, None], linear_rgb(texture.mortar), color * (0.8 + 0.4 * shade[:, None]))
+            joint = ((along - brick) * length < texture.joint) | (
+                points[:, 2] - row * height < texture.joint
+            )
+            color = np.where(
+                joint[:, None], linear_rgb(texture.mortar), color * (0.8 + 0.4 * shade[:, None])
+            )
     if texture.variation:
-        color = color * (1 + texture.variation * (2 * fractal_noise(points / texture.grain, 3, 7) - 1))[:, None]
+        color = (
+            color
+            * (1 + texture.variation * (2 * fractal_noise(points / texture.grain, 3, 7) - 1))[
+                :, None
+            ]
+        )
     return np.clip(color, 0.0, 0.9)  # what real diffuse surfaces return at most
 
 
@@ -188,9 +223,16 @@ def _palette(colors: tuple[str, ...]) -> Array:
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _lattice(ix: Any, iy: Any, iz: Any, seed: Any) -> Any:
-    # An integer hash (the finaliser of splitmix64): the same value on every machine, no table, no random state.
-    h = np.uint64(ix) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(iy) * np.uint64(0xC2B2AE3D27D4EB4F)
-    h = h ^ np.uint64(iz) * np.uint64(0x165667B19E3779F9) ^ np.uint64(seed) * np.uint64(0xD6E8FEB86659FD93)
+    # An integer hash (the finaliser of splitmix64): the same value on every machine, no table, no
+    # random state.
+    h = np.uint64(ix) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(iy) * np.uint64(
+        0xC2B2AE3D27D4EB4F
+    )
+    h = (
+        h
+        ^ np.uint64(iz) * np.uint64(0x165667B19E3779F9)
+        ^ np.uint64(seed) * np.uint64(0xD6E8FEB86659FD93)
+    )
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     h = h ^ (h >> np.uint64(31))
@@ -199,7 +241,9 @@ def _lattice(ix: Any, iy: Any, iz: Any, seed: Any) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def lattice_noise(points: Array, seed: int) -> Array:
-    """(N,) white noise in [0, 1): one value for each integer cell that the (N, 3) ``points`` fall into."""
+    """(N,) white noise in [0, 1): one value for each integer cell that the (N, 3) ``points`` fall
+    into.
+    """
     out = np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x, y, z = np.floor(points[i, 0]), np.floor(points[i, 1]), np.floor(points[i, 2])
@@ -223,8 +267,13 @@ def fractal_noise(points: Array, octaves: int, seed: int) -> Array:
     for i in range(points.shape[0]):
         total, weight, norm, scale = 0.0, 1.0, 0.0, 1.0
         for octave in range(octaves):
-            # Shifted per octave, so that surfaces at round coordinates do not run along the lattice.
-            x, y, z = points[i, 0] * scale + 0.31, points[i, 1] * scale + 0.57, points[i, 2] * scale + 0.43
+            # Shifted per octave, so that surfaces at round coordinates do not run along the
+            # lattice.
+            x, y, z = (
+                points[i, 0] * scale + 0.31,
+                points[i, 1] * scale + 0.57,
+                points[i, 2] * scale + 0.43,
+            )
             fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
             ix, iy, iz = np.int64(fx), np.int64(fy), np.int64(fz)
             u, v, w = x - fx, y - fy, z - fz

@@ -1,4 +1,5 @@
-"""Which light transport the words of a scene file call for, and where they contradict each other."""
+"""Which light transport the words of a scene file call for, and where they contradict each
+other."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ VERTEX_COLORED = ("body", "mesh", "terrain", "scatter")
 def called_for(spec: SceneSpec) -> dict[Effect, str]:
     """The effects that the words of a scene file call for, each with the words.
 
-    It reads the file alone, without rendering or loading anything; :mod:`attnwarp_eval.effects.detect` looks closer.
+    It reads the file alone, without rendering or loading anything;
+    :mod:`attnwarp_eval.effects.detect` looks closer.
     """
     found: dict[Effect, str] = {"geometry": f"{len(spec.objects)} objects"}
 
@@ -36,7 +38,11 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
     if lamps:
         note("direct", lamps[0])
         note("shadows", lamps[0])
-    small = [f"lights[{k}] is a {light.type}" for k, light in enumerate(spec.lights) if light.type != "sky"]
+    small = [
+        f"lights[{k}] is a {light.type}"
+        for k, light in enumerate(spec.lights)
+        if light.type != "sky"
+    ]
     small += [f"object {item.name!r} shines" for item in spec.objects if item.emission]
     bent: list[str] = []
     polarising = False
@@ -46,7 +52,9 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
         if item.emission:
             continue
         material, name = item.material, f"object {item.name!r} is {item.material.type}"
-        if isinstance(material, TEXTURED) and (item.texture.type != "plain" or item.texture.variation):
+        if isinstance(material, TEXTURED) and (
+            item.texture.type != "plain" or item.texture.variation
+        ):
             note("textures", f"object {item.name!r} has the texture {item.texture.type}")
         if isinstance(material, DiffuseMaterial):
             continue
@@ -54,19 +62,25 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
         note("glossy" if rough else "specular", f"{name}, roughness {rough:g}")
         if not rough:
             bent.append(name)
-            # A mirror here is ideal: it reflects both polarisations alike, so that only metal and glass tell them apart.
+            # A mirror here is ideal: it reflects both polarisations alike, so that only metal and
+            # glass tell them apart.
             polarising |= not isinstance(material, MirrorMaterial)
         if isinstance(material, GlassMaterial):
             note("refraction", name)
             if material.interior:
-                note("subsurface", f"{name} with an interior of sigma_t {material.interior.sigma_t:g}")
+                note(
+                    "subsurface",
+                    f"{name} with an interior of sigma_t {material.interior.sigma_t:g}",
+                )
             if material.abbe is not None:
                 note("dispersion", f"{name} of Abbe number {material.abbe:g}")
     if bent and small:
         note("caustics", f"{bent[0]}, and {small[0]}")
     if "refraction" in found or (len(bent) > 1 and polarising):
         note(
-            "polarisation", f"light meets specular surfaces more than once: {bent[0] if bent else found['refraction']}"
+            "polarisation",
+            "light meets specular surfaces more than once:"
+            f" {bent[0] if bent else found['refraction']}",
         )
     for k, light in enumerate(spec.lights):
         if isinstance(light, SkySpec):
@@ -111,32 +125,51 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
             yield f"effects.forbid: {effect!r} is pinned as well; keep one of the two", where
         elif effect in found:
             yield (
-                f"effects.forbid: {effect!r} is forbidden, but the scene calls for it ({found[effect]}); "
-                f"{_REMEDIES[effect]}, or take {effect!r} off the list", where,
-            )  # fmt: skip
+                (
+                    f"effects.forbid: {effect!r} is forbidden, but the scene calls for it"
+                    f" ({found[effect]}); {_REMEDIES[effect]}, or take {effect!r} off the list"
+                ),
+                where,
+            )
     for k, effect in enumerate(pinned):
         if effect in NOT_SIMULATED:
-            yield (f"effects.pin: {effect!r} is not simulated, so it cannot be pinned; take it off the list",
-                   ("effects", "pin", k))  # fmt: skip
+            yield (
+                (
+                    f"effects.pin: {effect!r} is not simulated, so it cannot be pinned; take it off"
+                    " the list"
+                ),
+                ("effects", "pin", k),
+            )
         elif effect not in found:
             yield (
-                f"effects.pin: {effect!r} is pinned, but nothing here causes it; docs/effects.md says what does",
+                (
+                    f"effects.pin: {effect!r} is pinned, but nothing here causes it;"
+                    " docs/effects.md says what does"
+                ),
                 ("effects", "pin", k),
             )
     bounces = spec.appearance.bounces
     for k, item in enumerate(spec.objects):
         if isinstance(item.material, PlasticMaterial) and item.shape.type in VERTEX_COLORED:
-            # Mitsuba's roughplastic asks its texture for a mean, which colours of vertices have none of.
+            # Mitsuba's roughplastic asks its texture for a mean, which colours of vertices have
+            # none of.
             yield (
-                f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic can be a sphere, a box or a "
-                "rectangle; say diffuse or metal, or another shape", ("objects", k, "material"),
-            )  # fmt: skip
+                (
+                    f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic"
+                    " can be a sphere, a box or a rectangle; say diffuse or metal, or another"
+                    " shape"
+                ),
+                ("objects", k, "material"),
+            )
         needed, why = _bounces_needed(item.material)
         if not item.emission and bounces != "unlimited" and bounces < needed:
             yield (
-                f"appearance.bounces: got {bounces}, but object {item.name!r} is {item.material.type}: {why}; "
-                f"say at least {needed}, or unlimited", ("objects", k, "material"),
-            )  # fmt: skip
+                (
+                    f"appearance.bounces: got {bounces}, but object {item.name!r} is"
+                    f" {item.material.type}: {why}; say at least {needed}, or unlimited"
+                ),
+                ("objects", k, "material"),
+            )
 
 
 def _bounces_needed(material: Material) -> tuple[int, str]:

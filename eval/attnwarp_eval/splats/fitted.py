@@ -1,4 +1,6 @@
-"""Views to fit splats on: cameras around a scene, their true pictures, and first points; as arrays or as a folder."""
+"""Views to fit splats on: cameras around a scene, their true pictures, and first points; as arrays
+or as a folder.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ SKY_SHARE = 0.1
 """Share of the first points that stand for the sky, where a scene has one."""
 
 SKY_DISTANCE = 4.0
-"""Distance of those points from the scene's centre, in radii of the orbit: behind all that the scene consists of."""
+"""Distance of those points from the scene's centre, in radii of the orbit: behind all that the
+scene consists of.
+"""
 
 RINGS = 5
 """Heights of the orbits. Prime to 8, so that the views held out are spread over them as well."""
@@ -58,7 +62,8 @@ class FirstPoints:
 
 
 def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
-    """Cameras all around a scene, at the radius of its own cameras and at five heights that span theirs.
+    """Cameras all around a scene, at the radius of its own cameras and at five heights that span
+    theirs.
 
     Their yaws are evenly spaced and their heights take turns, two rings up each time.
 
@@ -84,11 +89,15 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
         x = spec.look_at[0] + spec.radius * math.cos(yaw)
         y = spec.look_at[1] + spec.radius * math.sin(yaw)
         name = orbit_name(k, count)
-        camera = Camera.look_at((x, y, z), spec.look_at, width=width, height=height, fov_y=spec.fov, name=name)
+        camera = Camera.look_at(
+            (x, y, z), spec.look_at, width=width, height=height, fov_y=spec.fov, name=name
+        )
         for solid, owner in solids:
             if solid.contains(camera.position):
                 at = ", ".join(f"{v:.4g}" for v in camera.position)
-                raise SceneError(f"{name} at ({at}) would be inside the object {owner!r}; change cameras.radius")
+                raise SceneError(
+                    f"{name} at ({at}) would be inside the object {owner!r}; change cameras.radius"
+                )
         cameras.append(camera)
     return cameras
 
@@ -111,14 +120,17 @@ def held_out_names(count: int) -> list[str]:
 def first_points(
     scene: Scene, count: int, *, noise: float = 0.5, seed: int = 0, geometry: Geometry | None = None
 ) -> FirstPoints:
-    """Points on the scene's surfaces, displaced at random, with the colours that the truth has there.
+    """Points on the scene's surfaces, displaced at random, with the colours that the truth has
+    there.
 
-    Where the scene has a sky, a tenth of them lie on the upper half of a sphere around everything, in its colours.
+    Where the scene has a sky, a tenth of them lie on the upper half of a sphere around everything,
+    in its colours.
 
     Args:
         scene: whose surfaces they lie on.
         count: number of points, at least 10.
-        noise: standard deviation of the displacement along each axis, in local spacings of the points.
+        noise: standard deviation of the displacement along each axis, in local spacings of the
+            points.
         seed: of the sampling and the noise.
         geometry: ``Geometry(scene)``, if there is one already.
     """
@@ -129,7 +141,9 @@ def first_points(
         raise ValueError(f"count: got {count}, expected at least 10")
     sky = next((light for light in scene.spec.lights if isinstance(light, SkySpec)), None)
     above = round(SKY_SHARE * count) if sky is not None else 0
-    found = surface_splats(scene, "2d", count - above, position_noise=noise, seed=seed, geometry=geometry)
+    found = surface_splats(
+        scene, "2d", count - above, position_noise=noise, seed=seed, geometry=geometry
+    )
     points = found.world_means()
     colors = found.sh[:, 0].numpy().astype(np.float64) * SH_C0 + 0.5
     if sky is not None:
@@ -138,7 +152,9 @@ def first_points(
         z, turn = k / above, k * math.pi * (3 - math.sqrt(5))
         r = np.sqrt(1 - z * z)
         up = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
-        points = np.concatenate([points, scene.center + SKY_DISTANCE * scene.spec.cameras.radius * up])
+        points = np.concatenate(
+            [points, scene.center + SKY_DISTANCE * scene.spec.cameras.radius * up]
+        )
         colors = np.concatenate([colors, to_srgb(sky_radiance(sky, up))])
     return FirstPoints(points, np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8))
 
@@ -161,11 +177,12 @@ def fit_scene(
     geometry: Geometry | None = None,
     watch: Callable[[Step], object] | None = None,
 ) -> Fit:
-    """Fit splats to a scene's true pictures; the curve of the fit has the errors of depth and normals in it.
+    """Fit splats to a scene's true pictures; the curve of the fit has the errors of depth and
+    normals in it.
 
-    Both kinds begin with the same points. The errors of the curve are means over the held-out views of
-    ``depth.abs_rel`` and ``depth.normal_median`` of the median depth, by intersection for 2D splats and at the
-    ray's peak for 3D ones.
+    Both kinds begin with the same points. The errors of the curve are means over the held-out views
+    of ``depth.abs_rel`` and ``depth.normal_median`` of the median depth, by intersection for 2D
+    splats and at the ray's peak for 3D ones.
 
     Args:
         scene: with the image size that the fit is to have.
@@ -179,7 +196,9 @@ def fit_scene(
 
     geometry = Geometry(scene) if geometry is None else geometry
     cloud = first_points(scene, points, noise=noise, seed=seed, geometry=geometry)
-    start = from_points(cloud.points, cloud.colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
+    start = from_points(
+        cloud.points, cloud.colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed
+    )
     cameras = orbit(scene, views)
     images = [picture(scene, camera, spp) for camera in cameras]
     out = held_out(views)
@@ -191,18 +210,30 @@ def fit_scene(
     truth = [geometry.trace(camera) for camera in parts[1].cameras]
 
     def errors(splats: Gaussians) -> dict[str, float]:
-        found = [surface_error(splats, camera, hits)[1] for camera, hits in zip(parts[1].cameras, truth, strict=True)]
+        found = [
+            surface_error(splats, camera, hits)[1]
+            for camera, hits in zip(parts[1].cameras, truth, strict=True)
+        ]
         return {
-            name: float(np.mean([each[name] for each in found])) for name in ("depth.abs_rel", "depth.normal_median")
+            name: float(np.mean([each[name] for each in found]))
+            for name in ("depth.abs_rel", "depth.normal_median")
         }
 
-    return fit(start, parts[0], settings, held_out=parts[1], folder=folder, measure=errors, watch=watch)
+    return fit(
+        start, parts[0], settings, held_out=parts[1], folder=folder, measure=errors, watch=watch
+    )
 
 
 def surface_error(
-    splats: Gaussians, camera: Camera, truth: Hits, settings: WarpSettings | None = None, edge: Any = None
+    splats: Gaussians,
+    camera: Camera,
+    truth: Hits,
+    settings: WarpSettings | None = None,
+    edge: Any = None,
 ) -> tuple[Surface, dict[str, float]]:
-    """What a camera sees of splats, and its errors of depth and normals; median depth if nothing else is asked for."""
+    """What a camera sees of splats, and its errors of depth and normals; median depth if nothing
+    else is asked for.
+    """
     from attnwarp.warp.settings import WarpSettings as Defaults
     from attnwarp.warp.view import render_surface
     from attnwarp_eval import metrics
@@ -215,7 +246,8 @@ def surface_error(
 
 
 def picture_error(image: npt.NDArray[Any], true_image: npt.NDArray[np.uint8]) -> dict[str, float]:
-    """``fit.psnr``, ``fit.mse`` and ``fit.ssim`` of a (H, W, 3) sRGB picture in [0, 1] against its 8-bit truth.
+    """``fit.psnr``, ``fit.mse`` and ``fit.ssim`` of a (H, W, 3) sRGB picture in [0, 1] against its
+    8-bit truth.
 
     SSIM is NaN below 11 x 11 px.
     """
@@ -240,9 +272,11 @@ def export(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Write a scene as other programs would hand it over: transforms.json, images/*.png, and points.ply.
+    """Write a scene as other programs would hand it over: transforms.json, images/*.png, and
+    points.ply.
 
-    One view of eight is in the split "test", the others in "train". What is there already is overwritten.
+    One view of eight is in the split "test", the others in "train". What is there already is
+    overwritten.
 
     Args:
         scene: any of scenes/.

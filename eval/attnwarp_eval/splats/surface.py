@@ -1,4 +1,6 @@
-"""Gaussian splats made from a scene's surfaces: a model whose errors are known, because they were put in."""
+"""Gaussian splats made from a scene's surfaces: a model whose errors are known, because they were
+put in.
+"""
 
 from __future__ import annotations
 
@@ -56,37 +58,46 @@ def surface_splats(
 ) -> Gaussians:
     """Splats that lie on the surfaces of a scene.
 
-    They are spread as blue noise, lie in the tangent plane, and carry the colour that the truth has there: albedo
-    times direct light, traced to each splat (see :mod:`attnwarp_eval.truth.shading`). Colours are computed rather
-    than picked from rendered views, since a diffuse surface under direct light looks the same from everywhere, and
-    pictures would add their noise, mix colours across outlines and know nothing of surfaces that no view shows.
+    They are spread as blue noise, lie in the tangent plane, and carry the colour that the truth has
+    there: albedo times direct light, traced to each splat (see :mod:`attnwarp_eval.truth.shading`).
+        Colours are computed rather
+    than picked from rendered views, since a diffuse surface under direct light looks the same from
+    everywhere, and pictures would add their noise, mix colours across outlines and know nothing of
+    surfaces that no view shows.
 
     Args:
         kind: "2d" (discs) or "3d" (flat ellipsoids, ``thickness`` thick).
         count: number of splats.
-        position_noise: standard deviation of a displacement in every direction, in local spacings. The colour stays
-            that of the undisturbed point.
+        position_noise: standard deviation of a displacement in every direction, in local spacings.
+            The colour stays that of the undisturbed point.
         normal_noise: standard deviation of a tilt about each of the two tangents, in degrees.
         seed: of the sampling and the noise; the noise of one seed does not change the sampling.
-        size: standard deviation of a splat in its plane, in local spacings. At 0.6 a surface has a median alpha of
-            0.97 to 0.98 and 0.80 at its thinnest percentile, at 0.7 0.99 and 0.92, with wider fringes at outlines.
+        size: standard deviation of a splat in its plane, in local spacings. At 0.6 a surface has a
+            median alpha of 0.97 to 0.98 and 0.80 at its thinnest percentile, at 0.7 0.99 and 0.92,
+            with wider fringes at outlines.
         thickness: the third standard deviation of "3d" splats, in local spacings.
         opacity: of every splat.
-        focus: the radius about the scene's centre, in scene units, within which points are about equally dense;
-            further out the density falls with the square of the distance. A third of the cameras' orbit if left out.
+        focus: the radius about the scene's centre, in scene units, within which points are about
+            equally dense; further out the density falls with the square of the distance. A third of
+            the cameras' orbit if left out.
         geometry: ``Geometry(scene)``, if there is one already.
 
     Returns:
         Gaussians in float32 relative to the float64 scene centre, SH degree 0.
 
     Raises:
-        ValueError: a count below 1, a size, thickness or focus that is not positive, negative noise.
+        ValueError: a count below 1, a size, thickness or focus that is not positive, negative
+            noise.
     """
     import torch
 
     from attnwarp.gaussians import Gaussians
 
-    for name, value in {"size": size, "thickness": thickness, "focus": 1.0 if focus is None else focus}.items():
+    for name, value in {
+        "size": size,
+        "thickness": thickness,
+        "focus": 1.0 if focus is None else focus,
+    }.items():
         if not value > 0:
             raise ValueError(f"{name}: got {value}, expected a positive number")
     for name, value in {"position_noise": position_noise, "normal_noise": normal_noise}.items():
@@ -103,9 +114,14 @@ def surface_splats(
     noise = np.random.default_rng([seed, 1])
     position, normal = samples.point - scene.center, samples.normal
     if position_noise:
-        position = position + noise.standard_normal(position.shape) * (position_noise * samples.spacing)[:, None]
+        position = (
+            position
+            + noise.standard_normal(position.shape) * (position_noise * samples.spacing)[:, None]
+        )
     if normal_noise:
-        tilt = np.tan(np.radians(np.clip(noise.standard_normal((len(normal), 2)) * normal_noise, -80, 80)))
+        tilt = np.tan(
+            np.radians(np.clip(noise.standard_normal((len(normal), 2)) * normal_noise, -80, 80))
+        )
         tangent, bitangent = frames(normal)
         normal = normal + tilt[:, :1] * tangent + tilt[:, 1:] * bitangent
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -128,10 +144,11 @@ def surface_splats(
 
 
 def quaternions_from_normals(normals: Array) -> Array:
-    """(N, 4) unit quaternions wxyz that turn +z into each of (N, 3) unit ``normals``, by the shortest way.
+    """(N, 4) unit quaternions wxyz that turn +z into each of (N, 3) unit ``normals``, by the
+    shortest way.
 
-    For normals that point down the way starts at -z, after half a turn about x, so that nothing is divided by a
-    number near zero anywhere.
+    For normals that point down the way starts at -z, after half a turn about x, so that nothing is
+    divided by a number near zero anywhere.
     """
     x, y, z = normals.T
     down = z < 0
@@ -143,11 +160,13 @@ def quaternions_from_normals(normals: Array) -> Array:
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
-def sample_surface(geometry: Geometry, count: int, *, center: npt.ArrayLike, focus: float, seed: int) -> SurfaceSamples:
+def sample_surface(
+    geometry: Geometry, count: int, *, center: npt.ArrayLike, focus: float, seed: int
+) -> SurfaceSamples:
     """Blue noise on all surfaces by sample elimination (Yuksel 2015), denser near ``center``.
 
-    The density is proportional to 1 / (1 + (r / focus)^2), r the distance from ``center``, which keeps the splats of
-    a floor about equally large in the pictures of cameras that orbit it.
+    The density is proportional to 1 / (1 + (r / focus)^2), r the distance from ``center``, which
+    keeps the splats of a floor about equally large in the pictures of cameras that orbit it.
 
     Args:
         count: number of points, exactly.
@@ -170,7 +189,8 @@ def sample_surface(geometry: Geometry, count: int, *, center: npt.ArrayLike, foc
     normal /= 2 * np.maximum(area, 1e-300)[:, None]
     flat_mass = area * weight(corners.mean(axis=1))
 
-    # Spheres in cells of equal area: z and longitude are independent and uniform on a sphere (Archimedes).
+    # Spheres in cells of equal area: z and longitude are independent and uniform on a sphere
+    # (Archimedes).
     sphere_center, radius, sphere_id = geometry.spheres()
     cells = [_sphere_cells(c, r, focus / 4) for c, r in zip(sphere_center, radius, strict=True)]
     cell_sphere = np.repeat(np.arange(len(cells)), [len(c[0]) for c in cells]).astype(np.int64)
@@ -186,7 +206,8 @@ def sample_surface(geometry: Geometry, count: int, *, center: npt.ArrayLike, foc
     mass = np.concatenate([flat_mass, ball_mass])
     total = float(mass.sum())
     drawn = CANDIDATES * count
-    # Stratified over the patches: how many candidates a patch gets differs from its share by less than one.
+    # Stratified over the patches: how many candidates a patch gets differs from its share by less
+    # than one.
     ticket = (np.arange(drawn) + random.random(drawn)) / drawn * total
     patch = np.minimum(np.searchsorted(np.cumsum(mass), ticket, side="right"), len(mass) - 1)
     flat, ball = patch[patch < len(flat_mass)], patch[patch >= len(flat_mass)] - len(flat_mass)
@@ -203,15 +224,21 @@ def sample_surface(geometry: Geometry, count: int, *, center: npt.ArrayLike, foc
     # Surfaces inside other objects are seen by nobody; splats there would only shine through.
     free = ~buried(geometry, point, normals, primitive)
     if free.sum() < count:
-        raise ValueError(f"count: got {count}, but too little of the surface can be seen from anywhere outside")
+        raise ValueError(
+            f"count: got {count}, but too little of the surface can be seen from anywhere outside"
+        )
     point, normals, primitive = point[free], normals[free], primitive[free]
     spacing = np.sqrt(total * free.mean() / (count * weight(point)))
     keep = _eliminate(point - center, normals, spacing, count)
     return SurfaceSamples(point[keep], normals[keep], primitive[keep], spacing[keep])
 
 
-def _split(corners: Array, ids: npt.NDArray[np.int64], limit: float) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangles cut into four until no edge is longer than ``limit``, so that a patch has one density."""
+def _split(
+    corners: Array, ids: npt.NDArray[np.int64], limit: float
+) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Triangles cut into four until no edge is longer than ``limit``, so that a patch has one
+    density.
+    """
     done, done_ids = [], []
     while len(corners):
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
@@ -229,7 +256,9 @@ def _split(corners: Array, ids: npt.NDArray[np.int64], limit: float) -> tuple[Ar
 def _sphere_cells(center: Array, radius: float, limit: float) -> tuple[Array, Array]:
     rows = max(4, int(np.ceil(np.pi * radius / limit)))
     columns = 2 * rows
-    z, phi = np.meshgrid(np.linspace(-1, 1, rows + 1)[:-1], np.linspace(0, 2 * np.pi, columns + 1)[:-1])
+    z, phi = np.meshgrid(
+        np.linspace(-1, 1, rows + 1)[:-1], np.linspace(0, 2 * np.pi, columns + 1)[:-1]
+    )
     low = np.stack([z.ravel(), phi.ravel()], axis=-1)
     return low, np.tile([2 / rows, 2 * np.pi / columns], (len(low), 1))
 
@@ -241,7 +270,9 @@ def _on_sphere(z_phi: Array) -> Array:
 
 
 def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt.NDArray[np.int64]:
-    """Indices of the ``count`` points that are left when the most crowded one is removed again and again."""
+    """Indices of the ``count`` points that are left when the most crowded one is removed again and
+    again.
+    """
     from scipy.sparse import csr_matrix
     from scipy.spatial import cKDTree
 
@@ -259,7 +290,9 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
     use = (here != there) & same_side & (closeness > 0)
     crowd = csr_matrix((closeness[use] ** 8, (here[use], there[use])), shape=(n, n))
     crowd = crowd.maximum(crowd.T).tocsr()
-    alive = _remove(crowd.indptr.astype(np.int64), crowd.indices.astype(np.int64), crowd.data, n - count)
+    alive = _remove(
+        crowd.indptr.astype(np.int64), crowd.indices.astype(np.int64), crowd.data, n - count
+    )
     return np.flatnonzero(alive)
 
 
@@ -280,7 +313,9 @@ def _sink(heap, place, weight, k, size):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _remove(start, other, closeness, removals):  # type: ignore[no-untyped-def]
-    """Remove the heaviest node ``removals`` times, each time lightening its neighbours; a binary heap with places."""
+    """Remove the heaviest node ``removals`` times, each time lightening its neighbours; a binary
+    heap with places.
+    """
     n = len(start) - 1
     weight = np.zeros(n)
     for i in range(n):

@@ -1,9 +1,10 @@
 """Intervals and paired tests over scenes and views. Pure functions: numbers in, numbers out.
 
-Views of one scene are correlated, so the scene is the unit of evidence: an interval is Student's t over the means of
-the scenes. The views are a designed set (the same yaws for every scene and variant), not a sample, so they are not
-resampled. docs/statistics.md has the coverage that was measured for this and for two bootstraps: with three scenes
-theirs is 73 to 92 %, or above 97 %, at a stated 95 %.
+Views of one scene are correlated, so the scene is the unit of evidence: an interval is Student's t
+over the means of the scenes. The views are a designed set (the same yaws for every scene and
+variant), not a sample, so they are not resampled. docs/statistics.md has the coverage that was
+measured for this and for two bootstraps: with three scenes theirs is 73 to 92 %, or above 97 %, at
+a stated 95 %.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ class Interval:
         low, high: the interval; NaN with fewer than two scenes.
         scenes, views: how many of each went in.
         undefined: values that were NaN, left out and counted.
-        detectable: the smallest difference that would have been seen (80 % power at 5 %); NaN with under two scenes.
-        p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with under two scenes.
+        detectable: the smallest difference that would have been seen (80 % power at 5 %); NaN with
+            under two scenes.
+        p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with
+            under two scenes.
     """
 
     mean: float
@@ -61,7 +64,10 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     """
     from scipy import stats
 
-    kept = {scene: np.asarray(v, dtype=np.float64)[np.isfinite(v)] for scene, v in sorted(values.items())}
+    kept = {
+        scene: np.asarray(v, dtype=np.float64)[np.isfinite(v)]
+        for scene, v in sorted(values.items())
+    }
     undefined = sum(len(v) for v in values.values()) - sum(len(v) for v in kept.values())
     groups = [v for v in kept.values() if len(v)]
     views = sum(len(v) for v in groups)
@@ -76,11 +82,14 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
         error = 0.0  # the rounding of equal means, which is no spread
     half = error * float(stats.t.ppf(0.5 + level / 2, count - 1))
     p = float(2 * stats.t.sf(abs(mean) / error, count - 1)) if error > 0 else float(mean == 0)
-    return Interval(mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p)
+    return Interval(
+        mean, mean - half, mean + half, count, views, undefined, _power_factor(count) * error, p
+    )
 
 
 def _power_factor(scenes: int) -> float:
-    """Detectable difference in standard errors: t(0.975) + t(0.80), two-sided 5 % and 80 % power."""
+    """Detectable difference in standard errors: t(0.975) + t(0.80), two-sided 5 % and 80 %
+    power."""
     from scipy import stats
 
     return float(stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1))
@@ -90,12 +99,15 @@ def paired(a: ByView, b: ByView) -> Interval:
     """Interval of b - a over the views that both have.
 
     Args:
-        a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN, count as undefined.
+        a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN,
+            count as undefined.
     """
     differences: dict[str, list[float]] = {}
     for scene in sorted(set(a) | set(b)):
         left, right = a.get(scene, {}), b.get(scene, {})
-        differences[scene] = [right.get(v, np.nan) - left.get(v, np.nan) for v in sorted(set(left) | set(right))]
+        differences[scene] = [
+            right.get(v, np.nan) - left.get(v, np.nan) for v in sorted(set(left) | set(right))
+        ]
     return interval(differences)
 
 
@@ -113,8 +125,11 @@ class Ratio:
     high: float
 
 
-def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]], *, resamples: int = 1000) -> Ratio:
-    """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds a group, paired round by round.
+def time_ratio(
+    a: Sequence[Sequence[float]], b: Sequence[Sequence[float]], *, resamples: int = 1000
+) -> Ratio:
+    """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds a group, paired
+    round by round.
 
     Raises:
         ValueError: other numbers of groups or rounds, or seconds that are not positive.
@@ -123,12 +138,21 @@ def time_ratio(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]], *, re
     for left, right in zip(a, b, strict=True):
         x, y = np.asarray(left, dtype=np.float64), np.asarray(right, dtype=np.float64)
         if x.shape != y.shape or not ((x > 0).all() and (y > 0).all()):
-            raise ValueError("a, b: expected the same number of rounds on both sides, all of them positive seconds")
+            raise ValueError(
+                "a, b: expected the same number of rounds on both sides, all of them positive"
+                " seconds"
+            )
         logs.append(np.log(x / y))
     rng = np.random.default_rng(0)
-    drawn = np.mean([np.median(v[rng.integers(len(v), size=(resamples, len(v)))], axis=1) for v in logs], axis=0)
+    drawn = np.mean(
+        [np.median(v[rng.integers(len(v), size=(resamples, len(v)))], axis=1) for v in logs], axis=0
+    )
     low, high = np.quantile(drawn, [0.025, 0.975])
-    return Ratio(float(np.exp(np.mean([np.median(v) for v in logs]))), float(np.exp(low)), float(np.exp(high)))
+    return Ratio(
+        float(np.exp(np.mean([np.median(v) for v in logs]))),
+        float(np.exp(low)),
+        float(np.exp(high)),
+    )
 
 
 def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
@@ -137,14 +161,20 @@ def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
     It says what was seen on these scenes, without speaking of others.
     """
     differences = [
-        b[scene][view] - a[scene][view] for scene in a if scene in b for view in a[scene] if view in b[scene]
+        b[scene][view] - a[scene][view]
+        for scene in a
+        if scene in b
+        for view in a[scene]
+        if view in b[scene]
     ]
     known = [d for d in differences if np.isfinite(d)]
     return sum(d * sign > 0 for d in known), len(known)
 
 
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:
-    """p-values adjusted for the false discovery rate (Benjamini & Hochberg 1995); NaN stays NaN and does not count."""
+    """p-values adjusted for the false discovery rate (Benjamini & Hochberg 1995); NaN stays NaN and
+    does not count.
+    """
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(values.shape, np.nan)
     known = np.flatnonzero(np.isfinite(values))
@@ -169,7 +199,8 @@ def verdict(
         difference: from :func:`paired`.
         direction: which values of the metric are better.
         atol: differences whose interval does not clear this size are not told apart.
-        adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05 nothing is told.
+        adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05
+            nothing is told.
     """
     if not difference.known or (adjusted_p is not None and not adjusted_p <= 0.05):
         return "can't tell"

@@ -1,4 +1,6 @@
-"""Studies: scenes x variants x seeds x probes, run as content-addressed cells that survive any interruption."""
+"""Studies: scenes x variants x seeds x probes, run as content-addressed cells that survive any
+interruption.
+"""
 
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.store import Store

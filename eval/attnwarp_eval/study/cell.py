@@ -1,4 +1,6 @@
-"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of what it computes, never of its name."""
+"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of what it computes,
+never of its name.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,14 @@ class Cell:
     """One unit of work.
 
     Attributes:
-        spec: everything that decides the result, and nothing else: scene content, variant content, seed, views, image
-            size, protocol versions. The names that people gave to the variant are not in it.
+        spec: everything that decides the result, and nothing else: scene content, variant content,
+            seed, views, image size, protocol versions. The names that people gave to the variant
+            are not in it.
         scene, variant, probe, seed: labels for tables and error messages.
         labels: every variant name that leads to this same content.
         pictures: views of which pictures are kept.
-        encoders: by kind, the names that encoders are loaded by; which weights they are is in ``spec``.
+        encoders: by kind, the names that encoders are loaded by; which weights they are is in
+            ``spec``.
     """
 
     spec: dict[str, Any]
@@ -39,4 +43,6 @@ class Cell:
     @property
     def title(self) -> str:
         """Short text for progress bars and failure tables."""
-        return f"{self.scene} / {self.variant} / {self.probe}" + (f" / seed {self.seed}" if self.seed else "")
+        return f"{self.scene} / {self.variant} / {self.probe}" + (
+            f" / seed {self.seed}" if self.seed else ""
+        )

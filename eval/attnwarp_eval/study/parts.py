@@ -31,12 +31,16 @@ class Splats(Part):
 
 
 class Fits(Part):
-    """Splats fitted to true pictures from all around the scene; the ``fit`` probe measures them on views held out."""
+    """Splats fitted to true pictures from all around the scene; the ``fit`` probe measures them on
+    views held out.
+    """
 
     views: Annotated[int, Field(ge=9, le=10_000)] = 64
     points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
     noise: Annotated[float, Field(ge=0)] = 0.5
-    settings: dict[str, Any] = Field(default_factory=dict, description="fields of attnwarp.fit.FitSettings")
+    settings: dict[str, Any] = Field(
+        default_factory=dict, description="fields of attnwarp.fit.FitSettings"
+    )
 
 
 class Variant(Part):
@@ -71,9 +75,11 @@ class Ablation(Part):
 
 
 class Front(Part):
-    """A figure of the report: a metric (lower is better) against the seconds of the method, for these variants.
+    """A figure of the report: a metric (lower is better) against the seconds of the method, for
+    these variants.
 
-    Seconds come from the ``timing`` probe where it has all of them, taken in turn; else from the cells themselves.
+    Seconds come from the ``timing`` probe where it has all of them, taken in turn; else from the
+    cells themselves.
     """
 
     title: str

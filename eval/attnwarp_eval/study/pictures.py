@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.float32]
 
 WIDTH = 256
-"""Pictures are reduced to this width: enough to see where a mask errs, and a report that can be mailed."""
+"""Pictures are reduced to this width: enough to see where a mask errs, and a report that can be
+mailed.
+"""
 
 CLASSES: dict[str, tuple[str, str]] = {
     "visible, accepted": ("#2ca25f", "right"),
@@ -39,8 +41,15 @@ DEPTH_RANGE = 0.02
 """Relative depth error at the ends of the blue-white-red map: blue is too near, red too far."""
 
 
-def of(at: World, name: str, *, truth: TwoView, spp: int | None = None, view: WarpedView | None = None,
-       surface: Surface | None = None) -> dict[str, bytes]:  # fmt: skip
+def of(
+    at: World,
+    name: str,
+    *,
+    truth: TwoView,
+    spp: int | None = None,
+    view: WarpedView | None = None,
+    surface: Surface | None = None,
+) -> dict[str, bytes]:
     """JPEG files by what they show.
 
     Args:
@@ -67,7 +76,9 @@ def of(at: World, name: str, *, truth: TwoView, spp: int | None = None, view: Wa
 
 
 def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
-    """JPEG files of a view held out from a fit: its truth, what the splats show there, and their depth's error."""
+    """JPEG files of a view held out from a fit: its truth, what the splats show there, and their
+    depth's error.
+    """
     depth = np.asarray(fitted.depth, dtype=np.float64)
     found: dict[str, Image] = {
         "target": (image / 255).astype(np.float32),
@@ -80,8 +91,8 @@ def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict
 def jpeg(image: Image) -> bytes:
     """An sRGB image in [0, 1], reduced to :data:`WIDTH`, as JPEG without chroma subsampling.
 
-    These pictures are for people; every number is taken from the arrays. As PNG a report of them has three times the
-    size.
+    These pictures are for people; every number is taken from the arrays. As PNG a report of them
+    has three times the size.
     """
     import cv2
 
@@ -89,7 +100,12 @@ def jpeg(image: Image) -> bytes:
     if pixels.shape[1] > WIDTH:
         height = round(pixels.shape[0] * WIDTH / pixels.shape[1])
         pixels = cv2.resize(pixels, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    how = [cv2.IMWRITE_JPEG_QUALITY, 85, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    how = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        85,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
     done, data = cv2.imencode(".jpg", pixels[..., ::-1], how)
     if not done:
         raise RuntimeError(f"JPEG encoding failed for an image of shape {pixels.shape}")
@@ -109,9 +125,13 @@ def checkered(shape: tuple[int, int], step: int = 16) -> Image:
 
 def warped(source: Image, view: WarpedView) -> Image:
     """The source image as the warp carries it to the target; squares where the mask rejects."""
-    image, _ = sample(torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1))), view.correspondence)
+    image, _ = sample(
+        torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1))), view.correspondence
+    )
     height, width = view.mask.shape
-    return np.where(view.mask.numpy()[..., None], image.permute(1, 2, 0).numpy(), checkered((height, width)))
+    return np.where(
+        view.mask.numpy()[..., None], image.permute(1, 2, 0).numpy(), checkered((height, width))
+    )
 
 
 def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Image) -> Image:
@@ -135,7 +155,9 @@ def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Imag
 
 
 def endpoint_map(xy: npt.NDArray[np.float64], truth: TwoView) -> Image:
-    """Endpoint error of truly visible pixels on a logarithmic scale; grey elsewhere, red where there is no position."""
+    """Endpoint error of truly visible pixels on a logarithmic scale; grey elsewhere, red where
+    there is no position.
+    """
     import matplotlib
 
     error = np.linalg.norm(xy - truth.xy, axis=-1)
@@ -152,6 +174,8 @@ def depth_map(depth: npt.NDArray[np.float64], truth: Hits) -> Image:
 
     with np.errstate(invalid="ignore"):
         error = (depth - truth.depth) / truth.depth
-    image = matplotlib.colormaps["RdBu_r"](np.clip(0.5 + 0.5 * np.nan_to_num(error) / DEPTH_RANGE, 0, 1))[..., :3]
+    image = matplotlib.colormaps["RdBu_r"](
+        np.clip(0.5 + 0.5 * np.nan_to_num(error) / DEPTH_RANGE, 0, 1)
+    )[..., :3]
     image = np.where(np.isfinite(error)[..., None], image, 0.0)
     return np.where(truth.valid[..., None], image, 0.7).astype(np.float32)

@@ -1,4 +1,6 @@
-"""Run a study's cells: in this process, or on a local cluster of worker processes. Nothing finished is ever lost."""
+"""Run a study's cells: in this process, or on a local cluster of worker processes. Nothing finished
+is ever lost.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ if TYPE_CHECKING:
 
 @dataclass
 class Plan:
-    """A resolved study: its scenes, its cells, which are still to do, and how many were done by other code than this."""
+    """A resolved study: its scenes, its cells, which are still to do, and how many were done by
+    other code than this.
+    """
 
     study: Study
     scenes: dict[str, Scene]
@@ -85,13 +89,18 @@ def plan(study: Study, store: Store) -> Plan:
 
 
 def _has_pictures(cell: Cell, record: dict[str, Any], store: Store) -> bool:
-    """Whether the pictures that the study wants of a cell are there; what they show is no part of its id."""
+    """Whether the pictures that the study wants of a cell are there; what they show is no part of
+    its id.
+    """
     kept = [p for p in record.get("pictures", []) if (store.root / p["path"]).is_file()]
-    return len(kept) == len(record.get("pictures", [])) and set(cell.pictures) <= {p["view"] for p in kept}
+    return len(kept) == len(record.get("pictures", [])) and set(cell.pictures) <= {
+        p["view"] for p in kept
+    }
 
 
 def verify(store: Store) -> Problems:
-    """Recompute the hashes of a run's cells and pictures, and the list of expected cells from its study.
+    """Recompute the hashes of a run's cells and pictures, and the list of expected cells from its
+    study.
 
     Raises:
         InputError: the folder is no run, or a scene of it is gone.
@@ -106,7 +115,8 @@ def verify(store: Store) -> Problems:
         return problems
     if again != {c["id"] for c in kept["cells"]}:
         problems.damaged.append(
-            "the study names other cells today: a scene or a protocol has changed since; run it again for the new ones"
+            "the study names other cells today: a scene or a protocol has changed since; run it"
+            " again for the new ones"
         )
     return problems
 
@@ -115,7 +125,9 @@ def expected(plan: Plan) -> dict[str, Any]:
     """What ``study.json`` keeps: the resolved study and the cells that a complete run has."""
     return {
         "study": plan.study.model_dump(mode="json"),
-        "scenes": {name: {"hash": s.content_hash, "title": s.title} for name, s in plan.scenes.items()},
+        "scenes": {
+            name: {"hash": s.content_hash, "title": s.title} for name, s in plan.scenes.items()
+        },
         "cells": [
             {
                 "id": c.id,
@@ -135,7 +147,12 @@ Listener = Callable[[str, dict[str, Any]], None]
 
 
 def execute(
-    plan: Plan, store: Store, *, jobs: int = 1, keep_going: bool = True, listen: Listener | None = None
+    plan: Plan,
+    store: Store,
+    *,
+    jobs: int = 1,
+    keep_going: bool = True,
+    listen: Listener | None = None,
 ) -> Summary:
     """Compute the cells that are still to do, writing each as soon as it is finished.
 
@@ -154,7 +171,13 @@ def execute(
             summary.computed += 1
             tell("done", {"title": cell.title})
             continue
-        failure = {"title": cell.title, "scene": cell.scene, "variant": cell.variant, "probe": cell.probe, **error}
+        failure = {
+            "title": cell.title,
+            "scene": cell.scene,
+            "variant": cell.variant,
+            "probe": cell.probe,
+            **error,
+        }
         store.write_failure(cell.id, failure)
         summary.failures.append(failure)
         tell("failed", failure)
@@ -167,11 +190,14 @@ def execute(
 Outcome = tuple[Cell, dict[str, str] | None]
 
 
-def compute_and_write(cell: Cell, scene: str, root: str, threads: int | None = None) -> dict[str, str] | None:
+def compute_and_write(
+    cell: Cell, scene: str, root: str, threads: int | None = None
+) -> dict[str, str] | None:
     """Compute one cell and write its record; return what went wrong, or None.
 
-    The cell is written where it was computed, so a lost connection cannot lose a result. Every kind of error is
-    turned into a row of the table of failed cells: one bad cell must not cost the others.
+    The cell is written where it was computed, so a lost connection cannot lose a result. Every kind
+    of error is turned into a row of the table of failed cells: one bad cell must not cost the
+    others.
     """
     from attnwarp_eval.study.work import compute
 
@@ -199,14 +225,16 @@ def _here(plan: Plan, store: Store, tell: Listener) -> Iterator[Outcome]:
 def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Outcome]:
     """A local dask cluster, one process a worker, at most one cell in flight per worker.
 
-    A worker that dies takes only the cell it was at: that one is tried once more elsewhere, then reported.
+    A worker that dies takes only the cell it was at: that one is tried once more elsewhere, then
+    reported.
     """
     import dask
     from distributed import Client, LocalCluster, as_completed
 
     threads = max(1, len(os.sched_getaffinity(0)) // jobs)
     root = str(store.root.resolve())
-    # dask has workers give freed memory back at once; image-sized arrays then cost more page faults than arithmetic.
+    # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
+    # than arithmetic.
     keep_memory = {
         "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 30,
         "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 30,
@@ -221,9 +249,17 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
         with _deaf_to_interrupts():
-            # No memory limit: near one dask pauses a worker for good, since a world's caches are never given back.
-            how = {"processes": True, "threads_per_worker": 1, "memory_limit": 0, "silence_logs": 50}
-            cluster = stack.enter_context(LocalCluster(n_workers=jobs, dashboard_address=None, **how))
+            # No memory limit: near one dask pauses a worker for good, since a world's caches are
+            # never given back.
+            how = {
+                "processes": True,
+                "threads_per_worker": 1,
+                "memory_limit": 0,
+                "silence_logs": 50,
+            }
+            cluster = stack.enter_context(
+                LocalCluster(n_workers=jobs, dashboard_address=None, **how)
+            )
         client = stack.enter_context(Client(cluster))
         queue = _Queue(plan.todo)
         running: dict[Any, Cell] = {}
@@ -233,7 +269,9 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
             cell = queue.take(scene)
             if cell is not None:
                 tell("start", {"title": cell.title})
-                future = client.submit(compute_and_write, cell, cell.scene, root, threads, pure=False)
+                future = client.submit(
+                    compute_and_write, cell, cell.scene, root, threads, pure=False
+                )
                 running[future.key] = cell
                 pool.add(future)
 
@@ -248,7 +286,9 @@ def _cluster(plan: Plan, store: Store, jobs: int, tell: Listener) -> Iterator[Ou
 
 @contextlib.contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Let worker processes that start inside ignore Ctrl-C: this process is the one to hear it, and it ends them."""
+    """Let worker processes that start inside ignore Ctrl-C: this process is the one to hear it, and
+    it ends them.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -260,7 +300,9 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 
 class _Queue:
-    """Cells by scene. A worker stays with the scene whose truth it has made, then helps where most is left."""
+    """Cells by scene. A worker stays with the scene whose truth it has made, then helps where most
+    is left.
+    """
 
     def __init__(self, cells: list[Cell]) -> None:
         self.scenes: dict[str, deque[Cell]] = {}
@@ -269,7 +311,9 @@ class _Queue:
         self.started: set[str] = set()
 
     def take(self, scene: str | None) -> Cell | None:
-        """The next cell for the worker that last computed one of ``scene``; None when nothing is left."""
+        """The next cell for the worker that last computed one of ``scene``; None when nothing is
+        left.
+        """
         left = {name: cells for name, cells in self.scenes.items() if cells}
         if not left:
             return None

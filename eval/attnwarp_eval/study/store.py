@@ -1,4 +1,6 @@
-"""A run's folder. The truth is one JSON file a cell, written to a temporary file, flushed to disk, then renamed."""
+"""A run's folder. The truth is one JSON file a cell, written to a temporary file, flushed to disk,
+then renamed.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class StoreError(InputError):
 
 
 def write_atomic(path: Path, data: bytes) -> None:
-    """Write so that ``path`` either keeps its old content or has all of ``data``, even after a power cut."""
+    """Write so that ``path`` either keeps its old content or has all of ``data``, even after a
+    power cut.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     with temporary.open("wb") as file:
@@ -74,12 +78,15 @@ class Store:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise StoreError(
-                    f"{self.root}: another run is writing to this folder; wait for it, or name another with --out"
+                    f"{self.root}: another run is writing to this folder; wait for it, or name"
+                    " another with --out"
                 ) from None
             yield
 
     def write_study(self, study: dict[str, Any]) -> None:
-        """Keep the resolved study and its expected cells. Cells of a former study in this folder stay."""
+        """Keep the resolved study and its expected cells. Cells of a former study in this folder
+        stay.
+        """
         self.write_json(self.root / "study.json", study)
 
     def read_study(self) -> dict[str, Any]:
@@ -100,12 +107,16 @@ class Store:
                 return study
         except (ValueError, AttributeError):
             pass
-        raise StoreError(f"{path}: damaged; run the study again with --out {self.root}, which writes it anew")
+        raise StoreError(
+            f"{path}: damaged; run the study again with --out {self.root}, which writes it anew"
+        )
 
     @staticmethod
     def write_json(path: Path, value: Any) -> None:
         """Atomic, readable JSON."""
-        write_atomic(path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+        write_atomic(
+            path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
+        )
 
     def path(self, cell_id: str) -> Path:
         """Where the record of a cell lies."""
@@ -116,7 +127,9 @@ class Store:
         return {p.stem for p in self.cells.glob("*.json")} if self.cells.is_dir() else set()
 
     def write(self, record: dict[str, Any]) -> None:
-        """Keep a finished cell; ``record`` has at least ``id`` and ``spec``. A former failure of it is forgotten."""
+        """Keep a finished cell; ``record`` has at least ``id`` and ``spec``. A former failure of it
+        is forgotten.
+        """
         sealed = {**record, "format": FORMAT}
         sealed["sha256"] = digest(sealed)
         self.write_json(self.path(record["id"]), sealed)
@@ -194,5 +207,8 @@ class Store:
             if not path.is_file():
                 bad.append(f"{path}: missing; delete {self.path(record['id'])} and run again")
             elif hashlib.sha256(path.read_bytes()).hexdigest() != picture["sha256"]:
-                bad.append(f"{path}: changed since it was written; delete {self.path(record['id'])} and run again")
+                bad.append(
+                    f"{path}: changed since it was written; delete {self.path(record['id'])} and"
+                    " run again"
+                )
         return bad

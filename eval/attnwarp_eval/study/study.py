@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene
 
 PROTOCOLS = {"calibration": 1, "depth": 1, "warp": 1, "fit": 1, "timing": 1, "sensitivity": 1}
-"""Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get new ids."""
+"""Version of each probe's protocol. Raise one when its numbers change meaning: its cells then get
+new ids.
+"""
 
 ProbeName = Literal["calibration", "depth", "warp", "fit", "timing", "sensitivity"]
 
@@ -40,16 +42,24 @@ class Study(Part):
     description: str = ""
     size: Annotated[int, Field(ge=16, le=4096)] = 512
     scenes: Annotated[list[str], Field(min_length=1)]
-    views: list[str] = Field(default_factory=list, description="target views by name; all of them if empty")
+    views: list[str] = Field(
+        default_factory=list, description="target views by name; all of them if empty"
+    )
     seeds: Annotated[list[int], Field(min_length=1)] = Field(default_factory=lambda: [0])
     spp: Annotated[int, Field(ge=1)] = 16
-    feature_sizes: list[int] = Field(default_factory=list, description="image size, 1/8 and 1/16 of it if left out")
+    feature_sizes: list[int] = Field(
+        default_factory=list, description="image size, 1/8 and 1/16 of it if left out"
+    )
     feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
     timing_rounds: Annotated[int, Field(ge=3)] = 15
     splats: Splats = Splats()
     fit: Fits = Fits()
-    encoders: dict[Kind, str] = Field(default_factory=dict, description="by kind, as load_encoder takes them")
-    edits: list[str] = Field(default_factory=list, description="edits by name; all of a scene's if empty")
+    encoders: dict[Kind, str] = Field(
+        default_factory=dict, description="by kind, as load_encoder takes them"
+    )
+    edits: list[str] = Field(
+        default_factory=list, description="edits by name; all of a scene's if empty"
+    )
     variants: dict[str, Variant] = Field(default_factory=dict)
     probes: Annotated[dict[ProbeName, list[str]], Field(min_length=1)]
     ablations: list[Ablation] = Field(default_factory=list)
@@ -63,7 +73,12 @@ class Study(Part):
         size = data.get("size", 512) if isinstance(data, dict) else None
         if isinstance(size, int) and not data.get("feature_sizes"):
             # The latent sizes of a diffusion UNet's first two levels of attention.
-            return {**data, "feature_sizes": sorted({size, max(1, size // 8), max(1, size // 16)}, reverse=True)}
+            return {
+                **data,
+                "feature_sizes": sorted(
+                    {size, max(1, size // 8), max(1, size // 16)}, reverse=True
+                ),
+            }
         return data
 
     @model_validator(mode="after")
@@ -73,7 +88,8 @@ class Study(Part):
             raise ValueError(f"variants: got none, expected at least one for probes.{needed[0]}")
         if self.probes.get("sensitivity"):
             raise ValueError(
-                "probes.sensitivity: got variants, expected []; it judges metrics, which no variant changes"
+                "probes.sensitivity: got variants, expected []; it judges metrics, which no variant"
+                " changes"
             )
         for name, variant in self.variants.items():
             try:
@@ -85,25 +101,40 @@ class Study(Part):
                 raise ValueError(f"variants.{name}.splats: {explain(error, Splats)}") from None
             except ValueError as error:
                 raise ValueError(f"variants.{name}: {error}") from None
-        used: list[tuple[str, list[str], str | None]] = [(f"probes.{p}", v, None) for p, v in self.probes.items()]
-        used += [(f"ablations.{i}", [a.baseline, *a.variants], a.probe) for i, a in enumerate(self.ablations)]
+        used: list[tuple[str, list[str], str | None]] = [
+            (f"probes.{p}", v, None) for p, v in self.probes.items()
+        ]
+        used += [
+            (f"ablations.{i}", [a.baseline, *a.variants], a.probe)
+            for i, a in enumerate(self.ablations)
+        ]
         used += [(f"fronts.{i}", f.variants, f.probe) for i, f in enumerate(self.fronts)]
-        used += [("pictures.variants", self.pictures.variants, None), ("yaw.variants", self.yaw.variants, "warp")]
+        used += [
+            ("pictures.variants", self.pictures.variants, None),
+            ("yaw.variants", self.yaw.variants, "warp"),
+        ]
         for where, names, probe in used:
             for name in names:
                 if name not in self.variants:
-                    raise ValueError(f"{where}: no variant {name!r}{_did_you_mean(name, self.variants)}")
+                    raise ValueError(
+                        f"{where}: no variant {name!r}{_did_you_mean(name, self.variants)}"
+                    )
                 # A row that is never measured would vanish from its table without a word.
                 if probe is not None and name not in self.probes.get(probe, []):  # type: ignore[call-overload]
                     raise ValueError(f"{where}: {name!r} is not measured; add it to probes.{probe}")
         for name in self.probes.get("timing", []):
             if self.variants[name].geometry != "splats":
-                raise ValueError(f"probes.timing: {name!r} renders nothing, so there is no time to take; leave it out")
+                raise ValueError(
+                    f"probes.timing: {name!r} renders nothing, so there is no time to take; leave"
+                    " it out"
+                )
         self._metrics_are_known()
         self._encoders_are_known()
         for size in self.feature_sizes:
             if not 1 <= size <= self.size:
-                raise ValueError(f"feature_sizes: got {size}, expected 1 to {self.size}, the image size")
+                raise ValueError(
+                    f"feature_sizes: got {size}, expected 1 to {self.size}, the image size"
+                )
         for name, values in (
             ("scenes", self.scenes),
             ("seeds", self.seeds),
@@ -123,7 +154,9 @@ class Study(Part):
             except KeyError:
                 raise ValueError(f"fronts.{i}.metric: no metric {front.metric!r}") from None
             if direction != "lower":
-                raise ValueError(f"fronts.{i}.metric: {front.metric!r} is not one of which less is better")
+                raise ValueError(
+                    f"fronts.{i}.metric: {front.metric!r} is not one of which less is better"
+                )
 
     def _encoders_are_known(self) -> None:
         from attnwarp.encoders import kind_of
@@ -164,7 +197,15 @@ class Study(Part):
             # The instrument is judged in every run, whatever else it is used for.
             own = self._spec(scene, views, "calibration", Variant(), self.seeds[0])
             shown = tuple(v for v in self.pictures.views if v in views)
-            cell = Cell(own, scene_name, "calibration", "calibration", self.seeds[0], ("calibration",), shown)
+            cell = Cell(
+                own,
+                scene_name,
+                "calibration",
+                "calibration",
+                self.seeds[0],
+                ("calibration",),
+                shown,
+            )
             found[cell.id] = cell
             for probe, names in self.probes.items():
                 if probe == "calibration":
@@ -172,13 +213,26 @@ class Study(Part):
                 if probe == "sensitivity":
                     for seed in self.seeds:
                         spec = self._sensitivity(scene, views, identities, seed)
-                        cell = Cell(spec, scene_name, "metrics", probe, seed, ("metrics",), encoders=self._by_kind())
+                        cell = Cell(
+                            spec,
+                            scene_name,
+                            "metrics",
+                            probe,
+                            seed,
+                            ("metrics",),
+                            encoders=self._by_kind(),
+                        )
                         found[cell.id] = cell
                     continue
                 if probe == "timing":
                     for seed in self.seeds:
                         cell = Cell(
-                            self._timing(scene, views, names, seed), scene_name, "all", probe, seed, tuple(names)
+                            self._timing(scene, views, names, seed),
+                            scene_name,
+                            "all",
+                            probe,
+                            seed,
+                            tuple(names),
                         )
                         found[cell.id] = cell
                     continue
@@ -202,8 +256,12 @@ class Study(Part):
                         found[cell.id] = cell
         return list(found.values())
 
-    def _timing(self, scene: Scene, views: list[str], names: list[str], seed: int) -> dict[str, Any]:
-        """One cell for all contestants: only times that were taken in turn, in one process, can be compared."""
+    def _timing(
+        self, scene: Scene, views: list[str], names: list[str], seed: int
+    ) -> dict[str, Any]:
+        """One cell for all contestants: only times that were taken in turn, in one process, can be
+        compared.
+        """
         return {
             "probe": "timing",
             "protocol": PROTOCOLS["timing"],
@@ -226,13 +284,17 @@ class Study(Part):
         known = list(dict.fromkeys(edit.name for scene in scenes.values() for edit in scene.edits))
         for name in self.edits:
             if name not in known:
-                raise StudyError(f"edits: no scene has an edit {name!r}{_did_you_mean(name, known)}")
+                raise StudyError(
+                    f"edits: no scene has an edit {name!r}{_did_you_mean(name, known)}"
+                )
 
     def _by_kind(self) -> dict[str, str]:
         return {kind: self.encoders[kind] for kind in sorted(self.encoders)}
 
     def _identities(self) -> dict[str, dict[str, Any]]:
-        """Which encoders these are, by their weights: other weights give other cells, another folder does not."""
+        """Which encoders these are, by their weights: other weights give other cells, another
+        folder does not.
+        """
         if "sensitivity" not in self.probes:
             return {}
         from attnwarp_eval.study.probes import sensitivity
@@ -248,19 +310,22 @@ class Study(Part):
     def _sensitivity(
         self, scene: Scene, views: list[str], encoders: dict[str, dict[str, Any]], seed: int
     ) -> dict[str, Any]:
-        """One cell for all metrics of a scene: they judge the same pictures, and their times are taken in turn."""
+        """One cell for all metrics of a scene: they judge the same pictures, and their times are
+        taken in turn.
+        """
         from attnwarp_eval.study.probes.sensitivity import tasks
 
         known = [edit.name for edit in scene.edits]
         if not known:
             raise StudyError(
-                f"probes.sensitivity: scene {scene.name!r} names no edits, so there is no right result; leave it out, or "
-                "give it some (docs/edits.md)"
+                f"probes.sensitivity: scene {scene.name!r} names no edits, so there is no right"
+                " result; leave it out, or give it some (docs/edits.md)"
             )
         asked = tasks(scene, self.edits)
         if not asked:
             raise StudyError(
-                f"edits: scene {scene.name!r} has none of {', '.join(self.edits)}; there are {', '.join(known)}"
+                f"edits: scene {scene.name!r} has none of {', '.join(self.edits)}; there are"
+                f" {', '.join(known)}"
             )
         return {
             "probe": "sensitivity",
@@ -279,11 +344,16 @@ class Study(Part):
         known = [c.name for c in scene.targets]
         for name in self.views:
             if name not in known:
-                raise StudyError(f"views: scene {scene.name!r} has no view {name!r}{_did_you_mean(name, known)}")
+                raise StudyError(
+                    f"views: scene {scene.name!r} has no view {name!r}{_did_you_mean(name, known)}"
+                )
         return [name for name in known if not self.views or name in self.views]
 
-    def _spec(self, scene: Scene, views: list[str], probe: ProbeName, variant: Variant, seed: int) -> dict[str, Any]:
-        """Only what decides the probe's numbers: two variants that differ elsewhere share a cell."""
+    def _spec(
+        self, scene: Scene, views: list[str], probe: ProbeName, variant: Variant, seed: int
+    ) -> dict[str, Any]:
+        """Only what decides the probe's numbers: two variants that differ elsewhere share a
+        cell."""
         settings = variant.settings().to_dict()
         spec: dict[str, Any] = {
             "probe": probe,
@@ -305,13 +375,23 @@ class Study(Part):
 
             how = {**self.fit.model_dump(), "settings": self.fit_of(variant, seed).to_dict()}
             depth = {name: settings[name] for name in ("depth", "depth_statistic")}
-            return {**spec, "views": held_out_names(self.fit.views), "spp": self.spp, "fit": how, **depth}
+            return {
+                **spec,
+                "views": held_out_names(self.fit.views),
+                "spp": self.spp,
+                "fit": how,
+                **depth,
+            }
         if variant.geometry == "truth":
             spec["geometry"] = "truth"
         else:
             spec["splats"] = self.splats_of(variant).model_dump()
         if probe == "depth":
-            return {**spec, "depth": settings["depth"], "depth_statistic": settings["depth_statistic"]}
+            return {
+                **spec,
+                "depth": settings["depth"],
+                "depth_statistic": settings["depth_statistic"],
+            }
         return {
             **spec,
             "spp": self.spp,
@@ -346,14 +426,17 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
     path = shipped.get(name_or_path, Path(name_or_path))
     if not path.is_file():
         raise StudyError(
-            f"{name_or_path}: no such study{_did_you_mean(name_or_path, shipped)}, or give a YAML file's path"
+            f"{name_or_path}: no such study{_did_you_mean(name_or_path, shipped)}, or give a YAML"
+            " file's path"
         )
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise StudyError(f"{path}: not YAML: {error}") from None
     if not isinstance(data, dict):
-        raise StudyError(f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}")
+        raise StudyError(
+            f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
+        )
     data.update({k: v for k, v in overrides.items() if v is not None})
     try:
         return Study.model_validate(data)
@@ -368,19 +451,24 @@ class _Loader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key.value!r} stands twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} stands twice", key.start_mark
+                )
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def explain(error: ValidationError, model: type[BaseModel] = Study) -> str:
-    """Pydantic's findings in one readable text: where, what was wrong, and the nearest known key."""
+    """Pydantic's findings in one readable text: where, what was wrong, and the nearest known
+    key."""
     lines = []
     for item in error.errors():
         where = ".".join(str(p) for p in item["loc"])
         message = str(item["msg"]).removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
-            message = f"unknown key{_did_you_mean(str(item['loc'][-1]), _known_keys(model, item['loc']))}"
+            message = (
+                f"unknown key{_did_you_mean(str(item['loc'][-1]), _known_keys(model, item['loc']))}"
+            )
         lines.append(f"{where}: {message}" if where else message)
     return "; ".join(lines)
 

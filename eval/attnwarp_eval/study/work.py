@@ -1,4 +1,6 @@
-"""What one cell computes. A probe is a function of the cell's spec and the world; the record is what it returns."""
+"""What one cell computes. A probe is a function of the cell's spec and the world; the record is
+what it returns.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,14 @@ from attnwarp.fit import FitSettings
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp.warp.correspondence import TAP_SPREAD
 from attnwarp.warp.settings import PRESETS, WarpSettings
-from attnwarp.warp.view import EXACT_DEPTH_TOLERANCE, Surface, WarpedView, render_surface, warp_surfaces, warp_view
+from attnwarp.warp.view import (
+    EXACT_DEPTH_TOLERANCE,
+    Surface,
+    WarpedView,
+    render_surface,
+    warp_surfaces,
+    warp_view,
+)
 from attnwarp_eval import metrics
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.effects.table import said_by
@@ -36,10 +45,15 @@ View = tuple[str, Figures, dict[str, Any]]
 """A target's name, its figures, and what its pictures are drawn from."""
 
 MITSUBA_TOLERANCE = 1e-4
-"""Of the distance: Mitsuba's positions are float32, so a point 10 m away is known to about 1e-6 of that."""
+"""Of the distance: Mitsuba's positions are float32, so a point 10 m away is known to about 1e-6 of
+that.
+"""
 
-EXACT = dataclasses.replace(PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)
-"""The corrected rules with the tolerances for exact depth: what the instrument is calibrated with."""
+EXACT = dataclasses.replace(
+    PRESETS["corrected"], depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD
+)
+"""The corrected rules with the tolerances for exact depth: what the instrument is calibrated
+with."""
 
 
 def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> dict[str, Any]:
@@ -54,8 +68,8 @@ def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> d
     Returns:
         The record for :meth:`attnwarp_eval.study.store.Store.write`.
     """
-    # Image-sized tensor operations gain little from threads and lose much when other processes want the cores; the
-    # renderer's own threads are counted apart.
+    # Image-sized tensor operations gain little from threads and lose much when other processes want
+    # the cores; the renderer's own threads are counted apart.
     torch.set_num_threads(1)
     set_thread_count(threads or len(os.sched_getaffinity(0)))
     meter = Meter()
@@ -63,7 +77,9 @@ def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> d
     with meter.stage("setup"):
         at = world(scene, spec["size"])
     if at.content_hash != spec["scene"]:
-        raise InputError(f"scene {scene!r} has changed since the run was planned; start the run again")
+        raise InputError(
+            f"scene {scene!r} has changed since the run was planned; start the run again"
+        )
     views, pictures = [], []
     curve: list[dict[str, Any]] = []
     rounds: dict[str, Any] = {}
@@ -76,9 +92,13 @@ def compute(cell: Cell, scene: str, root: Path, threads: int | None = None) -> d
     elif cell.probe == "sensitivity":
         found = _sensitivity(at, cell, meter, rounds)
     else:
-        found = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe](at, scene, spec, meter)
+        found = {"calibration": _calibration, "depth": _depth, "warp": _warp}[cell.probe](
+            at, scene, spec, meter
+        )
     for name, figures, shown in found:
-        views.append({"view": name, "yaw": at.yaw[name.rpartition("/")[2]], "metrics": _plain(figures)})
+        views.append(
+            {"view": name, "yaw": at.yaw[name.rpartition("/")[2]], "metrics": _plain(figures)}
+        )
         if name in cell.pictures:
             with meter.stage("pictures"):
                 pictures += _save_pictures(cell, name, at, shown, root)
@@ -109,7 +129,9 @@ def _plain(figures: Mapping[str, float]) -> dict[str, float | int | None]:
 
 
 def _calibration(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator[View]:
-    """The instrument judged by itself: the truth's own depth through the same warp, the exact mask against itself."""
+    """The instrument judged by itself: the truth's own depth through the same warp, the exact mask
+    against itself.
+    """
     size = spec["size"]
     for name in spec["views"]:
         with meter.stage("truth"):
@@ -119,14 +141,18 @@ def _calibration(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> I
         figures = _warp_figures(at, spec, name, view, meter)
         if name == spec["views"][0]:
             figures["calibration.mitsuba_agrees"] = _mitsuba_agrees(at, truth)
-        own = metrics.mask_error(truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge)
+        own = metrics.mask_error(
+            truth.visible, truth.label, truth.hits.valid, truth.behind, truth.edge
+        )
         figures |= {f"{key}.exact": value for key, value in own.items()}
         meter.count(pixels=size * size)
         yield name, figures, {"truth": truth, "view": view, "spp": spec["spp"]}
 
 
 def _mitsuba_agrees(at: World, truth: TwoView) -> float:
-    """Share of a view's pixels where Mitsuba's own ray tracer finds the same surface point, or none where there is none."""
+    """Share of a view's pixels where Mitsuba's own ray tracer finds the same surface point, or none
+    where there is none.
+    """
     from attnwarp_eval.truth.mitsuba import position_and_shape
 
     position, _ = position_and_shape(at.scene, truth.target)
@@ -178,12 +204,17 @@ def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator
             truth = at.pair(name, size)
             images: dict[str, Any] = {}
             if settings.photometric is not None:
-                images = {"source_image": at.image(at.source.name, spp), "target_image": at.image(name, spp)}
+                images = {
+                    "source_image": at.image(at.source.name, spp),
+                    "target_image": at.image(name, spp),
+                }
         with meter.view():
             if model is None:
                 view = _warp_truth(at, truth, settings, **images)
             else:
-                view = warp_view(model, at.source, target, settings, source_surface=source_surface, **images)
+                view = warp_view(
+                    model, at.source, target, settings, source_surface=source_surface, **images
+                )
             for layer in spec["feature_sizes"]:
                 view.at((layer, layer))
         meter.count(**view.target.counters)
@@ -191,16 +222,27 @@ def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator
         yield name, figures, {"truth": truth, "view": view, "spp": spp}
 
 
-def _fit(at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[dict[str, Any]]) -> Iterator[View]:
-    """Splats fitted to true pictures, on views held out: pictures, depth and normals; and the curve of the fit.
+def _fit(
+    at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[dict[str, Any]]
+) -> Iterator[View]:
+    """Splats fitted to true pictures, on views held out: pictures, depth and normals; and the curve
+    of the fit.
 
-    The fit lies below the run's folder, named by what decides it: cells that measure the same one in another way share
-    it, and one that was cut short is gone on with.
+    The fit lies below the run's folder, named by what decides it: cells that measure the same one
+    in another way share it, and one that was cut short is gone on with.
     """
     how = spec["fit"]
-    decisive = {**how, "scene": spec["scene"], "size": spec["size"], "spp": spec["spp"], "seed": spec["seed"]}
+    decisive = {
+        **how,
+        "scene": spec["scene"],
+        "size": spec["size"],
+        "spp": spec["spp"],
+        "seed": spec["seed"],
+    }
     with meter.stage("truth"):
-        cameras = {c.name: c for c in fitted.orbit(at.scene, how["views"]) if c.name in spec["views"]}
+        cameras = {
+            c.name: c for c in fitted.orbit(at.scene, how["views"]) if c.name in spec["views"]
+        }
     for camera in cameras.values():
         at.add(camera)
     # Its seconds go into the curve, which holds them for fits of earlier sittings as well.
@@ -217,7 +259,9 @@ def _fit(at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[
     )
     for record in result.history:
         known = {"loss": record.loss, "psnr": record.psnr, "psnr_pooled": record.psnr_pooled}
-        defined = _plain({name: math.nan if value is None else value for name, value in known.items()})
+        defined = _plain(
+            {name: math.nan if value is None else value for name, value in known.items()}
+        )
         curve.append({**dataclasses.asdict(record), **defined, "measures": _plain(record.measures)})
     meter.count(iterations=result.iteration, splats=len(result.gaussians))
     settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
@@ -232,21 +276,29 @@ def _fit(at: World, spec: dict[str, Any], meter: Meter, root: Path, curve: list[
         with meter.stage("checks"):
             figures = fitted.picture_error(np.asarray(surface.image), image)
             figures |= metrics.depth_error(
-                surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
+                surface.depth,
+                truth.depth,
+                normal=surface.normal,
+                true_normal=truth.normal,
+                edge=edge,
             )
         yield name, figures, {"fitted": surface, "hits": truth, "image": image}
 
 
-def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[str, list[list[float]]]:
-    """Seconds of every contestant in every round, taken in turn in one process, in an order drawn anew each round.
+def _timing(
+    at: World, scene: str, spec: dict[str, Any], meter: Meter
+) -> dict[str, list[list[float]]]:
+    """Seconds of every contestant in every round, taken in turn in one process, in an order drawn
+    anew each round.
 
-    The machine's speed drifts; contestants of one round see the same machine, so their ratio within a round can be
-    trusted where two separate means cannot. The first contestant runs twice a round: the ratio of it to itself is what
-    noise alone does here. A first round, which compiles and fills caches, is not kept.
+    The machine's speed drifts; contestants of one round see the same machine, so their ratio within
+    a round can be trusted where two separate means cannot. The first contestant runs twice a round:
+    the ratio of it to itself is what noise alone does here. A first round, which compiles and fills
+    caches, is not kept.
 
     Returns:
-        "render" (the target's surface) and "pair" (render, correspondence, mask, feature grids), each a list over
-        contestants, the first one's second run last, of seconds a round.
+        "render" (the target's surface) and "pair" (render, correspondence, mask, feature grids),
+        each a list over contestants, the first one's second run last, of seconds a round.
     """
     target = at.targets[spec["views"][0]]
     contestants = [
@@ -259,7 +311,9 @@ def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[s
     contestants.append(contestants[0])
     sources = [render_surface(model, at.source, settings) for model, settings in contestants]
     rng = np.random.default_rng(spec["seed"])
-    seconds: dict[str, list[list[float]]] = {stage: [[] for _ in contestants] for stage in ("render", "pair")}
+    seconds: dict[str, list[list[float]]] = {
+        stage: [[] for _ in contestants] for stage in ("render", "pair")
+    }
     for turn in range(spec["rounds"] + 1):
         for index in rng.permutation(len(contestants)):
             model, settings = contestants[index]
@@ -277,8 +331,12 @@ def _timing(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> dict[s
     return seconds
 
 
-def _sensitivity(at: World, cell: Cell, meter: Meter, seconds: dict[str, list[float]]) -> Iterator[View]:
-    """Every metric on right and on flawed results of the scene's edits. A view is named ``edit/view``."""
+def _sensitivity(
+    at: World, cell: Cell, meter: Meter, seconds: dict[str, list[float]]
+) -> Iterator[View]:
+    """Every metric on right and on flawed results of the scene's edits. A view is named
+    ``edit/view``.
+    """
     from attnwarp_eval.study.probes import sensitivity
 
     with meter.stage("setup"):
@@ -297,13 +355,21 @@ def _warp_truth(at: World, truth: TwoView, settings: WarpSettings, **images: Any
     )
 
 
-def _warp_figures(at: World, spec: dict[str, Any], name: str, view: WarpedView, meter: Meter) -> Figures:
-    """Endpoint error, feature error and mask scores of a warp, at image size and at every feature size."""
+def _warp_figures(
+    at: World, spec: dict[str, Any], name: str, view: WarpedView, meter: Meter
+) -> Figures:
+    """Endpoint error, feature error and mask scores of a warp, at image size and at every feature
+    size.
+    """
     size = spec["size"]
     with meter.stage("checks"):
         truth = at.pair(name, size)
-        figures = metrics.endpoint_error(view.correspondence.xy, truth.xy, truth.visible, truth.edge)
-        figures |= metrics.mask_error(view.mask, truth.label, truth.hits.valid, truth.behind, truth.edge)
+        figures = metrics.endpoint_error(
+            view.correspondence.xy, truth.xy, truth.visible, truth.edge
+        )
+        figures |= metrics.mask_error(
+            view.mask, truth.label, truth.hits.valid, truth.behind, truth.edge
+        )
     channels, seed = spec["feature_channels"], spec["seed"]
     for layer in spec["feature_sizes"]:
         with meter.stage("truth"):
@@ -319,12 +385,16 @@ def _warp_figures(at: World, spec: dict[str, Any], name: str, view: WarpedView, 
             if layer != size:
                 xy = at_layer.correspondence.xy
                 found |= metrics.endpoint_error(xy, truth.xy, truth.visible, image_px=size / layer)
-                found |= metrics.mask_error(at_layer.mask, truth.label, truth.hits.valid, truth.behind)
+                found |= metrics.mask_error(
+                    at_layer.mask, truth.label, truth.hits.valid, truth.behind
+                )
             figures |= metrics.at_size(found, layer)
     return figures
 
 
-def _save_pictures(cell: Cell, name: str, at: World, shown: dict[str, Any], root: Path) -> list[dict[str, str]]:
+def _save_pictures(
+    cell: Cell, name: str, at: World, shown: dict[str, Any], root: Path
+) -> list[dict[str, str]]:
     from attnwarp_eval.study import pictures
 
     found = pictures.of_fit(**shown) if "fitted" in shown else pictures.of(at, name, **shown)
@@ -332,5 +402,12 @@ def _save_pictures(cell: Cell, name: str, at: World, shown: dict[str, Any], root
     for what, data in found.items():
         path = Path("pictures") / cell.id[:16] / f"{name}-{what}.jpg"
         write_atomic(root / path, data)
-        saved.append({"view": name, "what": what, "path": str(path), "sha256": hashlib.sha256(data).hexdigest()})
+        saved.append(
+            {
+                "view": name,
+                "what": what,
+                "path": str(path),
+                "sha256": hashlib.sha256(data).hexdigest(),
+            }
+        )
     return saved

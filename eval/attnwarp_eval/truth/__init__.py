@@ -1,11 +1,21 @@
-"""What is exactly known about a scene: geometry by ray casting and closed forms, appearance by Mitsuba."""
+"""What is exactly known about a scene: geometry by ray casting and closed forms, appearance by
+Mitsuba.
+"""
 
 from __future__ import annotations
 
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.mitsuba import appearance, render_plan
 from attnwarp_eval.truth.raycast import Geometry, Hits, RayHits
-from attnwarp_eval.truth.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView, edge_band, two_view
+from attnwarp_eval.truth.two_view import (
+    AMBIGUOUS,
+    HIDDEN,
+    NONE,
+    VISIBLE,
+    TwoView,
+    edge_band,
+    two_view,
+)
 
 __all__ = [
     "AMBIGUOUS",

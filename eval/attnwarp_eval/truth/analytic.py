@@ -17,9 +17,9 @@ def nearest_hit(
 ) -> tuple[Array, npt.NDArray[np.int64]]:
     """First hit of each ray with any sphere or rectangle.
 
-    Spheres use the discriminant r^2 - |oc - (oc.d)d|^2, which keeps its digits for tangent and far-away rays where
-    b^2 - 4ac loses them (Haines et al., Ray Tracing Gems, ch. 7), and the near root as a product, c / (b + s), which
-    keeps them when the origin is close to the surface.
+    Spheres use the discriminant r^2 - |oc - (oc.d)d|^2, which keeps its digits for tangent and
+    far-away rays where b^2 - 4ac loses them (Haines et al., Ray Tracing Gems, ch. 7), and the near
+    root as a product, c / (b + s), which keeps them when the origin is close to the surface.
 
     Args:
         origins: (N, 3).

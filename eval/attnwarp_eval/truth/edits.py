@@ -21,8 +21,11 @@ def touched(scene: Scene, name: str, answer: str | None = None) -> list[int]:
     return [scene.object_names.index(change.object) for change in does.changes]
 
 
-def edit_mask(scene: Scene, name: str, hits: Hits, answer: str | None = None) -> npt.NDArray[np.bool_]:
-    """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the light.
+def edit_mask(
+    scene: Scene, name: str, hits: Hits, answer: str | None = None
+) -> npt.NDArray[np.bool_]:
+    """(H, W) bool: pixels of a view that show an edited object; all of them for an edit of the
+    light.
 
     Args:
         hits: of the view, from :meth:`~attnwarp_eval.truth.Geometry.trace`.
@@ -39,7 +42,12 @@ def describe(scene: Scene) -> str:
         return f"{scene.name} names no edits"
     lines = [f"{scene.name}: {scene.title}"]
     for edit in scene.edits:
-        lines += ["", f"{edit.name}: {edit.instruction}", f"  from  {edit.source}", f"  to    {edit.target}"]
+        lines += [
+            "",
+            f"{edit.name}: {edit.instruction}",
+            f"  from  {edit.source}",
+            f"  to    {edit.target}",
+        ]
         for does in edit.answers or (edit,):
             what = [f"{change.object} ({', '.join(_kinds(change))})" for change in does.changes]
             if does.lights is not None:
@@ -62,14 +70,20 @@ def to_dict(scene: Scene) -> dict[str, Any]:
         "content": scene.content_hash,
         "edits": [
             {
-                "name": edit.name, "instruction": edit.instruction, "source": edit.source, "target": edit.target,
+                "name": edit.name,
+                "instruction": edit.instruction,
+                "source": edit.source,
+                "target": edit.target,
                 "ambiguous": edit.ambiguous,
                 "results": [
-                    {"answer": one.name if one else None, "target": one.target if one else edit.target,
-                     "content": scene.edited(edit.name, one.name if one else None).content_hash}
+                    {
+                        "answer": one.name if one else None,
+                        "target": one.target if one else edit.target,
+                        "content": scene.edited(edit.name, one.name if one else None).content_hash,
+                    }
                     for one in edit.answers or (None,)
                 ],
             }
             for edit in scene.edits
         ],
-    }  # fmt: skip
+    }

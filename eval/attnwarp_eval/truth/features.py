@@ -1,4 +1,6 @@
-"""A solid feature field: features that belong to the 3D point, so that the exact answer of every warp is known."""
+"""A solid feature field: features that belong to the 3D point, so that the exact answer of every
+warp is known.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,20 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SolidField:
-    """Band-limited functions of the 3D point: each channel a sum of sinusoids, zero mean, unit variance.
+    """Band-limited functions of the 3D point: each channel a sum of sinusoids, zero mean, unit
+    variance.
 
-    A feature pixel's value is the field at the surface point that the exact ray through the pixel's CENTRE hits, at
-    every feature size: it is a point sample, not a mean over the pixel.
+    A feature pixel's value is the field at the surface point that the exact ray through the pixel's
+    CENTRE hits, at every feature size: it is a point sample, not a mean over the pixel.
 
     Args:
         center: (3,) middle of the scene, world coordinates; subtracted in float64.
         extent: size of the scene in world units.
         channels: number of channels, C.
-        cycles: bandwidth: the highest spatial frequency, in cycles per ``extent``. At the default 4, a scene that fills
-            an image has wavelengths of at least 16 px on its 64 grid, where bilinear sampling at the worst place (half
-            way between two taps) errs by 1 - cos(pi/16) = 2 % of a channel's amplitude, and 8 % on the 32 grid.
+        cycles: bandwidth: the highest spatial frequency, in cycles per ``extent``. At the default
+            4, a scene that fills an image has wavelengths of at least 16 px on its 64 grid, where
+            bilinear sampling at the worst place (half way between two taps) errs by 1 - cos(pi/16)
+            = 2 % of a channel's amplitude, and 8 % on the 32 grid.
         terms: sinusoids a channel.
         seed: of the frequencies (uniform in the ball) and phases.
     """
@@ -76,8 +80,9 @@ class SolidField:
         """A feature map (C, h, w) from the surface points (h, w, 3) that a grid's central rays hit.
 
         Args:
-            background: value where there is no surface. The source's map takes a number, since a network has features
-                there too and bilinear taps reach across the outline; give NaN for the exact answer in the target.
+            background: value where there is no surface. The source's map takes a number, since a
+                network has features there too and bilinear taps reach across the outline; give NaN
+                for the exact answer in the target.
         """
         features = np.moveaxis(self(points), -1, 0)
         return np.where(np.isnan(features), background, features)

@@ -1,7 +1,9 @@
-"""Which of Mitsuba's variants renders on this machine: compiled by LLVM where that works, interpreted elsewhere.
+"""Which of Mitsuba's variants renders on this machine: compiled by LLVM where that works,
+interpreted elsewhere.
 
-``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster (docs/accuracy-and-time.md),
-but with some LLVMs (14 and 15) it ends the whole process instead of raising. So a child process tries it first.
+``llvm_ad_rgb`` compiles each scene's integrator to vector code and is several times faster
+(docs/accuracy-and-time.md), but with some LLVMs (14 and 15) it ends the whole process instead of
+raising. So a child process tries it first.
 """
 
 from __future__ import annotations
@@ -20,7 +22,9 @@ OLDEST = 16
 """LLVMs before this are not tried: 14 is refused by Dr.Jit and 15 aborts in its code generator."""
 
 TRIES = 3
-"""Most libraries that are tried: each costs a process start, and a machine with LLVMs that all fail is rare."""
+"""Most libraries that are tried: each costs a process start, and a machine with LLVMs that all fail
+is rare.
+"""
 
 PLACES = (
     "{prefix}/lib/libLLVM*",  # conda
@@ -32,8 +36,8 @@ PLACES = (
     "/opt/homebrew/opt/llvm*/lib/libLLVM*",
     "/usr/local/opt/llvm*/lib/libLLVM*",
 )
-"""Where distributions, conda and Homebrew put the library. Dr.Jit's own search takes the first name that it finds,
-which may be an old one beside a newer."""
+"""Where distributions, conda and Homebrew put the library. Dr.Jit's own search takes the first name
+that it finds, which may be an old one beside a newer."""
 
 PROBE = """
 try:
@@ -46,7 +50,8 @@ import numpy as np
 mi.set_variant("llvm_ad_rgb")
 pose = mi.ScalarTransform4f().look_at(origin=[0, 0, -4], target=[0, 0, 0], up=[0, 1, 0])
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3},
-    "ball": {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
+    "ball": {"type": "sphere", "bsdf": {
+        "type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
     "sky": {"type": "constant"}, "camera": {"type": "perspective", "fov": 10, "to_world": pose,
     "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}}})
 mean = float(np.array(mi.render(scene, spp=64))[..., :3].mean())
@@ -60,8 +65,8 @@ def variant() -> str:
     """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
 
     Asked once in the life of a process. ``ATTNWARP_MITSUBA`` names the variant and saves the try;
-    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. A library found here is put into
-    ``DRJIT_LIBLLVM_PATH``, where Dr.Jit and child processes find it.
+    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. A library found here is
+    put into ``DRJIT_LIBLLVM_PATH``, where Dr.Jit and child processes find it.
     """
     named = os.environ.get("ATTNWARP_MITSUBA")
     if named:
@@ -89,26 +94,37 @@ def libraries() -> list[str]:
 
 
 def version(path: str) -> tuple[int, ...] | None:
-    """What a library's file name says of its version: ``libLLVM-19.so``, ``libLLVM.so.19.1``, ``llvm-19/lib/libLLVM.so``.
+    """What a library's file name says of its version: ``libLLVM-19.so``, ``libLLVM.so.19.1``,
+    ``llvm-19/lib/libLLVM.so``.
 
     None for a name that is none of a shared library of LLVM, or that has no number.
     """
     name = Path(path).name
-    shared = re.fullmatch(r"libLLVM(?:-(\d+(?:\.\d+)*))?(?:\.so(?:\.(\d+(?:\.\d+)*))?|\.dylib)", name)
+    shared = re.fullmatch(
+        r"libLLVM(?:-(\d+(?:\.\d+)*))?(?:\.so(?:\.(\d+(?:\.\d+)*))?|\.dylib)", name
+    )
     if shared is None:
         return None
-    # libLLVM-14.0.6.so.1 ends in the number of its interface, so the number before .so counts first.
+    # libLLVM-14.0.6.so.1 ends in the number of its interface, so the number before .so counts
+    # first.
     folder = re.search(r"/llvm[-@]?(\d+)(?:\.\d+)*/", path)
     number = shared[1] or shared[2] or (folder[1] if folder else None)
     return tuple(int(part) for part in number.split(".")) if number else None
 
 
 def works(library: str | None) -> bool:
-    """Whether a child process rendered a known picture with ``library`` (None: whichever Dr.Jit finds) and lived."""
+    """Whether a child process rendered a known picture with ``library`` (None: whichever Dr.Jit
+    finds) and lived.
+    """
     environment = os.environ | ({"DRJIT_LIBLLVM_PATH": library} if library else {})
     try:
         tried = subprocess.run(
-            [sys.executable, "-c", PROBE], capture_output=True, text=True, timeout=60, check=False, env=environment
+            [sys.executable, "-c", PROBE],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+            env=environment,
         )
     except (OSError, subprocess.TimeoutExpired):
         return False

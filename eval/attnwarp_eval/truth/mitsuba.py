@@ -1,10 +1,12 @@
 """Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.plan` plans them.
 
-Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else ``scalar_rgb``, which works
+Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else
+``scalar_rgb``, which works
 everywhere: see :mod:`attnwarp_eval.truth.llvm`.
 
-Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64 first. Its cameras look
-along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1, -1, 1).
+Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64
+first. Its cameras look along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1,
+-1, 1).
 """
 
 from __future__ import annotations
@@ -49,10 +51,14 @@ TEXELS = 2048
 """Most texels along the longer side of a baked texture."""
 
 SKY_ROWS = 256
-"""Rows of the map that carries the sky's ramp; the ramp is linear in the sine of the elevation, so few would do."""
+"""Rows of the map that carries the sky's ramp; the ramp is linear in the sine of the elevation, so
+few would do.
+"""
 
 TEXEL_SIZE = 0.5
-"""Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the middle."""
+"""Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the
+middle.
+"""
 
 
 def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
@@ -64,8 +70,8 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
         seed: the same seed gives the same bits.
 
     Returns:
-        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel. Kept on disk, see
-        :mod:`attnwarp_eval.cache`.
+        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel.
+        Kept on disk, see :mod:`attnwarp_eval.cache`.
 
     Raises:
         ValueError: a camera that Mitsuba cannot express.
@@ -82,7 +88,11 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
         scene.world_hash,
         _texel(scene),
         # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
-        scene.spec.cameras.model_dump(mode="json", exclude={"size"}) if planned.lens or planned.media else None,
+        (
+            scene.spec.cameras.model_dump(mode="json", exclude={"size"})
+            if planned.lens or planned.media
+            else None
+        ),
         pose,
         planned.identity(),
         int(seed),
@@ -94,13 +104,16 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
     return stored["image"]
 
 
-def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None) -> Image:
-    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is kept.
+def render_plan(
+    scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None
+) -> Image:
+    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is
+    kept.
 
     Args:
         made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
-        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads add them to pixels
-            in any order, which shows in the last bits of float32.
+        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads
+            add them to pixels in any order, which shows in the last bits of float32.
     """
     _mitsuba(made_by or variant())
     total = _render_passes(scene, camera, plan, seed)
@@ -113,8 +126,9 @@ def render_plan(scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by:
 
 
 ATTEMPTS, OTHER_SEEDS = 4, 1_000_003
-"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the pixel is then rendered
-again with other seeds, which biases it by nothing that a rejected sample would not."""
+"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the
+pixel is then rendered again with other seeds, which biases it by nothing that a rejected sample
+would not."""
 
 
 def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
@@ -133,12 +147,21 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
         world, center, fog = _world(scene, step.lights, step.lamps, plan.media, step.beam)
         pass_seed = len(plan.passes) * int(seed) + number
         if step.first != "any":
-            total += step.sign * _part(scene, camera, plan, step, options, pass_seed, (world, center, fog))
+            total += step.sign * _part(
+                scene, camera, plan, step, options, pass_seed, (world, center, fog)
+            )
             continue
-        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to stratify.
+        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
+        # stratify.
         kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
         sensor = _sensor(
-            scene, camera, center, {"type": kind, "sample_count": step.spp}, world, plan, fog if plan.media else None
+            scene,
+            camera,
+            center,
+            {"type": kind, "sample_count": step.spp},
+            world,
+            plan,
+            fog if plan.media else None,
         )
         picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=pass_seed)
         total += step.sign * np.array(picture, dtype=np.float32)[..., :3]
@@ -154,10 +177,12 @@ def _part(
     seed: int,
     loaded: tuple[Any, Array, Any],
 ) -> Image:
-    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the others; zero elsewhere.
+    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the
+    others; zero elsewhere.
 
     Each camera ray gets a pixel of its own in a picture of
-    k x k cells a pixel, so that the index of the shape it met first tells which of the two it belongs to.
+    k x k cells a pixel, so that the index of the shape it met first tells which of the two it
+    belongs to.
     """
     mi = _mitsuba()
     world, center, fog = loaded
@@ -171,18 +196,26 @@ def _part(
     total = np.zeros((fine.height, fine.width, 3), dtype=np.float64)
     each = math.ceil(step.spp / k**2)
     for number in range(each):
-        sensor = _sensor(scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog)
-        picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1))
+        sensor = _sensor(
+            scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog
+        )
+        picture = np.array(
+            mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1)
+        )
         keep = smooth[np.round(picture[..., 3]).astype(np.int64)]
         total += np.where(keep[..., None], picture[..., :3], 0.0)
-    return (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
+    return (
+        (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
+    )
 
 
 def comparable(scene: Scene) -> str:
-    """The variant in which renderings of the source by different integrators can be held against each other.
+    """The variant in which renderings of the source by different integrators can be held against
+    each other.
 
-    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that depends on how an
-    integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on the scene alone.
+    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that
+    depends on how an integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on
+    the scene alone.
     """
     if variant() == SCALAR:
         return SCALAR
@@ -194,16 +227,20 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
     """What Mitsuba's own ray tracer hits at the pixel centres, to hold the exact geometry against.
 
     Returns:
-        position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is hit.
+        position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is
+            hit.
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
     mi = _mitsuba(variant())
     world, center, _ = _world(scene, (), False, False)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
-    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would lie nowhere.
+    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
+    # lie nowhere.
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
     sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None)
-    picture = np.array(mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64)
+    picture = np.array(
+        mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64
+    )
     shape = np.round(picture[..., 3]).astype(np.int64)
     position = np.where((shape > 0)[..., None], picture[..., :3] + center, np.nan)
     return position, _owner_of_number(scene, world)[shape]
@@ -212,7 +249,8 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
 def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
     """Object by the number that the AOV shape_index has for a shape; -1 for 0, which is none.
 
-    It is 1 + the place among the shapes in scalar_rgb, the place in a registry of the whole process in the others.
+    It is 1 + the place among the shapes in scalar_rgb, the place in a registry of the whole process
+    in the others.
     """
     mi = _mitsuba()
     shapes, owners = world.shapes(), _owners(scene)
@@ -220,7 +258,10 @@ def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
     if mi.variant() != SCALAR:
         import drjit
 
-        numbers = [int(np.array(drjit.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]) for shape in shapes]
+        numbers = [
+            int(np.array(drjit.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0])
+            for shape in shapes
+        ]
     table = np.full(max(numbers) + 1, -1, dtype=np.int64)
     # A fog's own box, which comes last, belongs to no object.
     table[numbers[: len(owners)]] = owners
@@ -249,15 +290,22 @@ def _mitsuba(name: str | None = None) -> Any:
 def _world(
     scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, narrow: bool = False
 ) -> tuple[Any, Array, Any]:
-    """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and the fog or None."""
+    """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and
+    the fog or None.
+    """
     mi = _mitsuba()
     texel = _texel(scene)
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
-    shone = {f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center) for k in lights}
+    shone = {
+        f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center)
+        for k in lights
+    }
     # Asked for or not: what is not there does not make another world.
     lamps = lamps and any(item.emission for item in scene.spec.objects)
-    media = media and (scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects))
+    media = media and (
+        scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects)
+    )
 
     def make() -> tuple[Any, Array, Any]:
         shapes: dict[str, Any] = {}
@@ -270,10 +318,17 @@ def _world(
             item = scene.spec.objects[owner]
             extra: dict[str, Any] = {}
             if lamps and item.emission:
-                extra["emitter"] = {"type": "area", "radiance": _rgb(item.emission.radiance, item.emission.color)}
+                extra["emitter"] = {
+                    "type": "area",
+                    "radiance": _rgb(item.emission.radiance, item.emission.color),
+                }
             if media and _interior(item):
                 extra["interior"] = _homogeneous(item.material.interior)
-            if fog is not None and isinstance(item.material, GlassMaterial) and _within(scene, owner, around):
+            if (
+                fog is not None
+                and isinstance(item.material, GlassMaterial)
+                and _within(scene, owner, around)
+            ):
                 # Light that leaves the glass is in the fog again.
                 extra["exterior"] = fog
             shapes[key] = mi.load_dict(form() | extra, optimize=False) if extra else shape
@@ -282,7 +337,12 @@ def _world(
             pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
             pose[:3, 3] = (around[0] + around[1]) / 2 - center
             shapes["medium"] = mi.load_dict(
-                {"type": "cube", "to_world": mi.ScalarTransform4f(pose), "bsdf": {"type": "null"}, "interior": fog}
+                {
+                    "type": "cube",
+                    "to_world": mi.ScalarTransform4f(pose),
+                    "bsdf": {"type": "null"},
+                    "interior": fog,
+                }
             )
         # optimize=False: the default merges shapes, after which their indices mean something else.
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
@@ -303,7 +363,11 @@ def fog_box(scene: Scene) -> tuple[Array, Array]:
         return middle - half, middle + half
     points = [corner for shape in scene.shapes() for corner in shape.bounds()]
     points += [camera.position for camera in scene.cameras]
-    points += [np.array(light.position) for light in scene.spec.lights if isinstance(light, PointSpec | SpotSpec)]
+    points += [
+        np.array(light.position)
+        for light in scene.spec.lights
+        if isinstance(light, PointSpec | SpotSpec)
+    ]
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     # A wall of fog in the very plane of a floor would be hit before or after it by chance.
     return low - 0.01 * np.max(high - low), high + 0.01 * np.max(high - low)
@@ -331,7 +395,9 @@ def _rgb(scale: float, color: str) -> dict[str, Any]:
 
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
-    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as loaded."""
+    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as
+    loaded.
+    """
     mi = _mitsuba(variant())
     everything = tuple(range(len(scene.spec.lights)))
     world, center, fog = _world(scene, everything, True, True)
@@ -339,7 +405,10 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
         (mi.variant(), scene.world_hash, _texel(scene)), lambda: _load_shapes(scene, _texel(scene))
     )
     names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}
-    parsed = [(where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n) for where, n in plugins]
+    parsed = [
+        (where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n)
+        for where, n in plugins
+    ]
     for k in everything:
         parsed += _plugins(f"lights[{k}]", _light(scene.spec.lights[k], center))
     for k, item in enumerate(scene.spec.objects):
@@ -350,9 +419,16 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
         parsed += _plugins("medium.interior", _homogeneous(scene.spec.medium))
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
     sensor = _sensor(scene, scene.source, center, middles, world, plan(scene, 1), fog)
-    parsed.append(("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective")))
-    loaded = [(names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]):], thing)
-              for where, thing in _walk(world)]  # fmt: skip
+    parsed.append(
+        ("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective"))
+    )
+    loaded = [
+        (
+            names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]) :],
+            thing,
+        )
+        for where, thing in _walk(world)
+    ]
     return parsed, loaded
 
 
@@ -366,7 +442,9 @@ def _plugins(where: str, form: Any) -> list[tuple[str, str]]:
 
 
 def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
-    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives it."""
+    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
+    it.
+    """
     mi = _mitsuba()
     found: list[tuple[str, Any]] = []
 
@@ -388,11 +466,15 @@ def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
 _loaded: dict[Any, Any] = {}
 
 KEPT = 12
-"""Loaded scenes and shapes that are kept: those of a plan with a caustic, a rendering of everything on, in two variants."""
+"""Loaded scenes and shapes that are kept: those of a plan with a caustic, a rendering of everything
+on, in two variants.
+"""
 
 
 def _kept(key: Any, make: Callable[[], Any]) -> Any:
-    """The value of ``make``, kept with the last few others: a scene's views come one after the other."""
+    """The value of ``make``, kept with the last few others: a scene's views come one after the
+    other.
+    """
     if key not in _loaded:
         while len(_loaded) >= KEPT:
             _loaded.pop(next(iter(_loaded)))
@@ -408,14 +490,18 @@ def forget() -> None:
 def _load_shapes(
     scene: Scene, texel: float
 ) -> tuple[dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]], Array, list[tuple[str, str]]]:
-    """Shapes that neither shine nor hold a medium: name -> (shape, object, what it is loaded from); origin; plugins."""
+    """Shapes that neither shine nor hold a medium: name -> (shape, object, what it is loaded from);
+    origin; plugins.
+    """
     mi = _mitsuba()
     bounds = np.stack([shape.bounds() for shape in scene.shapes()])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     out: dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]] = {}
     plugins: list[tuple[str, str]] = []
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
-        for (name, form), owner in zip(_shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True):
+        for (name, form), owner in zip(
+            _shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True
+        ):
             shape = mi.load_dict(form, optimize=False)
             plugins += _plugins(name, form)
             item = scene.spec.objects[owner]
@@ -442,7 +528,9 @@ def _owners(scene: Scene) -> list[int]:
     return [shape.object_id for shape in _faces(scene)]
 
 
-def _shapes(scene: Scene, center: Array, texel: float, folder: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+def _shapes(
+    scene: Scene, center: Array, texel: float, folder: Path
+) -> Iterator[tuple[str, dict[str, Any]]]:
     mi = _mitsuba()
     for index, shape in enumerate(_faces(scene)):
         item = scene.spec.objects[shape.object_id]
@@ -451,29 +539,46 @@ def _shapes(scene: Scene, center: Array, texel: float, folder: Path) -> Iterator
         def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
             color = albedo(texture, points.reshape(-1, 3)).reshape(points.shape).astype(np.float32)
             bitmap = mi.Bitmap(np.ascontiguousarray(color))
-            return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": "clamp"}
+            return {
+                "type": "bitmap",
+                "bitmap": bitmap,
+                "raw": True,
+                "filter_type": "bilinear",
+                "wrap_mode": "clamp",
+            }
 
         reflectance: dict[str, Any]
         if isinstance(shape, Sphere):
             columns = _texels(2 * math.pi * shape.radius, texel)
             rows = max(2, columns // 2)
-            # Mitsuba's u is the longitude from +x, v the angle from +z; a bitmap in memory starts at v = 0.
+            # Mitsuba's u is the longitude from +x, v the angle from +z; a bitmap in memory starts
+            # at v = 0.
             phi = (np.arange(columns) + 0.5) / columns * 2 * np.pi
             theta = ((np.arange(rows) + 0.5) / rows)[:, None] * np.pi
             outward = np.stack(
-                [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], axis=-1
+                [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi],
+                axis=-1,
             )
             reflectance = bake(shape.center + shape.radius * outward) | {"wrap_mode": "repeat"}
             form: dict[str, Any] = {
-                "type": "sphere", "center": (shape.center - center).tolist(), "radius": shape.radius,
-            }  # fmt: skip
+                "type": "sphere",
+                "center": (shape.center - center).tolist(),
+                "radius": shape.radius,
+            }
         elif isinstance(shape, Rectangle):
-            columns, rows = (_texels(2 * float(np.linalg.norm(edge)), texel) for edge in (shape.u, shape.v))
+            columns, rows = (
+                _texels(2 * float(np.linalg.norm(edge)), texel) for edge in (shape.u, shape.v)
+            )
             a = ((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :, None]
             b = ((np.arange(rows) + 0.5) / rows * 2 - 1)[:, None, None]
             reflectance = bake(shape.center + a * shape.u + b * shape.v)
             pose = np.eye(4)
-            pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = shape.u, shape.v, shape.normal, shape.center - center
+            pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = (
+                shape.u,
+                shape.v,
+                shape.normal,
+                shape.center - center,
+            )
             form = {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose)}
         else:
             file = folder / f"{index}.ply"
@@ -489,21 +594,50 @@ def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:
     inner: dict[str, Any]
     match material:
         case GlassMaterial():
-            kind = "thindielectric" if material.thin else "roughdielectric" if material.roughness else "dielectric"
-            rough = {"alpha": material.roughness, "distribution": "ggx"} if material.roughness else {}
+            kind = (
+                "thindielectric"
+                if material.thin
+                else "roughdielectric"
+                if material.roughness
+                else "dielectric"
+            )
+            rough = (
+                {"alpha": material.roughness, "distribution": "ggx"} if material.roughness else {}
+            )
             tint = {"specular_transmittance": _rgb(1.0, material.tint)}
             return {"type": kind, "int_ior": material.ior, "ext_ior": 1.0} | tint | rough
         case MirrorMaterial():
-            inner = {"type": "conductor", "material": "none", "specular_reflectance": _rgb(1.0, material.tint)}
+            inner = {
+                "type": "conductor",
+                "material": "none",
+                "specular_reflectance": _rgb(1.0, material.tint),
+            }
         case MetalMaterial():
-            inner = {"type": "conductor", "material": material.metal, "specular_reflectance": _rgb(1.0, material.tint)}
+            inner = {
+                "type": "conductor",
+                "material": material.metal,
+                "specular_reflectance": _rgb(1.0, material.tint),
+            }
             if material.roughness:
-                inner |= {"type": "roughconductor", "alpha": material.roughness, "distribution": "ggx"}
+                inner |= {
+                    "type": "roughconductor",
+                    "alpha": material.roughness,
+                    "distribution": "ggx",
+                }
         case PlasticMaterial():
-            inner = {"type": "roughplastic", "int_ior": material.ior, "ext_ior": 1.0, "alpha": material.roughness,
-                     "distribution": "ggx", "diffuse_reflectance": reflectance}  # fmt: skip
+            inner = {
+                "type": "roughplastic",
+                "int_ior": material.ior,
+                "ext_ior": 1.0,
+                "alpha": material.roughness,
+                "distribution": "ggx",
+                "diffuse_reflectance": reflectance,
+            }
         case _:
-            inner = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0} if item.emission else reflectance}
+            inner = {
+                "type": "diffuse",
+                "reflectance": {"type": "rgb", "value": 0.0} if item.emission else reflectance,
+            }
     # Two-sided, since splats and warps know no back faces either.
     return {"type": "twosided", "bsdf": inner}
 
@@ -532,20 +666,22 @@ def _files() -> tempfile.TemporaryDirectory[str]:
 
 
 NEEDLE = 2e-3
-"""A triangle whose shortest edge is below this share of its longest is a needle. Mitsuba interpolates vertex colours with
-barycentric coordinates found anew in float32, whose denominator falls with the square of this share: 3 % wrong here, and
-NaN or any number at 3e-4."""
+"""A triangle whose shortest edge is below this share of its longest is a needle. Mitsuba
+interpolates vertex colours with barycentric coordinates found anew in float32, whose denominator
+falls with the square of this share: 3 % wrong here, and NaN or any number at 3e-4."""
 
 
 def without_needles(vertices: Array, faces: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The faces with the short edge of every needle drawn together into one vertex, and those gone flat left out.
+    """The faces with the short edge of every needle drawn together into one vertex, and those gone
+    flat left out.
 
     Args:
         vertices: (V, 3).
         faces: (F, 3).
 
     Returns:
-        (G, 3), G <= F. Surfaces stay closed and move by at most the lengths of the edges that are gone.
+        (G, 3), G <= F. Surfaces stay closed and move by at most the lengths of the edges that are
+        gone.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -556,7 +692,9 @@ def without_needles(vertices: Array, faces: npt.NDArray[np.int64]) -> npt.NDArra
     if not short.any():
         return faces
     ends = edges[short]
-    joined = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(vertices), len(vertices)))
+    joined = coo_array(
+        (np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(vertices), len(vertices))
+    )
     _, group = connected_components(joined, directed=False)
     first = np.full(group.max() + 1, len(vertices), dtype=np.int64)
     np.minimum.at(first, group, np.arange(len(vertices)))
@@ -579,7 +717,11 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
     faces["n"], faces["v"] = 3, kept
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header\n"]
+    header += [
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
     with path.open("wb") as file:
         file.write("\n".join(header).encode())
         file.write(np.concatenate(columns, axis=1).astype("<f4").tobytes())
@@ -628,8 +770,15 @@ def _beam(scene: Scene, light: int, center: Array) -> dict[str, Any]:
     if cone is None or not isinstance(said, PointSpec):
         raise ValueError(f"lights[{light}]: got a {said.type} without a beam upon smooth objects")
     axis, angle = cone
-    spot = SpotSpec(type="spot", position=said.position, target=tuple(np.array(said.position) + axis),
-                    intensity=said.intensity, color=said.color, cutoff=angle, beam=0.999 * angle)  # fmt: skip
+    spot = SpotSpec(
+        type="spot",
+        position=said.position,
+        target=tuple(np.array(said.position) + axis),
+        intensity=said.intensity,
+        color=said.color,
+        cutoff=angle,
+        beam=0.999 * angle,
+    )
     return _light(spot, center)
 
 
@@ -675,11 +824,13 @@ def _sensor(
         "sampler": sampling,
     }
     if plan.lens is not None:
-        off = max(abs(form.pop("principal_point_offset_x")), abs(form.pop("principal_point_offset_y")))
+        off = max(
+            abs(form.pop("principal_point_offset_x")), abs(form.pop("principal_point_offset_y"))
+        )
         if off > 1e-9:
             raise ValueError(
-                f"camera: got a principal point {off:.3g} image sizes off the middle, but a lens needs it there; "
-                "take away cameras.lens or centre the image"
+                f"camera: got a principal point {off:.3g} image sizes off the middle, but a lens"
+                " needs it there; take away cameras.lens or centre the image"
             )
         form |= {"type": "thinlens", "aperture_radius": plan.lens.aperture,
                  "focus_distance": plan.lens.focus or focus_distance(scene, camera)}  # fmt: skip
@@ -691,6 +842,8 @@ def _sensor(
 
 
 def focus_distance(scene: Scene, camera: Camera) -> float:
-    """How far along the optical axis the point lies that the cameras look at; the orbit's radius if it is behind."""
+    """How far along the optical axis the point lies that the cameras look at; the orbit's radius if
+    it is behind.
+    """
     depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])
     return depth if depth > 0 else scene.spec.cameras.radius

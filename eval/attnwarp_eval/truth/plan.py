@@ -1,6 +1,7 @@
 """The cheapest rendering that is faithful to a scene.
 
-:func:`plan` follows from what the scene file says, without loading anything. docs/effects.md has the reasons.
+:func:`plan` follows from what the scene file says, without loading anything. docs/effects.md has
+the reasons.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ Array = npt.NDArray[np.float64]
 Integrator = Literal["direct", "path", "volpath", "ptracer"]
 
 SMALL = 0.15
-"""A lamp counts as small when its radius is below this share of its distance from the glass. Paths from the camera find
-it by chance, about once in 4 / SMALL^2 = 180 tries, and the caustic comes out as single bright pixels."""
+"""A lamp counts as small when its radius is below this share of its distance from the glass. Paths
+from the camera find it by chance, about once in 4 / SMALL^2 = 180 tries, and the caustic comes out
+as single bright pixels."""
 
 ROULETTE = 5
 """Paths without a cap are ended at random from this many edges on; Mitsuba's own default."""
@@ -31,9 +33,18 @@ LIGHT_PATHS = 4
 """Light paths for each camera sample: from the light, most paths end where no camera looks."""
 
 DROPPABLE: tuple[Effect, ...] = (
-    "interreflection", "specular", "refraction", "medium", "subsurface", "caustics", "environment", "depth_of_field",
-)  # fmt: skip
-"""Effects that a plan can leave out. The others come free with any picture: what shades a point has its texture."""
+    "interreflection",
+    "specular",
+    "refraction",
+    "medium",
+    "subsurface",
+    "caustics",
+    "environment",
+    "depth_of_field",
+)
+"""Effects that a plan can leave out. The others come free with any picture: what shades a point has
+its texture.
+"""
 
 
 @dataclass(frozen=True)
@@ -46,11 +57,14 @@ class Pass:
         lamps: whether the objects with an ``emission`` shine in it.
         max_depth: longest path in edges from the camera; 2 is direct light, -1 has no end.
         rr_depth: edges after which paths are ended at random; above ``max_depth`` never.
-        emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit ("direct" only).
+        emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit
+            ("direct" only).
         spp: samples a pixel; for "ptracer" light paths a pixel.
-        first: which camera rays count. "any"; "smooth", those whose first surface is smooth glass, metal or a mirror, a
-            lamp, or none at all; or "rough", the others, which are also those that a ptracer pass makes.
-        beam: light only what lies in the direction of the smooth objects (a point light becomes a spot upon them).
+        first: which camera rays count. "any"; "smooth", those whose first surface is smooth glass,
+            metal or a mirror, a lamp, or none at all; or "rough", the others, which are also those
+            that a ptracer pass makes.
+        beam: light only what lies in the direction of the smooth objects (a point light becomes a
+            spot upon them).
         sign: -1 for a pass that is taken away.
     """
 
@@ -69,7 +83,9 @@ class Pass:
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens: radius and focus distance in scene units; ``focus`` None means what the cameras look at."""
+    """A thin lens: radius and focus distance in scene units; ``focus`` None means what the cameras
+    look at.
+    """
 
     aperture: float
     focus: float | None
@@ -93,7 +109,9 @@ class Plan:
 
     @property
     def integrator(self) -> str:
-        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" where nothing is rendered."""
+        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" where nothing is
+        rendered.
+        """
         return " + ".join(dict.fromkeys(step.integrator for step in self.passes)) or "raycast"
 
     @property
@@ -119,15 +137,20 @@ class Plan:
 
 
 def sampler(spp: int) -> str:
-    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would render more."""
+    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would
+    render more.
+    """
     rows = int(np.sqrt(spp))
     return "multijitter" if spp > 0 and rows * -(-spp // rows) == spp else "independent"
 
 
-# Planning ------------------------------------------------------------------------------------------------------------
+# Planning
+# --------------------------------------------------------------------------------------------------
 
 
-def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "geometry"] = "appearance") -> Plan:
+def plan(
+    scene: Scene, spp: int | None = None, *, want: Literal["appearance", "geometry"] = "appearance"
+) -> Plan:
     """The cheapest rendering that shows what ``scene`` calls for.
 
     Args:
@@ -139,7 +162,15 @@ def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "g
         SceneError: the scene pins, forbids or caps what it cannot.
     """
     if want == "geometry":
-        return Plan((), ("depth, normals, ids and visibility are cast with rays (Open3D, float64), without light",))
+        return Plan(
+            (),
+            (
+                (
+                    "depth, normals, ids and visibility are cast with rays (Open3D, float64),"
+                    " without light"
+                ),
+            ),
+        )
     wanted = scene.spec.appearance
     if spp is not None and spp < 1:
         raise ValueError(f"spp: got {spp}, expected at least 1")
@@ -168,11 +199,14 @@ def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "g
         return Plan(passes, tuple(reasons), media, optic)
 
     if media:
-        reasons.append(f"light passes through a medium ({found.get('medium') or found['subsurface']}): volpath")
+        reasons.append(
+            f"light passes through a medium ({found.get('medium') or found['subsurface']}): volpath"
+        )
         return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, roulette))
     if not {"specular", "glossy", "refraction"} & set(found):
         reasons.append(
-            "every material is diffuse and opaque: no path passes through glass or a medium, and none is specular"
+            "every material is diffuse and opaque: no path passes through glass or a medium, and"
+            " none is specular"
         )
     if depth != 2:
         reasons.append(
@@ -183,9 +217,13 @@ def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "g
         if small is None:
             return finish(Pass(everything, "path", depth, 1, 1, spp, lamps, roulette))
         reasons.append(
-            f"light of {small} is bent by {found['caustics'].split(',')[0]}: paths from the light find its caustic"
+            f"light of {small} is bent by {found['caustics'].split(',')[0]}: paths from the light"
+            " find its caustic"
         )
-        reasons.append("camera paths still make what is seen in mirrors and through glass, lamps, and the sky's light")
+        reasons.append(
+            "camera paths still make what is seen in mirrors and through glass, lamps, and the"
+            " sky's light"
+        )
         skies = tuple(k for k in everything if isinstance(lights[k], SkySpec))
         points = tuple(k for k in everything if beam(scene, k) is not None)
         rest = tuple(k for k in everything if k not in skies and k not in points)
@@ -196,51 +234,66 @@ def plan(scene: Scene, spp: int | None = None, *, want: Literal["appearance", "g
                 Pass(rest, "ptracer", depth, 1, 1, LIGHT_PATHS * spp, lamps, roulette),
             ]
         for k in points:
-            # Outside the beam no light meets anything smooth first, so that camera paths find all of it; inside, paths
-            # from the light do. Light adds up: all - beam (both by camera paths) + beam (by light paths).
+            # Outside the beam no light meets anything smooth first, so that camera paths find all
+            # of it; inside, paths from the light do. Light adds up: all - beam (both by camera
+            # paths) + beam (by light paths).
             passes += [
                 Pass((k,), "path", depth, 1, 1, spp, False, roulette),
                 Pass((k,), "path", depth, 1, 1, spp, False, roulette, "rough", True, -1),
                 Pass((k,), "ptracer", depth, 1, 1, LIGHT_PATHS * spp, False, roulette, "any", True),
             ]
         if points:
-            reasons.append("of a point light only the beam upon the smooth objects is followed from the light")
+            reasons.append(
+                "of a point light only the beam upon the smooth objects is followed from the light"
+            )
         if skies:
             passes.append(Pass(skies, "path", depth, 1, 1, spp, False, roulette))
         return finish(*passes)
 
-    reasons.append("the scene asks for one bounce: light sampled at each visible point is the whole sum")
+    reasons.append(
+        "the scene asks for one bounce: light sampled at each visible point is the whole sum"
+    )
     glossy = "glossy" in found
     passes = []
-    # One direction or one point is one sample: its own pass has no noise but that of the pixel's area.
+    # One direction or one point is one sample: its own pass has no noise but that of the pixel's
+    # area.
     exact = [k for k in everything if not isinstance(lights[k], SkySpec)]
     suns = [k for k in exact if lights[k].type == "sun"]
     for group in ([tuple(suns)] if suns else []) + [(k,) for k in exact if k not in suns]:
         passes.append(Pass(group, "direct", 2, 1, 0, spp))
         what = (
-            "the sun comes from one direction" if group == tuple(suns) else f"the {lights[group[0]].type} has no size"
+            "the sun comes from one direction"
+            if group == tuple(suns)
+            else f"the {lights[group[0]].type} has no size"
         )
         reasons.append(f"{what}, so its own pass has no noise but that of the pixel's area")
     skies = tuple(k for k in everything if k not in exact)
     if skies:
         passes.append(Pass(skies, "direct", 2, int(glossy), 1, spp))
-        reasons.append("the sky is smooth, so rays spread by the material leave only the noise of what covers it")
+        reasons.append(
+            "the sky is smooth, so rays spread by the material leave only the noise of what"
+            " covers it"
+        )
     if lamps:
         passes.append(Pass((), "direct", 2, 1, 1, spp, True))
-        reasons.append("lamps have a size: rays toward them and along the material, weighted against each other")
+        reasons.append(
+            "lamps have a size: rays toward them and along the material, weighted against each"
+            " other"
+        )
     return finish(*passes)
 
 
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
-    """What a renderer does that knows nothing of the scene: volpath for all lights at once, a lens where one is said.
+    """What a renderer does that knows nothing of the scene: volpath for all lights at once, a lens
+    where one is said.
 
-    Where a caustic is called for ptracer is added: volpath alone would miss it, so "full" would not be the truth.
-    Never volpathmis, which is biased under roulette.
+    Where a caustic is called for ptracer is added: volpath alone would miss it, so "full" would not
+    be the truth. Never volpathmis, which is biased under roulette.
 
     Args:
         spp: samples a pixel; the scene's own number if left out.
-        capped: keep the scene's own cap on bounces, which is part of what its truth means. Without it light is followed
-            until roulette ends it: what the cap saves.
+        capped: keep the scene's own cap on bounces, which is part of what its truth means. Without
+            it light is followed until roulette ends it: what the cap saves.
     """
     ours = plan(scene, spp)
     spp = spp or scene.spec.appearance.spp
@@ -270,44 +323,64 @@ def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
         ValueError: an effect that no plan can leave out, or that is not in this one.
     """
     if effect not in DROPPABLE:
-        raise ValueError(f"effect: got {effect!r}, expected one that a plan can leave out: {', '.join(DROPPABLE)}")
+        raise ValueError(
+            f"effect: got {effect!r}, expected one that a plan can leave out:"
+            f" {', '.join(DROPPABLE)}"
+        )
     passes = ours.passes
     match effect:
         case "interreflection" | "specular" | "refraction":
             passes = tuple(replace(step, max_depth=2) for step in passes)
         case "medium" | "subsurface":
-            passes = tuple(replace(s, integrator="path" if s.integrator == "volpath" else s.integrator) for s in passes)
+            passes = tuple(
+                replace(s, integrator="path" if s.integrator == "volpath" else s.integrator)
+                for s in passes
+            )
             return replace(ours, passes=passes, media=False)
         case "caustics":
             kept = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
             passes = tuple(replace(step, first="any") for step in kept)
         case "environment":
             skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
-            passes = tuple(replace(step, lights=tuple(k for k in step.lights if k not in skies)) for step in passes)
+            passes = tuple(
+                replace(step, lights=tuple(k for k in step.lights if k not in skies))
+                for step in passes
+            )
             passes = tuple(step for step in passes if step.lights or step.lamps)
         case "depth_of_field":
             return replace(ours, lens=None)
     if passes == ours.passes:
-        raise ValueError(f"effect: {effect!r} is not in this plan ({ours.integrator}), so it cannot be left out of it")
+        raise ValueError(
+            f"effect: {effect!r} is not in this plan ({ours.integrator}), so it cannot be left out"
+            " of it"
+        )
     return replace(ours, passes=passes)
 
 
 def convex(scene: Scene) -> bool:
-    """Whether a scene is a single convex surface, which never lights itself. Glass does: light passes through it."""
-    alone = len(scene.spec.objects) == 1 and not isinstance(scene.spec.objects[0].material, materials.GlassMaterial)
+    """Whether a scene is a single convex surface, which never lights itself. Glass does: light
+    passes through it.
+    """
+    alone = len(scene.spec.objects) == 1 and not isinstance(
+        scene.spec.objects[0].material, materials.GlassMaterial
+    )
     shapes = scene.shapes() if alone else []
     return len(shapes) == 1 and isinstance(shapes[0], Box | Rectangle | Sphere)
 
 
 def small_lights(scene: Scene) -> str | None:
-    """Names the lights too small to be met by chance through smooth glass or a mirror; None where there are none."""
+    """Names the lights too small to be met by chance through smooth glass or a mirror; None where
+    there are none.
+    """
     names: list[str] = [light.type for light in scene.spec.lights if light.type != "sky"]
     names += [f"object {scene.spec.objects[k].name!r}" for k in small_lamps(scene)]
     return ", ".join(names) or None
 
 
 def small_lamps(scene: Scene) -> list[int]:
-    """Indices of the objects that shine and are too small to be met by chance through smooth glass or a mirror."""
+    """Indices of the objects that shine and are too small to be met by chance through smooth glass
+    or a mirror.
+    """
     found_small: list[int] = []
     lamps = [k for k, item in enumerate(scene.spec.objects) if item.emission]
     if lamps:
@@ -318,7 +391,10 @@ def small_lamps(scene: Scene) -> list[int]:
                 boxes.setdefault(shape.object_id, []).append(shape.bounds())
         middle = {k: np.mean([b.mean(0) for b in found], axis=0) for k, found in boxes.items()}
         for k in lamps:
-            low, high = np.min([b[0] for b in boxes[k]], axis=0), np.max([b[1] for b in boxes[k]], axis=0)
+            low, high = (
+                np.min([b[0] for b in boxes[k]], axis=0),
+                np.max([b[1] for b in boxes[k]], axis=0),
+            )
             away = min(float(np.linalg.norm(middle[k] - middle[j])) for j in bent) if bent else 0.0
             if float(np.linalg.norm(high - low)) / 2 < SMALL * away:
                 found_small.append(k)
@@ -326,11 +402,14 @@ def small_lamps(scene: Scene) -> list[int]:
 
 
 BEAM_MARGIN = 1.05
-"""How much wider than the sphere about the smooth objects a beam upon them is; Mitsuba's spots fall off at their rim."""
+"""How much wider than the sphere about the smooth objects a beam upon them is; Mitsuba's spots fall
+off at their rim.
+"""
 
 
 def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
-    """The cone in which a point light sees all smooth objects: its axis (not unit) and half angle in degrees.
+    """The cone in which a point light sees all smooth objects: its axis (not unit) and half angle
+    in degrees.
 
     None for other lights, or where the cone would be wider than 60 degrees: then it saves little.
     """
@@ -348,10 +427,14 @@ def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
 
 
 def smooth_objects(scene: Scene) -> list[int]:
-    """Indices of the objects that reflect or refract without scattering: mirrors, polished metal, clear glass."""
+    """Indices of the objects that reflect or refract without scattering: mirrors, polished metal,
+    clear glass.
+    """
     kinds = materials.MirrorMaterial | materials.MetalMaterial | materials.GlassMaterial
     return [
         k
         for k, item in enumerate(scene.spec.objects)
-        if not item.emission and isinstance(item.material, kinds) and not getattr(item.material, "roughness", 0.0)
+        if not item.emission
+        and isinstance(item.material, kinds)
+        and not getattr(item.material, "roughness", 0.0)
     ]

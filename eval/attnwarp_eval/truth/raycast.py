@@ -1,9 +1,9 @@
 """Exact geometry: what each pixel's central ray hits, and which points a camera can see.
 
-Triangles go through Open3D (Embree, float32) and the hit is then put on the plane of its triangle in float64;
-spheres and rectangles are closed forms in float64 throughout. Before any float32 number is made the scene is moved
-to the middle of its bounding box and scaled to unit size, both in float64, so that neither the scene's place nor its
-unit changes an answer.
+Triangles go through Open3D (Embree, float32) and the hit is then put on the plane of its triangle
+in float64; spheres and rectangles are closed forms in float64 throughout. Before any float32 number
+is made the scene is moved to the middle of its bounding box and scaled to unit size, both in
+float64, so that neither the scene's place nor its unit changes an answer.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 REACH_TOLERANCE = 1e-5
-"""A ray from an eye to a point reaches it when its first hit is at 1 +- this of the way. Open3D's own hits are off by
-up to 1.6e-5 of the scene, after refinement by far less; surfaces closer together than this along a ray count as one."""
+"""A ray from an eye to a point reaches it when its first hit is at 1 +- this of the way. Open3D's
+own hits are off by up to 1.6e-5 of the scene, after refinement by far less; surfaces closer
+together than this along a ray count as one."""
 
 REFINEMENT_LIMIT = 1e-3
-"""Refinement may move a hit by this share of its distance. More happens only where the plane is seen edge on, and there
-Open3D's own answer is the better one."""
+"""Refinement may move a hit by this share of its distance. More happens only where the plane is
+seen edge on, and there Open3D's own answer is the better one."""
 
 MISS = 0xFFFFFFFF  # Open3D's INVALID_ID
 
@@ -62,8 +63,10 @@ class Hits:
     Attributes:
         depth: (H, W) float64 z along the optical axis; NaN where nothing is hit.
         point: (H, W, 3) world coordinates; NaN where nothing is hit.
-        normal: (H, W, 3) unit geometric normal in world axes, facing the camera; NaN where nothing is hit.
-        cosine: (H, W) of the angle between that normal and the ray, in (0, 1]; NaN where nothing is hit.
+        normal: (H, W, 3) unit geometric normal in world axes, facing the camera; NaN where nothing
+            is hit.
+        cosine: (H, W) of the angle between that normal and the ray, in (0, 1]; NaN where nothing is
+            hit.
         object_id: (H, W) int32 index of the object in the scene, -1 where nothing is hit.
         primitive_id: (H, W) int64, -1 where nothing is hit.
         valid: (H, W) bool.
@@ -100,14 +103,23 @@ class Geometry:
 
         spheres = [s for s in shapes if isinstance(s, Sphere)]
         rectangles = [s for s in shapes if isinstance(s, Rectangle)]
-        meshes: list[Mesh] = [s.mesh() if isinstance(s, Box) else s for s in shapes if isinstance(s, Box | Mesh)]
-        self._spheres = np.array([[*self._local(s.center), s.radius / self.extent] for s in spheres]).reshape(-1, 4)
+        meshes: list[Mesh] = [
+            s.mesh() if isinstance(s, Box) else s for s in shapes if isinstance(s, Box | Mesh)
+        ]
+        self._spheres = np.array(
+            [[*self._local(s.center), s.radius / self.extent] for s in spheres]
+        ).reshape(-1, 4)
         self._rectangles = np.array(
-            [[*self._local(s.center), *(s.u / self.extent), *(s.v / self.extent), *s.normal] for s in rectangles]
+            [
+                [*self._local(s.center), *(s.u / self.extent), *(s.v / self.extent), *s.normal]
+                for s in rectangles
+            ]
         ).reshape(-1, 12)
         self._tint: Array | None = None
         if any(mesh.tint is not None for mesh in meshes):
-            self._tint = np.concatenate([np.ones_like(m.vertices) if m.tint is None else m.tint for m in meshes])
+            self._tint = np.concatenate(
+                [np.ones_like(m.vertices) if m.tint is None else m.tint for m in meshes]
+            )
         start, vertices, faces = 0, [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
         for mesh in meshes:
             vertices.append(self._local(mesh.vertices))
@@ -120,7 +132,12 @@ class Geometry:
         self._face_corner = corners[:, 0]
         self._object = np.concatenate(
             [np.full(len(m.faces), m.object_id, np.int32) for m in meshes]
-            + [np.array([s.object_id for s in spheres] + [s.object_id for s in rectangles], dtype=np.int32)]
+            + [
+                np.array(
+                    [s.object_id for s in spheres] + [s.object_id for s in rectangles],
+                    dtype=np.int32,
+                )
+            ]
         )
         self._embree = None
         if len(self._faces):
@@ -128,15 +145,20 @@ class Geometry:
             self._o3d = o3d
             self._embree = o3d.t.geometry.RaycastingScene(nthreads=0)
             self._embree.add_triangles(
-                o3d.core.Tensor(self._vertices.astype(np.float32)), o3d.core.Tensor(self._faces.astype(np.uint32))
+                o3d.core.Tensor(self._vertices.astype(np.float32)),
+                o3d.core.Tensor(self._faces.astype(np.uint32)),
             )
         self._traced: dict[bytes, Hits] = {}
 
     def flat_patches(self) -> tuple[Array, npt.NDArray[np.int64]]:
-        """Everything flat as triangles: (T, 3, 3) world corners and (T,) primitive ids; a rectangle is two of them."""
+        """Everything flat as triangles: (T, 3, 3) world corners and (T,) primitive ids; a rectangle
+        is two of them.
+        """
         q = self._rectangles
         c, u, v = q[:, None, 0:3], q[:, None, 3:6], q[:, None, 6:9]
-        halves = np.concatenate([np.concatenate([c - u - v, c + s * (u - v), c + u + v], axis=1) for s in (1, -1)])
+        halves = np.concatenate(
+            [np.concatenate([c - u - v, c + s * (u - v), c + u + v], axis=1) for s in (1, -1)]
+        )
         # The second half runs the other way round; turned, its normal agrees with the rectangle's.
         halves[len(q) :] = halves[len(q) :, ::-1]
         first = len(self._faces) + len(self._spheres)
@@ -147,14 +169,20 @@ class Geometry:
     def spheres(self) -> tuple[Array, Array, npt.NDArray[np.int64]]:
         """The spheres: (S, 3) world centres, (S,) radii, (S,) primitive ids."""
         ids = len(self._faces) + np.arange(len(self._spheres))
-        return self._spheres[:, :3] * self.extent + self.center, self._spheres[:, 3] * self.extent, ids
+        return (
+            self._spheres[:, :3] * self.extent + self.center,
+            self._spheres[:, 3] * self.extent,
+            ids,
+        )
 
     def object_of(self, primitive_id: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """(N,) index of the object that each primitive belongs to, -1 for -1."""
         return np.where(primitive_id >= 0, self._object[primitive_id], -1).astype(np.int32)
 
     def tint(self, points: Array, primitive_id: npt.NDArray[np.int64]) -> Array:
-        """(N, 3) vertex colours of the meshes (linear), interpolated at surface points; 1 where there are none."""
+        """(N, 3) vertex colours of the meshes (linear), interpolated at surface points; 1 where
+        there are none.
+        """
         tint = np.ones((len(points), 3))
         face = np.flatnonzero((primitive_id >= 0) & (primitive_id < len(self._faces)))
         if self._tint is None or not face.size:
@@ -175,7 +203,8 @@ class Geometry:
         return (np.asarray(points, dtype=np.float64) - self.center) / self.extent
 
     def trace(self, camera: Camera) -> Hits:
-        """First hits of the rays through the pixel centres. The last few cameras' answers are kept."""
+        """First hits of the rays through the pixel centres. The last few cameras' answers are
+        kept."""
         key = np.concatenate(
             [camera.K.ravel(), camera.world_to_camera.ravel(), [camera.width, camera.height]]
         ).tobytes()
@@ -196,7 +225,9 @@ class Geometry:
         unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
         normal = hits.normal.reshape(*shape, 3)
         return Hits(
-            depth=hits.t.reshape(shape),  # the directions have z = 1 in the camera, so t is the depth
+            depth=hits.t.reshape(
+                shape
+            ),  # the directions have z = 1 in the camera, so t is the depth
             point=hits.point.reshape(*shape, 3),
             normal=normal,
             cosine=-np.einsum("hwi,hwi->hw", normal, unit),
@@ -206,19 +237,22 @@ class Geometry:
         )
 
     def ties(self, camera: Camera) -> tuple[Mask, npt.NDArray[np.int32]]:
-        """Pixels whose first hit lies on surfaces of several objects at once, so that whose it is cannot be told.
+        """Pixels whose first hit lies on surfaces of several objects at once, so that whose it is
+        cannot be told.
 
-        Depth, points and correspondences of such pixels are as exact as any; their ``object_id`` is that of one of the
-        objects.
+        Depth, points and correspondences of such pixels are as exact as any; their ``object_id`` is
+        that of one of the objects.
 
         Returns:
             tied: (H, W) bool: another object's surface lies within ``REACH_TOLERANCE`` of the way.
-            lowest: (H, W) int32 the lowest object id there, the same whatever order the objects are traced in; -1 on a
-                miss.
+            lowest: (H, W) int32 the lowest object id there, the same whatever order the objects are
+                traced in; -1 on a miss.
         """
         hits = self.trace(camera)
         directions = (camera.directions() @ camera.rotation).reshape(-1, 3)
-        origins = np.ascontiguousarray(np.broadcast_to(self._local(camera.position), directions.shape))
+        origins = np.ascontiguousarray(
+            np.broadcast_to(self._local(camera.position), directions.shape)
+        )
         local = np.ascontiguousarray(directions / self.extent)
         first, owner = hits.depth.ravel(), hits.object_id.ravel()
         tied, lowest = np.zeros(len(first), dtype=bool), owner.copy()
@@ -230,8 +264,12 @@ class Geometry:
             np.minimum.at(lowest, ray[here], objects[here])
 
         every = np.arange(len(first))
-        closed = [(self._spheres[k : k + 1], self._rectangles[:0]) for k in range(len(self._spheres))]
-        closed += [(self._spheres[:0], self._rectangles[k : k + 1]) for k in range(len(self._rectangles))]
+        closed = [
+            (self._spheres[k : k + 1], self._rectangles[:0]) for k in range(len(self._spheres))
+        ]
+        closed += [
+            (self._spheres[:0], self._rectangles[k : k + 1]) for k in range(len(self._rectangles))
+        ]
         for k, (sphere, rectangle) in enumerate(closed):
             t, _ = nearest_hit(origins, local, sphere, rectangle)
             meet(every, t, np.full(len(t), self._object[len(self._faces) + k]))
@@ -242,9 +280,9 @@ class Geometry:
             face = found["primitive_ids"].numpy().astype(np.int64)
             normal = self._face_normal[face]
             with np.errstate(divide="ignore", invalid="ignore"):
-                t = np.einsum("ij,ij->i", normal, self._face_corner[face] - origins[ray]) / np.einsum(
-                    "ij,ij->i", normal, local[ray]
-                )
+                t = np.einsum(
+                    "ij,ij->i", normal, self._face_corner[face] - origins[ray]
+                ) / np.einsum("ij,ij->i", normal, local[ray])
             meet(ray, t, self._object[face])
         return tied.reshape(hits.depth.shape), lowest.reshape(hits.depth.shape)
 
@@ -273,7 +311,10 @@ class Geometry:
         """Nearest hits of rays in local coordinates: t (infinite on a miss) and primitive (-1)."""
         n_faces = len(self._faces)
         t, primitive = nearest_hit(
-            np.ascontiguousarray(origins), np.ascontiguousarray(directions), self._spheres, self._rectangles
+            np.ascontiguousarray(origins),
+            np.ascontiguousarray(directions),
+            self._spheres,
+            self._rectangles,
         )
         primitive = np.where(primitive >= 0, primitive + n_faces, -1)
         if self._embree is None:
@@ -290,7 +331,9 @@ class Geometry:
         primitive[hit[nearer]] = face[nearer]
         return t, primitive
 
-    def _refined(self, rough: Array, face: npt.NDArray[np.int64], origins: Array, directions: Array) -> Array:
+    def _refined(
+        self, rough: Array, face: npt.NDArray[np.int64], origins: Array, directions: Array
+    ) -> Array:
         """Where rays meet the planes of the triangles that Open3D found, in float64."""
         normal = self._face_normal[face]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -299,7 +342,8 @@ class Geometry:
             return np.where(np.abs(exact - rough) <= REFINEMENT_LIMIT * rough, exact, rough)
 
     def _normal(self, primitive: npt.NDArray[np.int64], points: Array) -> Array:
-        """(N, 3) unit geometric normals of either sign at ``points`` on ``primitive``; NaN for -1."""
+        """(N, 3) unit geometric normals of either sign at ``points`` on ``primitive``; NaN for
+        -1."""
         n_faces, n_spheres = len(self._faces), len(self._spheres)
         normal = np.full((len(primitive), 3), np.nan)
         face = (primitive >= 0) & (primitive < n_faces)
@@ -312,11 +356,14 @@ class Geometry:
         normal[flat] = self._rectangles[primitive[flat] - n_faces - n_spheres, 9:]
         return normal
 
-    def reached(self, eyes: npt.ArrayLike, points: npt.ArrayLike, primitive_id: npt.ArrayLike) -> Mask:
+    def reached(
+        self, eyes: npt.ArrayLike, points: npt.ArrayLike, primitive_id: npt.ArrayLike
+    ) -> Mask:
         """Whether the way from an eye to a surface point is free.
 
-        The ray is cast from the eye to the point and no offset is used anywhere: the way is free when the first hit
-        is the point's own primitive or lies at 1 +- ``REACH_TOLERANCE`` of the way.
+        The ray is cast from the eye to the point and no offset is used anywhere: the way is free
+        when the first hit is the point's own primitive or lies at 1 +- ``REACH_TOLERANCE`` of the
+        way.
 
         Args:
             eyes: (N, 3) or (3,) world coordinates.
@@ -332,9 +379,14 @@ class Geometry:
         return (primitive == np.asarray(primitive_id)) | (np.abs(t - 1) < REACH_TOLERANCE)
 
     def visible_from(
-        self, points: npt.ArrayLike, normals: npt.ArrayLike, primitive_id: npt.ArrayLike, eye: Camera | npt.ArrayLike
+        self,
+        points: npt.ArrayLike,
+        normals: npt.ArrayLike,
+        primitive_id: npt.ArrayLike,
+        eye: Camera | npt.ArrayLike,
     ) -> Mask:
-        """Whether surface points can be seen from ``eye``: reached, and on the side that ``normals`` point to.
+        """Whether surface points can be seen from ``eye``: reached, and on the side that
+        ``normals`` point to.
 
         Args:
             points, normals: (N, 3) world; the normal says which side of the surface is meant.

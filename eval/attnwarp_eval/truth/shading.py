@@ -1,11 +1,14 @@
-"""Direct light on diffuse surfaces, by ray casting: what a surface point looks like from anywhere that sees it.
+"""Direct light on diffuse surfaces, by ray casting: what a surface point looks like from anywhere
+that sees it.
 
 For a diffuse surface under the sun and the sky without interreflection the outgoing radiance is
-albedo / pi * (E_sun max(0, n.s) V + integral of the sky's radiance times cosine over the free part of the hemisphere),
-the same in every direction. Mitsuba's pictures of such scenes converge to it, which the tests check.
+albedo / pi * (E_sun max(0, n.s) V + integral of the sky's radiance times cosine over the free part
+of the hemisphere), the same in every direction. Mitsuba's pictures of such scenes converge to it,
+which the tests check.
 
-Points, spots and lamps add their own. What is not diffuse has no colour that is the same from everywhere: mirrors, metal
-and glass are given their tint as if it were paint, and block light; plastic is its base. Fog is not in it.
+Points, spots and lamps add their own. What is not diffuse has no colour that is the same from
+everywhere: mirrors, metal and glass are given their tint as if it were paint, and block light;
+plastic is its base. Fog is not in it.
 """
 
 from __future__ import annotations
@@ -33,15 +36,20 @@ def sun_direction(sun: SunSpec) -> Array:
 
 
 def sky_radiance(sky: SkySpec, directions: npt.ArrayLike) -> Array:
-    """(..., 3) linear radiance from unit ``directions`` (..., 3): horizon to zenith with the sine of the elevation.
+    """(..., 3) linear radiance from unit ``directions`` (..., 3): horizon to zenith with the sine
+    of the elevation.
 
     Below the horizon the sky keeps its horizon's colour.
     """
     z = np.clip(np.asarray(directions)[..., 2:3], 0, 1)
-    return sky.radiance * (np.array(linear_rgb(sky.horizon)) * (1 - z) + np.array(linear_rgb(sky.zenith)) * z)
+    return sky.radiance * (
+        np.array(linear_rgb(sky.horizon)) * (1 - z) + np.array(linear_rgb(sky.zenith)) * z
+    )
 
 
-def object_albedo(scene: Scene, geometry: Geometry, points: Array, primitive_id: npt.NDArray[np.int64]) -> Array:
+def object_albedo(
+    scene: Scene, geometry: Geometry, points: Array, primitive_id: npt.NDArray[np.int64]
+) -> Array:
     """(N, 3) linear albedo of surface points, from their objects' textures and tints."""
     objects = geometry.object_of(primitive_id)
     color = np.zeros((len(points), 3))
@@ -65,16 +73,21 @@ def emitted(scene: Scene, geometry: Geometry, primitive_id: npt.NDArray[np.int64
 
 
 def irradiance(
-    scene: Scene, geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int = 64
+    scene: Scene,
+    geometry: Geometry,
+    points: Array,
+    normals: Array,
+    primitive_id: npt.NDArray[np.int64],
+    rays: int = 64,
 ) -> Array:
     """(N, 3) direct irradiance at surface points, on the side that ``normals`` point to.
 
     Args:
         points, normals: (N, 3) world, normals unit.
         primitive_id: (N,) what each point lies on.
-        rays: directions toward the sky a point (a rotated Hammersley set, cosine-weighted). 64 differ from 1024 by
-            1 % in the median and 9 % at the 95th percentile (points in deep shade), without bias. As many points are
-            taken on each lamp.
+        rays: directions toward the sky a point (a rotated Hammersley set, cosine-weighted). 64
+            differ from 1024 by 1 % in the median and 9 % at the 95th percentile (points in deep
+            shade), without bias. As many points are taken on each lamp.
     """
     total = np.zeros((len(points), 3))
     for light in scene.spec.lights:
@@ -82,7 +95,8 @@ def irradiance(
             toward = sun_direction(light)
             cosine = normals @ toward
             lit = np.flatnonzero(cosine > 0)
-            # From outside the scene to the point, as everywhere: no offset from the surface is needed.
+            # From outside the scene to the point, as everywhere: no offset from the surface is
+            # needed.
             eyes = points[lit] + 2 * geometry.extent * toward
             lit = lit[geometry.reached(eyes, points[lit], primitive_id[lit])]
             total[lit] += cosine[lit, None] * light.irradiance * np.array(linear_rgb(light.color))
@@ -94,7 +108,11 @@ def irradiance(
 
 
 def _lone_irradiance(
-    light: PointSpec | SpotSpec, geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64]
+    light: PointSpec | SpotSpec,
+    geometry: Geometry,
+    points: Array,
+    normals: Array,
+    primitive_id: npt.NDArray[np.int64],
 ) -> Array:
     total = np.zeros((len(points), 3))
     away = np.array(light.position) - points
@@ -102,7 +120,9 @@ def _lone_irradiance(
     strength = np.einsum("ij,ij->i", normals, away) / distance**3 * light.intensity
     if isinstance(light, SpotSpec):
         axis = np.array(light.target) - np.array(light.position)
-        angle = np.degrees(np.arccos(np.clip(-(away @ axis) / distance / np.linalg.norm(axis), -1, 1)))
+        angle = np.degrees(
+            np.arccos(np.clip(-(away @ axis) / distance / np.linalg.norm(axis), -1, 1))
+        )
         beam = 0.75 * light.cutoff if light.beam is None else light.beam
         # Mitsuba's: full within the beam, then linear in the angle.
         strength = strength * np.clip((light.cutoff - angle) / max(light.cutoff - beam, 1e-9), 0, 1)
@@ -113,10 +133,17 @@ def _lone_irradiance(
 
 
 def _lamp_irradiance(
-    scene: Scene, geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int
+    scene: Scene,
+    geometry: Geometry,
+    points: Array,
+    normals: Array,
+    primitive_id: npt.NDArray[np.int64],
+    rays: int,
 ) -> Array:
     total = np.zeros((len(points), 3))
-    lamps = {k: item.emission for k, item in enumerate(scene.spec.objects) if item.emission is not None}
+    lamps = {
+        k: item.emission for k, item in enumerate(scene.spec.objects) if item.emission is not None
+    }
     if not lamps:
         return total
     for shape in scene.shapes():
@@ -131,7 +158,11 @@ def _lamp_irradiance(
             for eye, turned in zip(eyes, facing, strict=True):
                 way = eye - points
                 distance = np.linalg.norm(way, axis=1)
-                cosines = np.einsum("ij,ij->i", normals, way).clip(0) * (-(way @ turned)).clip(0) / distance**4
+                cosines = (
+                    np.einsum("ij,ij->i", normals, way).clip(0)
+                    * (-(way @ turned)).clip(0)
+                    / distance**4
+                )
                 lit = np.flatnonzero(cosines > 0)
                 lit = lit[geometry.reached(eye, points[lit], primitive_id[lit])]
                 total[lit] += share * cosines[lit, None] * np.array(linear_rgb(emission.color))
@@ -139,7 +170,9 @@ def _lamp_irradiance(
 
 
 def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array, float]:
-    """(count, 3) points spread evenly over a lamp, the directions they shine in, and the lamp's area."""
+    """(count, 3) points spread evenly over a lamp, the directions they shine in, and the lamp's
+    area.
+    """
     first = (np.arange(count) + 0.5) / count
     second = np.array([int(f"{k:032b}"[::-1], 2) / 2**32 for k in range(count)])
     if isinstance(shape, Rectangle):
@@ -163,7 +196,12 @@ def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array,
 
 
 def _sky_irradiance(
-    sky: SkySpec, geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int
+    sky: SkySpec,
+    geometry: Geometry,
+    points: Array,
+    normals: Array,
+    primitive_id: npt.NDArray[np.int64],
+    rays: int,
 ) -> Array:
     total = np.zeros((len(points), 3))
     for direction in hemisphere(normals, rays):
@@ -173,9 +211,14 @@ def _sky_irradiance(
 
 
 def buried(
-    geometry: Geometry, points: Array, normals: Array, primitive_id: npt.NDArray[np.int64], rays: int = 64
+    geometry: Geometry,
+    points: Array,
+    normals: Array,
+    primitive_id: npt.NDArray[np.int64],
+    rays: int = 64,
 ) -> npt.NDArray[np.bool_]:
-    """Which surface points no ray from outside the scene reaches: inside other objects, or where two of them touch.
+    """Which surface points no ray from outside the scene reaches: inside other objects, or where
+    two of them touch.
 
     Args:
         points, normals, primitive_id: as in :func:`irradiance`.
@@ -186,7 +229,8 @@ def buried(
     """
     left = np.arange(len(points))
     for start in range(0, rays, 8):
-        # Most points are out in the open: eight directions at a time leave few of them for the next eight.
+        # Most points are out in the open: eight directions at a time leave few of them for the next
+        # eight.
         asked = left
         open_ = np.zeros(len(asked), dtype=bool)
         for direction in hemisphere(normals[asked], 8, start * 0.0477):
@@ -199,9 +243,11 @@ def buried(
 
 
 def hemisphere(normals: Array, rays: int, turn: float = 0.0) -> Iterator[Array]:
-    """Cosine-weighted unit directions about each normal: ``rays`` arrays (N, 3) of a Hammersley set.
+    """Cosine-weighted unit directions about each normal: ``rays`` arrays (N, 3) of a Hammersley
+    set.
 
-    The set is turned by another angle for each point (a golden-ratio sequence), which makes its bias noise.
+    The set is turned by another angle for each point (a golden-ratio sequence), which makes its
+    bias noise.
     """
     tangent, bitangent = frames(normals)
     offset = (np.arange(len(normals)) * 0.6180339887498949 + turn) % 1.0

@@ -31,7 +31,8 @@ def describe(scene: Scene) -> str:
         lines.append(f"  {index:2} {item.name:16} {item.shape.type:10} {item.texture.type}")
     lines.append(f"lights: {', '.join(light.type for light in spec.lights)}")
     lines.append(
-        f"cameras ({1 + len(scene.targets)}), {scene.source.width} x {scene.source.height} px, units {spec.units}"
+        f"cameras ({1 + len(scene.targets)}), {scene.source.width} x {scene.source.height} px,"
+        f" units {spec.units}"
     )
     for camera in scene.cameras:
         x, y, z = camera.position
@@ -73,7 +74,11 @@ def render_views(
             progress(camera.name)
         image = to_srgb(appearance(scene, camera, spp=spp))
         hits = geometry.trace(camera)
-        pictures = {"image": image, "depth": depth_picture(hits.depth), "normal": normal_picture(hits.normal, camera)}
+        pictures = {
+            "image": image,
+            "depth": depth_picture(hits.depth),
+            "normal": normal_picture(hits.normal, camera),
+        }
         for what, picture in pictures.items():
             yield _write(out / f"{camera.name}-{what}.png", picture)
         rows.append(np.concatenate(list(pictures.values()), axis=1))
@@ -81,7 +86,9 @@ def render_views(
 
 
 def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
-    """Depth in colour, near bright, on a scale of 1 / z between the view's own extremes; grey where undefined."""
+    """Depth in colour, near bright, on a scale of 1 / z between the view's own extremes; grey where
+    undefined.
+    """
     import matplotlib
 
     near = 1 / depth
@@ -94,7 +101,9 @@ def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
 
 
 def normal_picture(normal: npt.NDArray[np.float64], camera: Camera) -> Image:
-    """Normals in the camera's axes (x right, y up, z toward the camera) as red, green, blue; grey where undefined."""
+    """Normals in the camera's axes (x right, y up, z toward the camera) as red, green, blue; grey
+    where undefined.
+    """
     local = normal @ camera.rotation.T * np.array([1, -1, -1])
     return np.where(np.isfinite(local), 0.5 + 0.5 * np.nan_to_num(local), 0.5)
 

@@ -1,4 +1,6 @@
-"""Exact correspondences between two views: where each target pixel lies in the source, and whether it shows there."""
+"""Exact correspondences between two views: where each target pixel lies in the source, and whether
+it shows there.
+"""
 
 from __future__ import annotations
 
@@ -28,20 +30,21 @@ class TwoView:
     Attributes:
         source, target: the cameras.
         hits: what the target's pixels show.
-        xy: (H, W, 2) float64 source pixel coordinates of the same surface point; NaN where there is no surface or it
-            is not in front of the source camera.
-        z_source: (H, W) float64 depth of the point in the source camera, of either sign; NaN where no surface.
+        xy: (H, W, 2) float64 source pixel coordinates of the same surface point; NaN where there is
+            no surface or it is not in front of the source camera.
+        z_source: (H, W) float64 depth of the point in the source camera, of either sign; NaN where
+            no surface.
         in_source_image: (H, W) bool: in front of the source camera and inside its image.
         label: (H, W) uint8.
-            0 NONE: no surface in the target pixel, or its point is outside the source image (or behind its camera);
-            ``hits.valid`` tells the two apart.
+            0 NONE: no surface in the target pixel, or its point is outside the source image (or
+            behind its camera); ``hits.valid`` tells the two apart.
             1 VISIBLE: inside the source image, on the side that faces it, and nothing in between.
             2 HIDDEN: inside the source image, but occluded or turned away.
-            3 AMBIGUOUS: there is a surface, but the four corners of the pixel do not get the same answer as its
-            centre (no surface, outside, visible or hidden), or the surface is seen at a cosine of incidence under
-            1e-3 by either camera.
-        edge: (H, W) bool: within 2 px of a depth or object edge of the target, or, where the point falls inside the
-            source image, within 2 px of one there.
+            3 AMBIGUOUS: there is a surface, but the four corners of the pixel do not get the same
+            answer as its centre (no surface, outside, visible or hidden), or the surface is seen at
+            a cosine of incidence under 1e-3 by either camera.
+        edge: (H, W) bool: within 2 px of a depth or object edge of the target, or, where the point
+            falls inside the source image, within 2 px of one there.
     """
 
     source: Camera
@@ -60,7 +63,9 @@ class TwoView:
 
     @property
     def outside(self) -> Mask:
-        """(H, W) bool: a surface, certainly not inside the source image (beside it, or behind the camera)."""
+        """(H, W) bool: a surface, certainly not inside the source image (beside it, or behind the
+        camera).
+        """
         return self.hits.valid & (self.label == NONE)
 
     @property
@@ -77,13 +82,20 @@ class TwoView:
 def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:
     """Exact correspondence and visibility of every target pixel in the source view.
 
-    No step has a length in it: scaling or moving the scene together with its cameras gives the same labels.
+    No step has a length in it: scaling or moving the scene together with its cameras gives the same
+    labels.
     """
     hits = geometry.trace(target)
     points = hits.point.reshape(-1, 3)
     xy, z, inside = _project(source, points)
     status, cosine = _status(
-        geometry, points, hits.normal.reshape(-1, 3), hits.primitive_id.ravel(), hits.valid.ravel(), inside, source
+        geometry,
+        points,
+        hits.normal.reshape(-1, 3),
+        hits.primitive_id.ravel(),
+        hits.valid.ravel(),
+        inside,
+        source,
     )
     shape = (target.height, target.width)
     status = status.reshape(shape)
@@ -103,17 +115,24 @@ def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:
     xy = xy.reshape(*shape, 2)
     source_edge = edge_band(geometry, source)
     column, row = (np.floor(xy[inside]).astype(np.int64)).T
-    edge[inside] |= source_edge[np.clip(row, 0, source.height - 1), np.clip(column, 0, source.width - 1)]
+    edge[inside] |= source_edge[
+        np.clip(row, 0, source.height - 1), np.clip(column, 0, source.width - 1)
+    ]
     return TwoView(source, target, hits, xy, z.reshape(shape), inside, label, edge)
 
 
-_OUTSIDE, _EMPTY = 4, 5  # statuses that become NONE; apart from each other when footprints are compared
+_OUTSIDE, _EMPTY = (
+    4,
+    5,
+)  # statuses that become NONE; apart from each other when footprints are compared
 
 
 def _project(source: Camera, points: Array) -> tuple[Array, Array, Mask]:
     with np.errstate(invalid="ignore"):
         xy, z = source.project(points)
-        inside = (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] <= source.width) & (xy[:, 1] <= source.height)
+        inside = (
+            (z > 0) & (xy >= 0).all(-1) & (xy[:, 0] <= source.width) & (xy[:, 1] <= source.height)
+        )
     return xy, z, inside
 
 
@@ -126,7 +145,9 @@ def _status(
     inside: Mask,
     source: Camera,
 ) -> tuple[npt.NDArray[np.uint8], Array]:
-    """(N,) status and (N,) cosine of incidence at the source (of either side; NaN outside its image)."""
+    """(N,) status and (N,) cosine of incidence at the source (of either side; NaN outside its
+    image).
+    """
     status = np.full(len(points), _EMPTY, dtype=np.uint8)
     status[valid] = _OUTSIDE
     ask = np.flatnonzero(inside)
@@ -134,26 +155,33 @@ def _status(
     status[ask] = np.where(seen, VISIBLE, HIDDEN)
     cosine = np.full(len(points), np.nan)
     to_source = source.position - points[ask]
-    cosine[ask] = np.abs(np.einsum("ij,ij->i", normals[ask], to_source)) / np.linalg.norm(to_source, axis=-1)
+    cosine[ask] = np.abs(np.einsum("ij,ij->i", normals[ask], to_source)) / np.linalg.norm(
+        to_source, axis=-1
+    )
     return status, cosine
 
 
 def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.NDArray[np.uint8]:
     """(H + 1, W + 1) status at the corners of the target's pixels."""
-    grid = np.stack(np.meshgrid(np.arange(target.width + 1.0), np.arange(target.height + 1.0)), axis=-1)
+    grid = np.stack(
+        np.meshgrid(np.arange(target.width + 1.0), np.arange(target.height + 1.0)), axis=-1
+    )
     directions = (target.directions(grid) @ target.rotation).reshape(-1, 3)
     hits = geometry.trace_rays(target.position, directions)
     _, _, inside = _project(source, hits.point)
-    status, _ = _status(geometry, hits.point, hits.normal, hits.primitive_id, hits.valid, inside, source)
+    status, _ = _status(
+        geometry, hits.point, hits.normal, hits.primitive_id, hits.valid, inside, source
+    )
     return status.reshape(target.height + 1, target.width + 1)
 
 
 def edges(geometry: Geometry, camera: Camera) -> Mask:
     """Pixels beside a depth or object edge.
 
-    Two neighbours (left and right, above and below) are parted by an edge when they show different objects, when
-    only one of them shows any, or when the tangent plane of neither comes within one pixel's footprint (z / f) of
-    the other's depth. The planes keep a slanted floor from being called an edge.
+    Two neighbours (left and right, above and below) are parted by an edge when they show different
+    objects, when only one of them shows any, or when the tangent plane of neither comes within one
+    pixel's footprint (z / f) of the other's depth. The planes keep a slanted floor from being
+    called an edge.
 
     Returns:
         (H, W) bool: pixels with such a neighbour.
@@ -169,7 +197,10 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
         b = (slice(None), slice(1, None)) if axis else (slice(1, None), slice(None))
         with np.errstate(divide="ignore", invalid="ignore"):
             errors = [
-                np.abs(reach[p] / np.einsum("hwi,hwi->hw", hits.normal[p], directions[q]) - hits.depth[q])
+                np.abs(
+                    reach[p] / np.einsum("hwi,hwi->hw", hits.normal[p], directions[q])
+                    - hits.depth[q]
+                )
                 for p, q in ((a, b), (b, a))
             ]
             tolerance = footprint * np.fmin(hits.depth[a], hits.depth[b])
@@ -181,11 +212,14 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 
 
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
-    """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it included."""
+    """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it
+    included.
+    """
     from scipy.ndimage import distance_transform_edt
 
     edge = edges(geometry, camera)
     if not edge.any():
         return edge
-    # The pixels beside an edge are half a pixel from it, so the band reaches width - 1 px from them, rounded up.
+    # The pixels beside an edge are half a pixel from it, so the band reaches width - 1 px from
+    # them, rounded up.
     return distance_transform_edt(~edge) <= np.ceil(width) - 1

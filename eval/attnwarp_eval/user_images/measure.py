@@ -1,6 +1,8 @@
-"""A person's own pictures: found and paired by name, read, and measured as the paper's table has it.
+"""A person's own pictures: found and paired by name, read, and measured as the paper's table has
+it.
 
-The figures themselves are pure functions in :mod:`attnwarp_eval.metrics`; files are touched here alone.
+The figures themselves are pure functions in :mod:`attnwarp_eval.metrics`; files are touched here
+alone.
 """
 
 from __future__ import annotations
@@ -23,7 +25,11 @@ Embedding = npt.NDArray[np.float64]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
-DEFAULTS: dict[Kind, str] = {"clip": "clip-small", "dino": "dino-small", "perceptual": "perceptual-small"}
+DEFAULTS: dict[Kind, str] = {
+    "clip": "clip-small",
+    "dino": "dino-small",
+    "perceptual": "perceptual-small",
+}
 """The encoders that are taken where none is named."""
 
 OFF = "none"
@@ -44,8 +50,8 @@ class Inputs:
         source_edit: the one edited picture that the others follow.
         prompt: what the edited scene should show.
         source_prompt: what the scene showed before.
-        masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual distance, black
-            does not.
+        masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
+            distance, black does not.
         background: sRGB in [0, 1] behind transparent pixels.
     """
 
@@ -126,13 +132,19 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
     _Figure("edit.psnr_mean", "Edit PSNR", ("renders", "edited")),
     _Figure("embedding.clip_similarity", "CLIP similarity", ("renders", "prompt"), "clip"),
     _Figure(
-        "embedding.clip_directional", "CLIP directional similarity",
-        ("renders", "originals", "prompt", "source_prompt"), "clip",
+        "embedding.clip_directional",
+        "CLIP directional similarity",
+        ("renders", "originals", "prompt", "source_prompt"),
+        "clip",
     ),
-    _Figure("embedding.dino_image", "DINO single-image similarity", ("renders", "source_edit"), "dino"),
-    _Figure("embedding.clip_image", "CLIP single-image similarity", ("renders", "source_edit"), "clip"),
+    _Figure(
+        "embedding.dino_image", "DINO single-image similarity", ("renders", "source_edit"), "dino"
+    ),
+    _Figure(
+        "embedding.clip_image", "CLIP single-image similarity", ("renders", "source_edit"), "clip"
+    ),
     _Figure("perceptual.distance", "Perceptual distance", ("renders", "edited"), "perceptual"),
-)  # fmt: skip
+)
 
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
@@ -149,20 +161,23 @@ def measure(
 
     Args:
         inputs: the pictures and prompts.
-        encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its figures out. A kind
-            that is not named, or named None, takes the bundled one, and its figures are left out where there is none.
+        encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
+            figures out. A kind that is not named, or named None, takes the bundled one, and its
+            figures are left out where there is none.
         device: "cpu" or "cuda", for real encoders.
         progress: told of each view.
 
     Raises:
-        InputError: nothing can be computed (the message says why, figure by figure), a picture that cannot be read, a
-            pair of different sizes, two files of one name.
+        InputError: nothing can be computed (the message says why, figure by figure), a picture that
+            cannot be read, a pair of different sizes, two files of one name.
     """
     done = Measured(inputs)
     for name in ("prompt", "source_prompt"):
         text = getattr(inputs, name)
         if text is not None and not text.strip():
-            raise InputError(f"{_option(name)}: is empty, expected a description of what the pictures show")
+            raise InputError(
+                f"{_option(name)}: is empty, expected a description of what the pictures show"
+            )
     folders = {
         name: pictures_in(getattr(inputs, name), _option(name))
         for name in ("renders", "edited", "originals", "masks")
@@ -173,7 +188,8 @@ def measure(
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     if not wanted:
         raise InputError(
-            "nothing can be computed: " + "; ".join(f"{title}: {why}" for title, why in done.missing.items())
+            "nothing can be computed: "
+            + "; ".join(f"{title}: {why}" for title, why in done.missing.items())
         )
     views = {figure: _views(figure, folders) for figure in wanted}
     _check_sizes(folders, views)
@@ -187,34 +203,40 @@ def measure(
 
 
 def pictures_in(folder: Path, option: str) -> dict[str, Path]:
-    """The picture files of a folder by their names without suffix, in the order that a person would put them.
+    """The picture files of a folder by their names without suffix, in the order that a person would
+    put them.
 
     Raises:
-        InputError: no such folder, no picture in it, or two files that differ in their suffix alone.
+        InputError: no such folder, no picture in it, or two files that differ in their suffix
+            alone.
     """
     if not folder.is_dir():
-        raise InputError(f"{option}: {folder} is no folder; name the folder that holds the pictures")
+        raise InputError(
+            f"{option}: {folder} is no folder; name the folder that holds the pictures"
+        )
     found: dict[str, Path] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural(p.name)):
         if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
         if path.stem in found:
             raise InputError(
-                f"{option}: {found[path.stem]} and {path.name} have one name; pictures are paired by their names without "
-                "the suffix, so remove or rename one"
+                f"{option}: {found[path.stem]} and {path.name} have one name; pictures are paired"
+                " by their names without the suffix, so remove or rename one"
             )
         found[path.stem] = path
     if not found:
-        raise InputError(f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}")
+        raise InputError(
+            f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}"
+        )
     return found
 
 
 def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> Picture:
     """(H, W, 3) float32 sRGB in [0, 1].
 
-    8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent pixels are laid
-    over ``background``. Pixels are taken as they lie in the file: a tag that asks for a turned picture is not followed,
-    since renders have none.
+    8 and 16 bits are divided by their largest value; grey becomes three equal channels; transparent
+    pixels are laid over ``background``. Pixels are taken as they lie in the file: a tag that asks
+    for a turned picture is not followed, since renders have none.
 
     Raises:
         InputError: not a picture, one that breaks off, or one of other than 8 or 16 bits.
@@ -240,9 +262,11 @@ def inside(picture: Picture) -> npt.NDArray[np.bool_]:
 
 
 def _header(path: Path, *, whole: bool = False) -> tuple[int, int] | None:
-    """(width, height) of a picture; None where Pillow does not know the format. ``whole`` decodes it too.
+    """(width, height) of a picture; None where Pillow does not know the format. ``whole`` decodes
+    it too.
 
-    OpenCV, which reads 16 bits and so reads the pixels, fills what is missing of a JPEG with grey and says nothing.
+    OpenCV, which reads 16 bits and so reads the pixels, fills what is missing of a JPEG with grey
+    and says nothing.
     """
     import warnings
 
@@ -264,7 +288,10 @@ def _header(path: Path, *, whole: bool = False) -> tuple[int, int] | None:
 
 
 def _possible(
-    inputs: Inputs, folders: Mapping[str, Mapping[str, Path]], encoders: Mapping[Kind, str | None], done: Measured
+    inputs: Inputs,
+    folders: Mapping[str, Mapping[str, Path]],
+    encoders: Mapping[Kind, str | None],
+    done: Measured,
 ) -> list[_Figure]:
     """The figures that the inputs allow; the others' reasons go to ``done``."""
     wanted = []
@@ -275,7 +302,9 @@ def _possible(
         elif figure.encoder is not None and encoders.get(figure.encoder) == OFF:
             done.missing[figure.title] = f"left out by --{figure.encoder} {OFF}"
         elif not _views(figure, folders):
-            used = " and ".join(f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders))
+            used = " and ".join(
+                f"{_option(name)} ({_some(folders[name])})" for name in _groups(figure, folders)
+            )
             done.missing[figure.title] = f"no name stands in all of {used}"
         else:
             wanted.append(figure)
@@ -300,8 +329,9 @@ def _load(
         done.encoders[kind] = loaded[kind].about
         if loaded[kind].about.source == "bundled":
             done.notes.append(
-                f"{loaded[kind].about.name} is small and was trained on random rendered scenes: its figures rank "
-                f"results among themselves and do not compare with published ones. --{kind} names a real encoder"
+                f"{loaded[kind].about.name} is small and was trained on random rendered scenes: its"
+                " figures rank results among themselves and do not compare with published ones."
+                f" --{kind} names a real encoder"
             )
     return loaded
 
@@ -318,25 +348,38 @@ def _groups(figure: _Figure, folders: Mapping[str, Mapping[str, Path]]) -> list[
 
 
 def _compare_names(
-    folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]], done: Measured
+    folders: Mapping[str, Mapping[str, Path]],
+    views: Mapping[_Figure, Sequence[str]],
+    done: Measured,
 ) -> None:
     """Say what found no partner."""
     shown = list(folders["renders"])
     used = {name for figure in views for name in figure.needs} | (
         {"masks"} if any(figure in views for figure in _MASKED) else set()
     )
-    for other in (name for name in ("edited", "originals", "masks") if name in folders and name in used):
+    for other in (
+        name for name in ("edited", "originals", "masks") if name in folders and name in used
+    ):
         there = folders[other]
-        # A scene is usually fitted on some of its views: renders without an edited picture are no mistake.
+        # A scene is usually fitted on some of its views: renders without an edited picture are no
+        # mistake.
         for where, names in (
-            (f"of {_option('renders')} without one in {_option(other)}", [n for n in shown if n not in there]),
-            (f"of {_option(other)} without one in {_option('renders')}", [n for n in there if n not in shown]),
+            (
+                f"of {_option('renders')} without one in {_option(other)}",
+                [n for n in shown if n not in there],
+            ),
+            (
+                f"of {_option(other)} without one in {_option('renders')}",
+                [n for n in there if n not in shown],
+            ),
         ):
             if names:
                 done.unpaired.append(f"{len(names)} {where}: {_some(names, 8)}")
 
 
-def _check_sizes(folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]) -> None:
+def _check_sizes(
+    folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]
+) -> None:
     """Before anything is computed: every pair has one size."""
     for figure, names in views.items():
         for other in _groups(figure, folders):
@@ -350,8 +393,8 @@ def _check_sizes(folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figu
 def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> None:
     if a != b:
         raise InputError(
-            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size; resize one of the "
-            "two folders"
+            f"{two} is {b[0]} x {b[1]} px, but {one} is {a[0]} x {a[1]}: a pair must have one size;"
+            " resize one of the two folders"
         )
 
 
@@ -367,9 +410,12 @@ class _Gathered:
 
 
 def _gather(
-    inputs: Inputs, folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]],
-    loaded: Mapping[Kind, Any], progress: Progress,
-) -> _Gathered:  # fmt: skip
+    inputs: Inputs,
+    folders: Mapping[str, Mapping[str, Path]],
+    views: Mapping[_Figure, Sequence[str]],
+    loaded: Mapping[Kind, Any],
+    progress: Progress,
+) -> _Gathered:
     """Read every picture once and keep what the figures need of it."""
     kept = _Gathered()
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
@@ -377,7 +423,9 @@ def _gather(
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
         return {name: read_picture(folders[group][name], inputs.background) for name in names}
 
-    def partners(group: str, names: Iterable[str], renders: Mapping[str, Picture]) -> dict[str, Picture]:
+    def partners(
+        group: str, names: Iterable[str], renders: Mapping[str, Picture]
+    ) -> dict[str, Picture]:
         pictures = read(group, names)
         for name, picture in pictures.items():  # again, for formats whose header alone is not known
             sizes = [(array.shape[1], array.shape[0]) for array in (renders[name], picture)]
@@ -391,7 +439,9 @@ def _gather(
     def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
         return float(loaded["perceptual"].distance([a], [b])[0])
 
-    needed = [name for name in folders["renders"] if any(name in names for names in members.values())]
+    needed = [
+        name for name in folders["renders"] if any(name in names for names in members.values())
+    ]
     for start in range(0, len(needed), BATCH):
         batch = needed[start : start + BATCH]
         progress(start, len(needed), batch[0])
@@ -402,7 +452,9 @@ def _gather(
         encode("clip", partners("originals", changed, renders), kept.before)
         paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
         masked = paired if "masks" in folders else []
-        masks = {name: inside(picture) for name, picture in partners("masks", masked, renders).items()}
+        masks = {
+            name: inside(picture) for name, picture in partners("masks", masked, renders).items()
+        }
         for name, picture in partners("edited", paired, renders).items():
             if name in members[_EDIT]:
                 mask = {name: masks[name]} if masks else None
@@ -410,7 +462,9 @@ def _gather(
                 kept.errors[name] = (one.mse[0], one.psnr[0])
             if name in members[_PERCEPTUAL]:
                 try:
-                    kept.distances[name] = metrics.perceptual(picture, renders[name], distance, masks.get(name))
+                    kept.distances[name] = metrics.perceptual(
+                        picture, renders[name], distance, masks.get(name)
+                    )
                 except ValueError as error:
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
     progress(len(needed), len(needed), "")
@@ -418,11 +472,18 @@ def _gather(
 
 
 def _rows(
-    inputs: Inputs, source: Picture | None, views: Mapping[_Figure, Sequence[str]], loaded: Mapping[Kind, Any],
-    kept: _Gathered, done: Measured,
-) -> None:  # fmt: skip
+    inputs: Inputs,
+    source: Picture | None,
+    views: Mapping[_Figure, Sequence[str]],
+    loaded: Mapping[Kind, Any],
+    kept: _Gathered,
+    done: Measured,
+) -> None:
     """The figures of what was gathered, in the order of the paper's table."""
-    texts = {name: _text(loaded["clip"], getattr(inputs, name), _option(name), done) for name in _texts_needed(views)}
+    texts = {
+        name: _text(loaded["clip"], getattr(inputs, name), _option(name), done)
+        for name in _texts_needed(views)
+    }
     for figure, names in views.items():
         if figure is _EDIT:
             _edit_rows(kept.errors, done)
@@ -436,38 +497,54 @@ def _rows(
             found = metrics.clip_similarity(_stack(kept.clip, names), texts["prompt"])
         elif figure is _DIRECTION:
             before, after = _stack(kept.before, names), _stack(kept.clip, names)
-            found = metrics.directional_similarity(before, after, texts["source_prompt"], texts["prompt"])
+            found = metrics.directional_similarity(
+                before, after, texts["source_prompt"], texts["prompt"]
+            )
         else:
             kind: Kind = "dino" if figure is _DINO else "clip"
             assert source is not None  # the figure needs it, see _possible
             edit = loaded[kind].images([source])
-            found = metrics.image_similarity(edit, _stack(kept.dino if figure is _DINO else kept.clip, names))
+            found = metrics.image_similarity(
+                edit, _stack(kept.dino if figure is _DINO else kept.clip, names)
+            )
         values = dict(zip(names, map(float, found.values), strict=True))
         done.rows.append(Row(figure.key, figure.title, found.mean, values, figure.encoder))
 
 
 def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> None:
-    found = metrics.EditPsnr(tuple(errors), tuple(m for m, _ in errors.values()), tuple(p for _, p in errors.values()))
+    found = metrics.EditPsnr(
+        tuple(errors), tuple(m for m, _ in errors.values()), tuple(p for _, p in errors.values())
+    )
     values = dict(zip(found.views, found.psnr, strict=True))
-    done.rows.append(Row("edit.psnr_mean", "Edit PSNR, mean of the views", found.mean_finite, values))
+    done.rows.append(
+        Row("edit.psnr_mean", "Edit PSNR, mean of the views", found.mean_finite, values)
+    )
     done.rows.append(Row("edit.psnr_pooled", "Edit PSNR, pooled", found.pooled, values))
     if found.identical:
         done.notes.append(
-            f"{found.identical} edited pictures equal their renders: their PSNR is infinite and not in the mean of the "
-            "views; in the pooled figure they count as no error"
+            f"{found.identical} edited pictures equal their renders: their PSNR is infinite and not"
+            " in the mean of the views; in the pooled figure they count as no error"
         )
     if found.undefined:
-        done.notes.append(f"{found.undefined} masks are black all over: nothing of those views counts")
+        done.notes.append(
+            f"{found.undefined} masks are black all over: nothing of those views counts"
+        )
 
 
 def _texts_needed(views: Iterable[_Figure]) -> list[str]:
-    return [n for n in ("prompt", "source_prompt") if any(f.encoder == "clip" and n in f.needs for f in views)]
+    return [
+        n
+        for n in ("prompt", "source_prompt")
+        if any(f.encoder == "clip" and n in f.needs for f in views)
+    ]
 
 
 def _text(clip: Any, text: str, option: str, done: Measured) -> Embedding:
     cut = clip.cut(text) if hasattr(clip, "cut") else 0
     if cut:
-        done.notes.append(f"{option} is longer than the encoder takes: its last {cut} tokens were not read")
+        done.notes.append(
+            f"{option} is longer than the encoder takes: its last {cut} tokens were not read"
+        )
     return np.asarray(clip.texts([text])[0])
 
 
@@ -482,7 +559,9 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 def _some(names: Iterable[str], count: int = 3) -> str:
     listed = list(names)
-    return ", ".join(listed[:count]) + (f" and {len(listed) - count} more" if len(listed) > count else "")
+    return ", ".join(listed[:count]) + (
+        f" and {len(listed) - count} more" if len(listed) > count else ""
+    )
 
 
 def _option(name: str) -> str:

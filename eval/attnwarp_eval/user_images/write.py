@@ -19,8 +19,9 @@ FORMAT = 1
 """Version of metrics.json."""
 
 _READING = (
-    "Pictures are read as sRGB in [0, 1]: 8 bits over 255, 16 bits over 65535, grey as three equal channels, transparent "
-    "pixels over the background; tags that ask for a turned picture are not followed."
+    "Pictures are read as sRGB in [0, 1]: 8 bits over 255, 16 bits over 65535, grey as three equal"
+    " channels, transparent pixels over the background; tags that ask for a turned picture are not"
+    " followed."
 )
 
 
@@ -34,7 +35,15 @@ def to_dict(measured: Measured) -> dict[str, Any]:
         "inputs": {
             **{
                 name: None if getattr(inputs, name) is None else str(getattr(inputs, name))
-                for name in ("renders", "edited", "originals", "source_edit", "masks", "prompt", "source_prompt")
+                for name in (
+                    "renders",
+                    "edited",
+                    "originals",
+                    "source_edit",
+                    "masks",
+                    "prompt",
+                    "source_prompt",
+                )
             },
             "background": list(inputs.background),
             "reading": _READING,
@@ -71,11 +80,22 @@ def to_markdown(measured: Measured) -> str:
     """The text of metrics.md."""
     inputs = measured.inputs
     lines = ["# Metrics of the edited scene", ""]
-    for name in ("renders", "edited", "originals", "source_edit", "masks", "prompt", "source_prompt"):
+    for name in (
+        "renders",
+        "edited",
+        "originals",
+        "source_edit",
+        "masks",
+        "prompt",
+        "source_prompt",
+    ):
         value = getattr(inputs, name)
         if value is not None:
             lines.append(f"- {name.replace('_', ' ')}: {_cell(str(value))}")
-    lines += ["", *_grid(["figure", "value", "views", "undefined", "better", "encoder"], _overview(measured))]
+    lines += [
+        "",
+        *_grid(["figure", "value", "views", "undefined", "better", "encoder"], _overview(measured)),
+    ]
     for title, items in (
         ("Not computed", [f"{what}: {why}" for what, why in measured.missing.items()]),
         ("Pictures without a partner", measured.unpaired),
@@ -85,24 +105,36 @@ def to_markdown(measured: Measured) -> str:
             lines += ["", f"## {title}", "", *(f"- {_cell(item)}" for item in items)]
     if measured.encoders:
         rows = [
-            [a.name, kind, a.source, a.weights_sha256, a.preprocessing] for kind, a in sorted(measured.encoders.items())
+            [a.name, kind, a.source, a.weights_sha256, a.preprocessing]
+            for kind, a in sorted(measured.encoders.items())
         ]
-        lines += ["", "## Encoders", "", *_grid(["name", "kind", "source", "SHA-256 of the weights", "pictures"], rows)]
+        lines += [
+            "",
+            "## Encoders",
+            "",
+            *_grid(["name", "kind", "source", "SHA-256 of the weights", "pictures"], rows),
+        ]
     shown = [row for row in measured.rows if row.key != "edit.psnr_pooled"]
     if shown:
         names = sorted({name for row in shown for name in row.views}, key=natural)
-        rows = [[name, *(_value(row, row.views[name]) if name in row.views else "" for row in shown)] for name in names]
+        rows = [
+            [name, *(_value(row, row.views[name]) if name in row.views else "" for row in shown)]
+            for name in names
+        ]
         heads = [row.title.removesuffix(", mean of the views") for row in shown]
         lines += ["", "## View by view", "", *_grid(["view", *heads], rows)]
     return "\n".join(lines) + "\n"
 
 
 def table(measured: Measured) -> Table:
-    """The figures, for a terminal; encoders by their kind, since the names of real ones are long."""
+    """The figures, for a terminal; encoders by their kind, since the names of real ones are
+    long."""
     from rich.table import Table
     from rich.text import Text
 
-    grid = Table("figure", "value", "views", "undefined", "better", title="Metrics of the edited scene")
+    grid = Table(
+        "figure", "value", "views", "undefined", "better", title="Metrics of the edited scene"
+    )
     for cells in _overview(measured):
         grid.add_row(*map(Text, cells[:5]))
     return grid
@@ -124,7 +156,14 @@ def _overview(measured: Measured) -> list[list[str]]:
         encoder = "" if row.encoder is None else measured.encoders[row.encoder].name
         defined = len(row.views) - len(row.undefined)
         rows.append(
-            [row.title, _value(row, row.value), str(defined), str(len(row.undefined)), _spec(row).direction, encoder]
+            [
+                row.title,
+                _value(row, row.value),
+                str(defined),
+                str(len(row.undefined)),
+                _spec(row).direction,
+                encoder,
+            ]
         )
     rows += [[title, "not computed", "0", "", "", ""] for title in measured.missing]
     return rows

@@ -1,4 +1,6 @@
-"""The bundled encoders. Oracles: worlds whose contents are known, rendered anew here, and what identity and order demand."""
+"""The bundled encoders. Oracles: worlds whose contents are known, rendered anew here, and what
+identity and order demand.
+"""
 
 import hashlib
 import json
@@ -20,14 +22,18 @@ NAMES = ("clip-small", "dino-small", "perceptual-small")
 
 @pytest.fixture(scope="module")
 def worlds():
-    """Two views and three looks of worlds whose seeds no recipe uses, of shapes that training never sees."""
+    """Two views and three looks of worlds whose seeds no recipe uses, of shapes that training never
+    sees.
+    """
     return _rendered(Split(90_000_000, 25, pairs="any", new_shapes=True))
 
 
 def _rendered(split):
     seeds = range(split.first, split.first + split.worlds)
     rows = [
-        (image, shown, seed, view, look) for seed in seeds for image, shown, view, look in render_world(seed, split)
+        (image, shown, seed, view, look)
+        for seed in seeds
+        for image, shown, view, look in render_world(seed, split)
     ]
     return Shown(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -50,7 +56,9 @@ def perceptual():
 @pytest.mark.parametrize("name", NAMES)
 def test_weights_are_small_and_are_those_that_the_card_names(name):
     card = (WEIGHTS / f"{name}.md").read_text()
-    files = [p for p in WEIGHTS.glob(f"{name}*") if p.name.endswith((".safetensors", ".tokenizer.json"))]
+    files = [
+        p for p in WEIGHTS.glob(f"{name}*") if p.name.endswith((".safetensors", ".tokenizer.json"))
+    ]
     assert files
     for path in files:
         assert path.stat().st_size <= 8e6
@@ -90,9 +98,13 @@ def test_they_are_what_the_door_promises(clip, dino, perceptual):
 
 
 def test_missing_or_foreign_weights_are_an_error_that_says_so(tmp_path):
-    with pytest.raises(InputError, match=r"dino-small\.safetensors: missing; install the package again"):
+    with pytest.raises(
+        InputError, match=r"dino-small\.safetensors: missing; install the package again"
+    ):
         load("dino-small", tmp_path)
-    (tmp_path / "dino-small.safetensors").write_bytes((WEIGHTS / "perceptual-small.safetensors").read_bytes())
+    (tmp_path / "dino-small.safetensors").write_bytes(
+        (WEIGHTS / "perceptual-small.safetensors").read_bytes()
+    )
     with pytest.raises(InputError, match="not the weights of this version"):
         load("dino-small", tmp_path)
     with pytest.raises(InputError, match="not bundled, expected one of clip-small"):
@@ -105,7 +117,9 @@ def test_an_embedding_does_not_depend_on_what_else_is_in_the_list(clip, dino):
     for encode in (clip.images, dino.images, dino.tokens):
         together = encode(pictures)
         for k, picture in enumerate(pictures):
-            assert np.allclose(encode([picture])[0], together[k], atol=1e-4 * np.abs(together).max())
+            assert np.allclose(
+                encode([picture])[0], together[k], atol=1e-4 * np.abs(together).max()
+            )
 
 
 def test_a_picture_and_its_mirror_image_say_the_same(clip):
@@ -116,10 +130,16 @@ def test_a_picture_and_its_mirror_image_say_the_same(clip):
 
 def test_things_colours_and_times_are_named(clip, worlds):
     figures = {
-        f.what: f for f in assess.clip_figures(clip, dict.fromkeys(("test", "test-new-pairs", "test-rendered"), worlds))
+        f.what: f
+        for f in assess.clip_figures(
+            clip, dict.fromkeys(("test", "test-new-pairs", "test-rendered"), worlds)
+        )
     }
-    # 150 pictures of 25 worlds that the cards' figures do not know: what was asked of the encoder must lie within their interval.
-    asked = {f.what: f.asked for f in figures.values() if f.asked is not None and "new shapes" in f.what}
+    # 150 pictures of 25 worlds that the cards' figures do not know: what was asked of the encoder
+    # must lie within their interval.
+    asked = {
+        f.what: f.asked for f in figures.values() if f.asked is not None and "new shapes" in f.what
+    }
     assert len(asked) >= 3
     for what, share in asked.items():
         assert figures[what].high >= share, what
@@ -129,7 +149,9 @@ def test_things_colours_and_times_are_named(clip, worlds):
 
 
 def test_unknown_words_do_not_drown_the_known_ones(clip):
-    red, odd, blue = clip.texts(["a photo of a red ball", "a photo of a blorvish red ball", "a photo of a blue ball"])
+    red, odd, blue = clip.texts(
+        ["a photo of a red ball", "a photo of a blorvish red ball", "a photo of a blue ball"]
+    )
     cosine = lambda a, b: a @ b / np.linalg.norm(a) / np.linalg.norm(b)  # noqa: E731
     assert cosine(red, odd) > cosine(odd, blue) + 0.1
     assert np.isfinite(clip.texts(["", "🐻 " * 200, "Ein Bär, bitte!"])).all()
@@ -149,7 +171,9 @@ def test_a_thing_is_found_from_another_side_more_often_than_by_its_colours(dino)
 
 def test_the_distance_is_zero_for_equal_pictures_symmetric_and_grows_with_blur(perceptual, worlds):
     picture = worlds.images[3].astype(np.float32) / 255
-    blurred = [np.clip(cv2.GaussianBlur(picture, (0, 0), s), 0, 1) for s in (0.7, 1.2, 2.0, 3.5, 6.0)]
+    blurred = [
+        np.clip(cv2.GaussianBlur(picture, (0, 0), s), 0, 1) for s in (0.7, 1.2, 2.0, 3.5, 6.0)
+    ]
     assert perceptual.distance([picture], [picture])[0] == 0
     distances = perceptual.distance([picture] * 5, blurred)
     assert (np.diff(distances) > 0).all()
@@ -166,10 +190,14 @@ def test_a_small_shift_weighs_less_than_a_blur_which_squared_errors_get_wrong(pe
     for image in chosen:
         # Fine grain all over: a shift by a pixel changes nearly every value.
         noise = np.random.default_rng(0).normal(0, 0.12, (160, 160, 1))
-        picture = np.clip(image / 255 + cv2.GaussianBlur(noise, (0, 0), 0.7)[..., None] * 2, 0, 1).astype(np.float32)
+        picture = np.clip(
+            image / 255 + cv2.GaussianBlur(noise, (0, 0), 0.7)[..., None] * 2, 0, 1
+        ).astype(np.float32)
         shifted, blurred = np.roll(picture, 1, axis=1), cv2.GaussianBlur(picture, (0, 0), 2.0)
         a, b = perceptual.distance([picture] * 2, [shifted, blurred])
         right["ours"] += a < b
-        right["PSNR"] += assess.psnr_distance(picture, shifted) < assess.psnr_distance(picture, blurred)
+        right["PSNR"] += assess.psnr_distance(picture, shifted) < assess.psnr_distance(
+            picture, blurred
+        )
     assert right["ours"] >= 0.8 * len(chosen)
     assert right["PSNR"] <= 0.3 * len(chosen)

@@ -24,24 +24,31 @@ def test_a_name_tells_the_kind(name, kind):
 @pytest.mark.parametrize(
     "name, guess",
     [
-        ("clipsmall", "'clip-small'"), ("dino:/models/x", "'dinov2:FOLDER'"), ("LPIPS:x", "'lpips:FILE_OR_FOLDER'"),
-        ("perceptual", "'perceptual-small'"), ("Clip-Small", "'clip-small'"),
+        ("clipsmall", "'clip-small'"),
+        ("dino:/models/x", "'dinov2:FOLDER'"),
+        ("LPIPS:x", "'lpips:FILE_OR_FOLDER'"),
+        ("perceptual", "'perceptual-small'"),
+        ("Clip-Small", "'clip-small'"),
     ],
-)  # fmt: skip
+)
 def test_a_name_that_is_nearly_right_is_guessed(name, guess):
     with pytest.raises(InputError, match=f"unknown; did you mean {guess}"):
         encoders.load_encoder(name)
 
 
 def test_a_name_that_is_like_none_gets_the_list():
-    with pytest.raises(InputError, match=r"encoder 'zzz': unknown\. Known are clip-small, .*lpips:FILE_OR_FOLDER"):
+    with pytest.raises(
+        InputError, match=r"encoder 'zzz': unknown\. Known are clip-small, .*lpips:FILE_OR_FOLDER"
+    ):
         encoders.kind_of("zzz")
     with pytest.raises(InputError, match="no place behind the colon, expected clip:FOLDER"):
         encoders.kind_of("clip: ")
 
 
 def test_another_kind_than_asked_for_is_refused_before_anything_is_loaded():
-    with pytest.raises(InputError, match="is of kind 'dino', expected 'clip'; name one of clip-small, clip:FOLDER"):
+    with pytest.raises(
+        InputError, match="is of kind 'dino', expected 'clip'; name one of clip-small, clip:FOLDER"
+    ):
         encoders.load_encoder("dinov2:/nowhere", "clip")
 
 
@@ -52,13 +59,24 @@ def test_bundled_ones_are_described():
 
 def test_an_installation_without_bundled_weights_says_so(monkeypatch):
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name.endswith("bundled") else found(name))
-    with pytest.raises(InputError, match="carries no bundled weights; name a real one: clip:FOLDER"):
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *a: None if name.endswith("bundled") else found(name),
+    )
+    with pytest.raises(
+        InputError, match="carries no bundled weights; name a real one: clip:FOLDER"
+    ):
         encoders.load_encoder("clip-small")
 
 
 def test_the_door_itself_loads_nothing_heavy():
     heavy = "{'torch', 'transformers', 'PIL', 'cv2', 'scipy'}"
-    code = f"import sys, attnwarp.encoders as e; e.kind_of('clip:x'); print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    code = (
+        f"import sys, attnwarp.encoders as e; e.kind_of('clip:x'); print({heavy} &"
+        " set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout.strip() == "set()"

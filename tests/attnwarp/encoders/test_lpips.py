@@ -1,4 +1,6 @@
-"""LPIPS with torchvision's layouts and the published linear layers, held against torchmetrics and against a sum by hand."""
+"""LPIPS with torchvision's layouts and the published linear layers, held against torchmetrics and
+against a sum by hand.
+"""
 
 import numpy as np
 import pytest
@@ -27,11 +29,15 @@ def one_thread():
 
 @pytest.fixture(scope="module", params=["alex", "vgg", "squeeze"])
 def placed(request, tmp_path_factory):
-    """A folder with a random backbone and all three published files of linear layers; the network; its name."""
+    """A folder with a random backbone and all three published files of linear layers; the network;
+    its name.
+    """
     folder = tmp_path_factory.mktemp(request.param)
     network = tiny_models.save_backbone(folder / BACKBONES[request.param].file, request.param)
     for name in CHANNELS:
-        (folder / f"{name}.pth").write_bytes((tiny_models.linear_layers() / f"{name}.pth").read_bytes())
+        (folder / f"{name}.pth").write_bytes(
+            (tiny_models.linear_layers() / f"{name}.pth").read_bytes()
+        )
     return folder, network, request.param
 
 
@@ -57,8 +63,9 @@ def test_it_is_torchmetrics_network(placed, monkeypatch):
         x, y = (torch.from_numpy(v).permute(2, 0, 1)[None] for v in (x, y))
         with torch.no_grad():
             expected = float(judge(x, y, normalize=True))
-        # torchmetrics adds 1e-8 to the square of a feature's length, the authors 1e-10 to the length: random networks'
-        # features are long enough (above 1e-2) for that to change the fourth digit at most.
+        # torchmetrics adds 1e-8 to the square of a feature's length, the authors 1e-10 to the
+        # length: random networks' features are long enough (above 1e-2) for that to change the
+        # fourth digit at most.
         assert value == pytest.approx(expected, rel=1e-3)
         assert value > 1e-3
 
@@ -77,7 +84,9 @@ def test_it_is_the_sum_of_the_paper_in_float64(placed):
                 break  # a last pool, which nothing is read behind
             x, y = layer(x), layer(y)
             following = judge[i + 1] if i + 1 < len(judge) else None
-            if isinstance(layer, nn.Conv2d | nn.MaxPool2d) or (name == "vgg" and isinstance(following, nn.Conv2d)):
+            if isinstance(layer, nn.Conv2d | nn.MaxPool2d) or (
+                name == "vgg" and isinstance(following, nn.Conv2d)
+            ):
                 continue  # stages end at a rectified output: each of them, or VGG's last before each pool
             if name == "squeeze" and isinstance(following, tiny_models._Fire) and i in (3, 6):
                 continue  # of SqueezeNet's first two pairs of blocks, the second
@@ -87,7 +96,9 @@ def test_it_is_the_sum_of_the_paper_in_float64(placed):
             stage += 1
     network.float()
     assert stage == len(CHANNELS[name])
-    assert load_encoder(f"lpips:{folder}").distance([a], [b])[0] == pytest.approx(total, rel=1e-5)  # float32
+    assert load_encoder(f"lpips:{folder}").distance([a], [b])[0] == pytest.approx(
+        total, rel=1e-5
+    )  # float32
 
 
 def test_equal_pictures_are_at_0_and_the_order_does_not_matter(placed):
@@ -101,19 +112,27 @@ def test_equal_pictures_are_at_0_and_the_order_does_not_matter(placed):
 def test_the_smallest_picture_goes_through_and_a_smaller_one_is_refused(placed):
     side = BACKBONES[placed[2]].smallest
     encoder = load_encoder(f"lpips:{placed[0]}")
-    assert np.isfinite(encoder.distance(pictures((side, side)), pictures((side, side), seed=1))).all()
-    with pytest.raises(ValueError, match=rf"a\[0\]: got {side} x {side - 1} px, expected sides of at least {side} px"):
+    assert np.isfinite(
+        encoder.distance(pictures((side, side)), pictures((side, side), seed=1))
+    ).all()
+    with pytest.raises(
+        ValueError,
+        match=rf"a\[0\]: got {side} x {side - 1} px, expected sides of at least {side} px",
+    ):
         encoder.distance(pictures((side - 1, side)), pictures((side - 1, side)))
     with torch.no_grad(), pytest.raises(RuntimeError):  # the limit is the network's, not ours
-        tiny_models.torchvision_features(tiny_models.TORCHVISION[placed[2]])[: BACKBONES[placed[2]].taps[-1] + 1](
-            torch.zeros(1, 3, side - 1, side)
-        )
+        tiny_models.torchvision_features(tiny_models.TORCHVISION[placed[2]])[
+            : BACKBONES[placed[2]].taps[-1] + 1
+        ](torch.zeros(1, 3, side - 1, side))
 
 
 def test_a_file_saved_from_the_lpips_package_is_one_that_holds_all(placed, tmp_path):
     folder, network, name = placed
     taps = BACKBONES[name].taps
-    state = {"scaling_layer.shift": torch.zeros(1, 3, 1, 1), "scaling_layer.scale": torch.ones(1, 3, 1, 1)}
+    state = {
+        "scaling_layer.shift": torch.zeros(1, 3, 1, 1),
+        "scaling_layer.scale": torch.ones(1, 3, 1, 1),
+    }
     for key, value in network.state_dict().items():
         number = 1 + sum(int(key.split(".")[0]) > tap for tap in taps)
         state[f"net.slice{number}.{key}"] = value
@@ -144,7 +163,10 @@ def test_the_layers_bear_torchvision_s_names():
 def test_what_is_missing_is_named_with_the_remedy(placed, tmp_path):
     folder, _, name = placed
     backbone = BACKBONES[name].file
-    with pytest.raises(InputError, match=r"is no file and no folder with weights\. Place there two files.*torchvision"):
+    with pytest.raises(
+        InputError,
+        match=r"is no file and no folder with weights\. Place there two files.*torchvision",
+    ):
         load_encoder(f"lpips:{tmp_path / 'nowhere'}")
     (tmp_path / backbone).write_bytes((folder / backbone).read_bytes())
     with pytest.raises(InputError, match=f"holds no linear layers for {name}, expected one file"):

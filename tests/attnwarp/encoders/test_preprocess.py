@@ -15,14 +15,16 @@ def random():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("resample", [Image.Resampling.BICUBIC, Image.Resampling.BILINEAR, Image.Resampling.LANCZOS])
+@pytest.mark.parametrize(
+    "resample", [Image.Resampling.BICUBIC, Image.Resampling.BILINEAR, Image.Resampling.LANCZOS]
+)
 @pytest.mark.parametrize("to", [(20, 31), (61, 90), (40, 17)])
 def test_resizing_is_pillow_s_apart_from_its_rounding(random, resample, to):
     picture = random.integers(0, 256, (40, 50, 3), dtype=np.uint8)
     expected = np.asarray(Image.fromarray(picture).resize(to[::-1], resample), dtype=np.float64)
     got = 255 * resize((picture / 255).astype(np.float32), to, int(resample))
-    # 8 bits are rounded twice, after the rows and after the columns, the first of which the second one's weights
-    # (whose magnitudes sum to at most 1.5) may stretch: 0.5 * 1.5 + 0.5.
+    # 8 bits are rounded twice, after the rows and after the columns, the first of which the second
+    # one's weights (whose magnitudes sum to at most 1.5) may stretch: 0.5 * 1.5 + 0.5.
     assert np.abs(got - expected).max() < 1.25
     assert np.abs(got - expected).mean() < 0.35
 
@@ -30,7 +32,9 @@ def test_resizing_is_pillow_s_apart_from_its_rounding(random, resample, to):
 def test_making_a_picture_smaller_averages_instead_of_skipping_pixels():
     stripes = np.zeros((64, 64, 3), np.float32)
     stripes[:, ::2] = 1
-    assert np.abs(resize(stripes, (8, 8)) - 0.5).max() < 0.02  # without a wider filter it would be 0 or 1
+    assert (
+        np.abs(resize(stripes, (8, 8)) - 0.5).max() < 0.02
+    )  # without a wider filter it would be 0 or 1
 
 
 def test_a_cubic_s_overshoot_is_cut_off():
@@ -60,8 +64,16 @@ def test_the_centre_is_cut_as_transformers_cuts_it(random, shape):
         {"size": {"shortest_edge": 24}, "crop_size": {"height": 20, "width": 20}},
         {"size": {"height": 20, "width": 26}, "do_center_crop": False},
         {"size": {"shortest_edge": 24}, "crop_size": {"height": 30, "width": 20}, "resample": 2},
-        {"size": {"shortest_edge": 24}, "crop_size": {"height": 20, "width": 20}, "rescale_factor": 1 / 127.5},
-        {"size": {"shortest_edge": 24}, "crop_size": {"height": 20, "width": 20}, "do_normalize": False},
+        {
+            "size": {"shortest_edge": 24},
+            "crop_size": {"height": 20, "width": 20},
+            "rescale_factor": 1 / 127.5,
+        },
+        {
+            "size": {"shortest_edge": 24},
+            "crop_size": {"height": 20, "width": 20},
+            "do_normalize": False,
+        },
         {"do_resize": False, "crop_size": {"height": 33, "width": 20}},
     ],
 )
@@ -71,7 +83,8 @@ def test_a_whole_pipeline_is_that_of_transformers(tmp_path, random, said, shape)
 
     processor = CLIPImageProcessorPil(**said)
     processor.save_pretrained(tmp_path)
-    # Squeezed to another shape Pillow takes the axes in another order, which shows in what overshoots: so nothing does.
+    # Squeezed to another shape Pillow takes the axes in another order, which shows in what
+    # overshoots: so nothing does.
     low, high = (64, 192) if "height" in said.get("size", {}) else (0, 256)
     picture = random.integers(low, high, (*shape, 3), dtype=np.uint8)
     expected = processor([picture], return_tensors="np")["pixel_values"][0]
@@ -85,21 +98,32 @@ def test_a_whole_pipeline_is_that_of_transformers(tmp_path, random, said, shape)
 def test_sizes_of_old_files_are_single_numbers(tmp_path):
     # As published with openai/clip-vit-large-patch14-336.
     old = {
-        "crop_size": 336, "do_center_crop": True, "do_normalize": True, "do_resize": True, "resample": 3, "size": 336,
-        "feature_extractor_type": "CLIPFeatureExtractor", "image_mean": [0.48145466, 0.4578275, 0.40821073],
+        "crop_size": 336,
+        "do_center_crop": True,
+        "do_normalize": True,
+        "do_resize": True,
+        "resample": 3,
+        "size": 336,
+        "feature_extractor_type": "CLIPFeatureExtractor",
+        "image_mean": [0.48145466, 0.4578275, 0.40821073],
         "image_std": [0.26862954, 0.26130258, 0.27577711],
-    }  # fmt: skip
+    }
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(old))
     ours = read_preprocessing(tmp_path)
     assert (ours.resize, ours.crop, ours.scale) == (336, (336, 336), 1.0)
-    assert str(ours) == (
-        "resized the shorter edge to 336 px (bicubic, antialiased, floating); the central 336 x 336 px cut out; "
-        "minus (0.4815, 0.4578, 0.4082), over (0.2686, 0.2613, 0.2758)"
+    assert (
+        str(ours)
+        == "resized the shorter edge to 336 px (bicubic, antialiased, floating); the central 336 x"
+        " 336 px cut out; minus (0.4815, 0.4578, 0.4082), over (0.2686, 0.2613, 0.2758)"
     )
 
 
 def test_the_part_of_a_newer_file_is_found(tmp_path):
-    part = {"image_processor_type": "CLIPImageProcessorFast", "size": {"shortest_edge": 30}, "crop_size": 28}
+    part = {
+        "image_processor_type": "CLIPImageProcessorFast",
+        "size": {"shortest_edge": 30},
+        "crop_size": 28,
+    }
     (tmp_path / "processor_config.json").write_text(json.dumps({"image_processor": part}))
     ours = read_preprocessing(tmp_path)
     assert isinstance(ours, Preprocessing) and ours.resize == 30 and ours.shape == (28, 28)
@@ -111,7 +135,10 @@ def test_the_part_of_a_newer_file_is_found(tmp_path):
         (None, "no preprocessor_config.json or processor_config.json; place"),
         ("{", "not JSON"),
         ("[1]", "holds a list, expected an object"),
-        ('{"image_processor_type": "SamImageProcessor"}', "is 'SamImageProcessor', expected one of CLIPImageProcessor"),
+        (
+            '{"image_processor_type": "SamImageProcessor"}',
+            "is 'SamImageProcessor', expected one of CLIPImageProcessor",
+        ),
         ('{"size": {"longest_edge": 300}}', "is not known here, expected shortest_edge"),
         ('{"size": 0}', "size 0 is not a number of px"),
         ('{"resample": 9}', "resample 9 is not known"),

@@ -58,7 +58,9 @@ def dino(request, tmp_path_factory):
 def pictures(count=11, seed=0):
     """Of several shapes, and more than go through the network at a time."""
     random = np.random.default_rng(seed)
-    return [random.integers(0, 256, (40 + 3 * (i % 4), 50, 3), dtype=np.uint8) for i in range(count)]
+    return [
+        random.integers(0, 256, (40 + 3 * (i % 4), 50, 3), dtype=np.uint8) for i in range(count)
+    ]
 
 
 def floating(images):
@@ -70,17 +72,23 @@ def cosine(a, b):
 
 
 def through(model_call, folder, images):
-    """The network on what our preprocessing gives, one picture at a time: no batches, no float64 in between."""
+    """The network on what our preprocessing gives, one picture at a time: no batches, no float64 in
+    between.
+    """
     prepare = read_preprocessing(folder)
     with torch.no_grad():
-        return np.stack([model_call(torch.from_numpy(prepare(x))[None])[0].numpy() for x in floating(images)])
+        return np.stack(
+            [model_call(torch.from_numpy(prepare(x))[None])[0].numpy() for x in floating(images)]
+        )
 
 
 def test_clip_s_pictures_are_transformers_own_but_for_its_rounding_to_8_bits(clip, clip_folder):
     _, model, processor, _ = clip_folder
     images = pictures()
     with torch.no_grad():
-        expected = model.get_image_features(**processor(images, return_tensors="pt")).pooler_output.numpy()
+        expected = model.get_image_features(
+            **processor(images, return_tensors="pt")
+        ).pooler_output.numpy()
     got = clip.images(floating(images))
     assert got.shape == (11, 24) and got.dtype == np.float64
     assert cosine(got, expected).min() > 1 - 2e-5  # noise, all of whose pixels were rounded twice
@@ -90,14 +98,19 @@ def test_clip_s_pictures_are_transformers_own_but_for_its_rounding_to_8_bits(cli
 
 def test_clip_s_pictures_are_exactly_the_network_s(clip, clip_folder):
     folder, model, *_ = clip_folder
-    expected = through(lambda x: model.get_image_features(pixel_values=x).pooler_output, folder, pictures())
-    np.testing.assert_allclose(clip.images(floating(pictures())), expected, rtol=0, atol=2e-5)  # float32, lengths of 2
+    expected = through(
+        lambda x: model.get_image_features(pixel_values=x).pooler_output, folder, pictures()
+    )
+    np.testing.assert_allclose(
+        clip.images(floating(pictures())), expected, rtol=0, atol=2e-5
+    )  # float32, lengths of 2
 
 
 def test_clip_s_texts_are_transformers_own(clip, clip_folder):
     _, model, _, tokenizer = clip_folder
     with torch.no_grad():
-        # Padded in one batch, as users call it: what stands behind the end of a text must not matter.
+        # Padded in one batch, as users call it: what stands behind the end of a text must not
+        # matter.
         inputs = tokenizer(TEXTS, padding=True, truncation=True, max_length=24, return_tensors="pt")
         expected = model.get_text_features(**inputs).pooler_output.numpy()
     got = clip.texts(TEXTS)
@@ -133,7 +146,9 @@ def test_dino_gives_the_class_token_and_the_patches_in_their_places(dino):
     got, grid = encoder.images(floating(pictures())), encoder.tokens(floating(pictures()))
     assert got.shape == (11, 32) and grid.shape == (11, 3, 3, 32) and grid.dtype == np.float64
     np.testing.assert_allclose(got, expected[:, 0], rtol=0, atol=2e-5)
-    np.testing.assert_allclose(grid.reshape(11, 9, 32), expected[:, 1 + registers :], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(
+        grid.reshape(11, 9, 32), expected[:, 1 + registers :], rtol=0, atol=2e-5
+    )
     assert cosine(got[:1], got[1:]).max() < 1 - 1e-4
 
 
@@ -155,7 +170,8 @@ def test_dino_of_transformers_own_processor_agrees(dino):
         inputs = BitImageProcessorPil.from_pretrained(folder)(images, return_tensors="pt")
         expected = model(**inputs).pooler_output.numpy()
     got = encoder.images(floating(images))
-    # Random layers this strong amplify that rounding; two pictures lie a hundred times further apart.
+    # Random layers this strong amplify that rounding; two pictures lie a hundred times further
+    # apart.
     assert cosine(got, expected).min() > 1 - 1e-3
     assert cosine(got[:1], got[1:]).max() < 1 - 5e-2
 
@@ -195,14 +211,23 @@ def test_what_they_say_of_themselves(clip, clip_folder, dino):
     import hashlib
 
     about = clip.about
-    assert (about.name, about.kind, about.size, about.dim) == (f"clip:{clip_folder[0]}", "clip", 32, 24)
+    assert (about.name, about.kind, about.size, about.dim) == (
+        f"clip:{clip_folder[0]}",
+        "clip",
+        32,
+        24,
+    )
     weights = (clip_folder[0] / "model.safetensors").read_bytes()
-    assert about.weights_sha256 == hashlib.sha256(weights).hexdigest() and about.source == str(clip_folder[0])
+    assert about.weights_sha256 == hashlib.sha256(weights).hexdigest() and about.source == str(
+        clip_folder[0]
+    )
     assert "shorter edge to 32 px (bicubic" in about.preprocessing
     assert json.loads(json.dumps(about.to_dict()))["dim"] == 24
     assert (dino[0].about.kind, dino[0].about.size, dino[0].about.dim) == ("dino", 42, 32)
     assert (
-        isinstance(clip, TextImageEncoder) and isinstance(dino[0], ImageEncoder) and isinstance(dino[0], TokenEncoder)
+        isinstance(clip, TextImageEncoder)
+        and isinstance(dino[0], ImageEncoder)
+        and isinstance(dino[0], TokenEncoder)
     )
 
 
@@ -213,7 +238,10 @@ def test_weights_in_parts_and_in_the_old_format_are_found(clip_folder, clip, tmp
         shutil.copytree(folder, place)
         (place / "model.safetensors").unlink()
     model.save_pretrained(parts, max_shard_size="100KB")
-    assert not (parts / "model.safetensors").exists() and len(list(parts.glob("model-*.safetensors"))) > 1
+    assert (
+        not (parts / "model.safetensors").exists()
+        and len(list(parts.glob("model-*.safetensors"))) > 1
+    )
     torch.save(model.state_dict(), old / "pytorch_model.bin")
     expected = clip.images(floating(pictures(2)))
     for place in (parts, old):
@@ -226,19 +254,42 @@ def test_weights_in_parts_and_in_the_old_format_are_found(clip_folder, clip, tmp
 @pytest.mark.parametrize(
     "change, complaint",
     [
-        (lambda f: shutil.rmtree(f), "there is no folder .*Place these files there: config.json, model.safetensors"),
-        (lambda f: (f / "config.json").unlink(), "has no config.json.*openai/clip-vit-large-patch14-336"),
+        (
+            lambda f: shutil.rmtree(f),
+            "there is no folder .*Place these files there: config.json, model.safetensors",
+        ),
+        (
+            lambda f: (f / "config.json").unlink(),
+            "has no config.json.*openai/clip-vit-large-patch14-336",
+        ),
         (lambda f: (f / "config.json").write_text("{"), r"config\.json: not JSON"),
-        (lambda f: edit(f / "config.json", model_type="dinov2"), "model_type 'dinov2', expected 'clip'"),
-        (lambda f: (f / "model.safetensors").unlink(), "no model.safetensors and no pytorch_model.bin.*hf download"),
-        (lambda f: (f / "model.safetensors").write_bytes(b"x" * 99), "cannot be loaded: .*fetch its files again"),
+        (
+            lambda f: edit(f / "config.json", model_type="dinov2"),
+            "model_type 'dinov2', expected 'clip'",
+        ),
+        (
+            lambda f: (f / "model.safetensors").unlink(),
+            "no model.safetensors and no pytorch_model.bin.*hf download",
+        ),
+        (
+            lambda f: (f / "model.safetensors").write_bytes(b"x" * 99),
+            "cannot be loaded: .*fetch its files again",
+        ),
         (lambda f: (f / "preprocessor_config.json").unlink(), "no preprocessor_config.json"),
-        (lambda f: (f / "tokenizer.json").unlink(), "has no tokenizer.json, nor vocab.json with merges.txt"),
+        (
+            lambda f: (f / "tokenizer.json").unlink(),
+            "has no tokenizer.json, nor vocab.json with merges.txt",
+        ),
         (lambda f: (f / "tokenizer.json").write_text("{}"), "not a tokenizer"),
-        (lambda f: edit(f / "preprocessor_config.json", crop_size=40), r"gives \(40, 40\), the network .* \(32, 32\)"),
+        (
+            lambda f: edit(f / "preprocessor_config.json", crop_size=40),
+            r"gives \(40, 40\), the network .* \(32, 32\)",
+        ),
     ],
 )
-def test_a_folder_that_will_not_do_is_refused_with_the_remedy(clip_folder, tmp_path, change, complaint):
+def test_a_folder_that_will_not_do_is_refused_with_the_remedy(
+    clip_folder, tmp_path, change, complaint
+):
     folder = tmp_path / "clip"
     shutil.copytree(clip_folder[0], folder)
     change(folder)
@@ -259,7 +310,10 @@ def test_missing_tensors_are_not_filled_with_noise(clip_folder, tmp_path):
     state = load_file(path)
     del state["text_projection.weight"]
     save_file(state, path, metadata={"format": "pt"})
-    with pytest.raises(InputError, match=r"lacks 1 tensors that config.json calls for, text_projection\.weight first"):
+    with pytest.raises(
+        InputError,
+        match=r"lacks 1 tensors that config.json calls for, text_projection\.weight first",
+    ):
         load_encoder(f"clip:{tmp_path / 'clip'}")
 
 
@@ -282,7 +336,8 @@ def test_another_model_s_tokenizer_is_refused(clip_folder, tmp_path):
     fewer = {t: i for i, t in enumerate(t for t in vocab if t != "bear</w>")}
     tiny_models.CLIPTokenizer(vocab=fewer, merges=merges[:2]).save_pretrained(tmp_path / "clip")
     with pytest.raises(
-        InputError, match="has 516 tokens and ends a text with 515, the model .* knows 517 and expects 516"
+        InputError,
+        match="has 516 tokens and ends a text with 515, the model .* knows 517 and expects 516",
     ):
         load_encoder(f"clip:{tmp_path / 'clip'}")
 
@@ -290,9 +345,15 @@ def test_another_model_s_tokenizer_is_refused(clip_folder, tmp_path):
 @pytest.mark.parametrize(
     "bad, complaint",
     [
-        (np.zeros((4, 4, 4), np.float32), r"images\[1\]: got shape \(4, 4, 4\), expected \(H, W, 3\)"),
+        (
+            np.zeros((4, 4, 4), np.float32),
+            r"images\[1\]: got shape \(4, 4, 4\), expected \(H, W, 3\)",
+        ),
         (np.zeros((4, 4, 3), np.uint8), r"images\[1\]: got uint8, expected floating"),
-        (np.full((4, 4, 3), 1.5, np.float32), r"images\[1\]: got values in \[1.5, 1.5\], expected \[0, 1\]"),
+        (
+            np.full((4, 4, 3), 1.5, np.float32),
+            r"images\[1\]: got values in \[1.5, 1.5\], expected \[0, 1\]",
+        ),
         (np.full((4, 4, 3), np.nan, np.float32), r"images\[1\]: 48 values are NaN or infinite"),
         (np.full((4, 4, 3), 1e300), r"images\[1\]: got values in \[1e\+300"),
         (np.zeros((0, 4, 3), np.float32), "at least one pixel"),

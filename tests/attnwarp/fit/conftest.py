@@ -19,7 +19,9 @@ def ring(count=10, size=SIZE, offset=(0.0, 0.0, 0.0)):
         yaw = 2 * math.pi * k / count
         position = np.array([3 * math.cos(yaw), 3 * math.sin(yaw), 0.5 + 0.3 * (k % 3)]) + offset
         name = f"{k:02d}.png"
-        cameras.append(Camera.look_at(position, offset, width=size, height=size, fov_y=40, name=name))
+        cameras.append(
+            Camera.look_at(position, offset, width=size, height=size, fov_y=40, name=name)
+        )
     return cameras
 
 
@@ -30,7 +32,9 @@ def blobs(count=40, seed=3, offset=(0.0, 0.0, 0.0)):
     quats = torch.randn(count, 4, generator=random)
     scales = 0.08 + 0.1 * torch.rand(count, 3, generator=random)
     opacities = torch.full((count,), 0.9)
-    return Gaussians("3d", means, quats, scales, opacities, Gaussians.sh_from_rgb(color), origin=np.array(offset))
+    return Gaussians(
+        "3d", means, quats, scales, opacities, Gaussians.sh_from_rgb(color), origin=np.array(offset)
+    )
 
 
 def pictures(splats, cameras, *, alpha=False):
@@ -58,7 +62,8 @@ def scene():
 
 @pytest.fixture(autouse=True, scope="package")
 def one_thread():
-    """Pictures this small gain nothing from threads, and lose much where others want the cores too."""
+    """Pictures this small gain nothing from threads, and lose much where others want the cores
+    too."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

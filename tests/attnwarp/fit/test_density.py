@@ -49,7 +49,9 @@ def test_gradient_on_screen_is_that_of_the_pixels_for_a_loss_of_pixels():
     means = torch.tensor(random.normal(0, 0.5, (20, 3)), requires_grad=True)
     upstream = torch.tensor(random.normal(0, 1, (20, 2)))
     # The oracle projects with torch and asks autograd for both gradients.
-    c = (means + torch.tensor(origin)) @ torch.tensor(camera.rotation.T.copy()) + torch.tensor(camera.translation)
+    c = (means + torch.tensor(origin)) @ torch.tensor(camera.rotation.T.copy()) + torch.tensor(
+        camera.translation
+    )
     pixels = (c @ torch.tensor(camera.K.T.copy()))[:, :2] / c[:, 2:]
     (pixels * upstream).sum().backward()
     ours = screen_gradient(means.grad, means.detach(), camera, origin, near=0.01)
@@ -98,8 +100,11 @@ def test_halves_are_drawn_from_the_splat_they_replace(kind):
     sigma = torch.zeros(3, dtype=torch.float64)
     sigma[: scales.shape[1]] = scales[0].double()
     expected = R @ torch.diag(sigma**2) @ R.T
-    # The standard error of a variance s^2 from n draws is s^2 sqrt(2 / n), 1.6 % of the largest here; 4 of them.
-    torch.testing.assert_close(offset.T @ offset / len(offset), expected, rtol=0, atol=4 * 0.81 * math.sqrt(2 / 8000))
+    # The standard error of a variance s^2 from n draws is s^2 sqrt(2 / n), 1.6 % of the largest
+    # here; 4 of them.
+    torch.testing.assert_close(
+        offset.T @ offset / len(offset), expected, rtol=0, atol=4 * 0.81 * math.sqrt(2 / 8000)
+    )
 
 
 def test_transparent_and_huge_splats_are_removed_but_far_ones_may_be_large():
@@ -126,7 +131,9 @@ def test_growth_stops_at_the_limit_and_prefers_the_largest_gradients():
     density.seen[:] = 1
     density.total[:] = torch.tensor([1.0, 5, 2, 4, 3, 0])
     density.refine(model, 5, torch.Generator().manual_seed(0))
-    torch.testing.assert_close(model.gaussians().means.detach(), start.means[[0, 1, 2, 3, 4, 5, 1, 3]])
+    torch.testing.assert_close(
+        model.gaussians().means.detach(), start.means[[0, 1, 2, 3, 4, 5, 1, 3]]
+    )
 
 
 def test_nothing_is_added_after_its_share_of_the_iterations():
@@ -142,7 +149,9 @@ def test_those_that_stay_keep_adams_memory_and_new_ones_have_none():
     model, _ = model_and_density(start)
     step(model)
     before = model.state()
-    model.replace(torch.tensor([3, 0]), {name: tensor.detach()[[1]] for name, tensor in model.tensors.items()})
+    model.replace(
+        torch.tensor([3, 0]), {name: tensor.detach()[[1]] for name, tensor in model.tensors.items()}
+    )
     for name in NAMES:
         for moment in ("first", "second"):
             after = getattr(model, moment)[name]
@@ -160,7 +169,9 @@ def test_a_reset_lowers_every_opacity_and_forgets_where_it_was_going():
     density.refine(model, 5, torch.Generator())
     now = model.gaussians().opacities.detach()
     torch.testing.assert_close(now, was.clamp_max(0.01), rtol=1e-5, atol=0)
-    assert float(model.first["opacity"].abs().max()) == float(model.second["opacity"].abs().max()) == 0
+    assert (
+        float(model.first["opacity"].abs().max()) == float(model.second["opacity"].abs().max()) == 0
+    )
 
 
 def test_the_centres_learning_rate_falls_exponentially_with_the_scenes_size():

@@ -1,4 +1,6 @@
-"""The fit as a whole: it gets better, it can be stopped and gone on with, and it says what is wrong."""
+"""The fit as a whole: it gets better, it can be stopped and gone on with, and it says what is
+wrong.
+"""
 
 import dataclasses
 import json
@@ -16,19 +18,39 @@ from attnwarp.render import render
 from .conftest import blobs, pictures, ring
 
 BUSY = {
-    "iterations": 60, "densify_from": 10, "densify_every": 10, "densify_until": 0.9, "reset_every": 30,
-    "sh_degree": 1, "sh_every": 20, "normal_from": 0.2, "evaluate_every": 20, "grow_gradient": 1e-5,
-    "max_splats": 90, "background": "random", "prune_opacity": 0.005,
-}  # fmt: skip
+    "iterations": 60,
+    "densify_from": 10,
+    "densify_every": 10,
+    "densify_until": 0.9,
+    "reset_every": 30,
+    "sh_degree": 1,
+    "sh_every": 20,
+    "normal_from": 0.2,
+    "evaluate_every": 20,
+    "grow_gradient": 1e-5,
+    "max_splats": 90,
+    "background": "random",
+    "prune_opacity": 0.005,
+}
 """Everything that a fit does happens within 60 iterations."""
 
-FAST = {"sh_degree": 0, "densify": False, "lr_means": 1e-3, "lr_dc": 2e-2, "lr_opacity": 0.2, "lr_scales": 2e-2}
+FAST = {
+    "sh_degree": 0,
+    "densify": False,
+    "lr_means": 1e-3,
+    "lr_dc": 2e-2,
+    "lr_opacity": 0.2,
+    "lr_scales": 2e-2,
+}
 """40 splats can be pushed harder than thousands."""
 
 
 def begin(scene, **changes):
     settings = FitSettings(**changes)
-    return from_points(scene[2], scene[3], kind=settings.kind, sh_degree=settings.sh_degree), settings
+    return (
+        from_points(scene[2], scene[3], kind=settings.kind, sh_degree=settings.sh_degree),
+        settings,
+    )
 
 
 def values(splats: Gaussians):
@@ -36,7 +58,9 @@ def values(splats: Gaussians):
 
 
 def same_bits(a: Gaussians, b: Gaussians) -> bool:
-    return all(torch.equal(x, y) for x, y in zip(values(a).values(), values(b).values(), strict=True))
+    return all(
+        torch.equal(x, y) for x, y in zip(values(a).values(), values(b).values(), strict=True)
+    )
 
 
 def untimed(history):
@@ -63,14 +87,21 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
 
     monkeypatch.setattr("attnwarp.fit.loop.render", watched)
     k = 3
-    start, settings = begin(scene, iterations=4 * k, sh_every=k, evaluate_every=1000, **{**FAST, "sh_degree": 2})
+    start, settings = begin(
+        scene, iterations=4 * k, sh_every=k, evaluate_every=1000, **{**FAST, "sh_degree": 2}
+    )
     result = fit(start, scene[0], settings)
-    # Iteration i is drawn with degree i // k, up to the settings' own: 0 at 0, 1 from k, 2 from 2k, and 2 it stays.
+    # Iteration i is drawn with degree i // k, up to the settings' own: 0 at 0, 1 from k, 2 from 2k,
+    # and 2 it stays.
     assert asked == [0, 0, 0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
     # What was not drawn had no gradient and stays as it began; what was drawn moved.
     only_first = fit(start, scene[0], dataclasses.replace(settings, iterations=k)).gaussians.sh
-    assert bool((only_first[:, 1:] == 0).all()) and not torch.equal(only_first[:, :1], start.sh[:, :1])
-    assert bool((result.gaussians.sh[:, 1:4] != 0).any()) and bool((result.gaussians.sh[:, 4:] != 0).any())
+    assert bool((only_first[:, 1:] == 0).all()) and not torch.equal(
+        only_first[:, :1], start.sh[:, :1]
+    )
+    assert bool((result.gaussians.sh[:, 1:4] != 0).any()) and bool(
+        (result.gaussians.sh[:, 4:] != 0).any()
+    )
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
@@ -80,7 +111,14 @@ def test_stopped_anywhere_and_gone_on_with_a_fit_gives_the_same_bits(scene, kind
     assert len(whole.gaussians) > len(start)  # splats were added, or nothing much was tested
     for at in (7, 30, 41):
         asked = iter(range(1000))
-        fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path, stop=lambda at=at, i=asked: next(i) >= at)
+        fit(
+            start,
+            scene[0],
+            settings,
+            held_out=scene[1],
+            folder=tmp_path,
+            stop=lambda at=at, i=asked: next(i) >= at,
+        )
         if at == 41:
             parts = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path)
     assert same_bits(whole.gaussians, parts.gaussians)
@@ -124,7 +162,9 @@ def test_a_world_far_from_its_origin_is_fitted_as_well():
         truth, cameras = blobs(offset=offset), ring(offset=np.array(offset))
         start = from_points(truth.world_means(), kind="2d", sh_degree=0)
         settings = FitSettings(iterations=40, sh_degree=0, densify=False)
-        result = fit(start, pictures(truth, cameras[1:]), settings, held_out=pictures(truth, cameras[:1]))
+        result = fit(
+            start, pictures(truth, cameras[1:]), settings, held_out=pictures(truth, cameras[:1])
+        )
         figures.append([record.psnr for record in result.history])
     # Positions differ by 1e-10 after the offset; Adam's sign-like steps make 1e-2 dB of it at most.
     np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
@@ -146,8 +186,12 @@ def test_scaling_the_world_changes_nothing():
 
         images = [render(truth, c, near=near).color.clamp(0, 1).numpy() for c in moved]
         start = from_points(truth.world_means(), kind="2d", sh_degree=0)
-        settings = FitSettings(iterations=40, sh_degree=0, densify=False, normal_from=0, distortion_from=0)
-        result = fit(start, Views(moved[1:], images[1:]), settings, held_out=Views(moved[:1], images[:1]))
+        settings = FitSettings(
+            iterations=40, sh_degree=0, densify=False, normal_from=0, distortion_from=0
+        )
+        result = fit(
+            start, Views(moved[1:], images[1:]), settings, held_out=Views(moved[:1], images[:1])
+        )
         figures.append([record.psnr for record in result.history])
     np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
     np.testing.assert_allclose(figures[0], figures[2], atol=0.05)
@@ -173,7 +217,13 @@ def test_no_seconds_left_means_no_iteration(scene):
 
 def test_patience_ends_a_fit_that_no_longer_gains(scene):
     start, settings = begin(
-        scene, iterations=500, sh_degree=0, densify=False, evaluate_every=10, patience=2, min_gain=50.0
+        scene,
+        iterations=500,
+        sh_degree=0,
+        densify=False,
+        evaluate_every=10,
+        patience=2,
+        min_gain=50.0,
     )
     result = fit(start, scene[0], settings, held_out=scene[1])
     assert (result.stopped, result.iteration) == ("patience", 20)
@@ -181,7 +231,13 @@ def test_patience_ends_a_fit_that_no_longer_gains(scene):
 
 def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
     start, settings = begin(scene, iterations=20, sh_degree=0, evaluate_every=10)
-    result = fit(start, scene[0], settings, folder=tmp_path, measure=lambda g: {"largest": float(g.scales.max())})
+    result = fit(
+        start,
+        scene[0],
+        settings,
+        folder=tmp_path,
+        measure=lambda g: {"largest": float(g.scales.max())},
+    )
     assert [record.iteration for record in result.history] == [0, 10, 20]
     assert all(record.measures["largest"] > 0 for record in result.history)
     assert all(record.psnr is None for record in result.history)
@@ -232,11 +288,19 @@ def test_splats_of_another_kind_or_degree_are_refused(scene):
 
 def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
     start, settings = begin(
-        scene, kind="2d", sh_degree=0, iterations=60, densify_from=10, densify_every=10, densify_until=1.0,
+        scene,
+        kind="2d",
+        sh_degree=0,
+        iterations=60,
+        densify_from=10,
+        densify_every=10,
+        densify_until=1.0,
         prune_opacity=0.5,
-    )  # fmt: skip
+    )
     start.means = start.means + 100
-    with pytest.raises(RuntimeError, match="check that cameras and points are in one coordinate system"):
+    with pytest.raises(
+        RuntimeError, match="check that cameras and points are in one coordinate system"
+    ):
         fit(start, scene[0], settings)
 
 

@@ -17,7 +17,9 @@ def step(iteration, **changes):
 
 def test_a_step_is_described_by_its_loss_and_psnr():
     assert describe(step(1)) == "loss 0.0374, PSNR 33.91 dB, held out 33.20 dB, 20000 splats"
-    assert describe(step(1, psnr=math.inf, held_out=None)) == "loss 0.0374, PSNR inf dB, 20000 splats"
+    assert (
+        describe(step(1, psnr=math.inf, held_out=None)) == "loss 0.0374, PSNR inf dB, 20000 splats"
+    )
 
 
 def test_without_a_terminal_there_are_plain_lines_now_and_then():
@@ -36,4 +38,8 @@ def test_on_a_terminal_the_counts_keep_their_digits(width):
     with shown(console, title="bear") as watch:
         watch(step(2999))
         watch(step(3000))
-    assert "3000/3000" in text.getvalue() and "loss 0.0374" in text.getvalue() and "…" not in text.getvalue()
+    assert (
+        "3000/3000" in text.getvalue()
+        and "loss 0.0374" in text.getvalue()
+        and "…" not in text.getvalue()
+    )

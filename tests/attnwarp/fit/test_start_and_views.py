@@ -7,7 +7,15 @@ import torch
 from PIL import Image
 
 from attnwarp import Camera
-from attnwarp.fit import Views, extent_of, from_points, hold_out, load_views, random_points, read_image
+from attnwarp.fit import (
+    Views,
+    extent_of,
+    from_points,
+    hold_out,
+    load_views,
+    random_points,
+    read_image,
+)
 from attnwarp.io import Dataset, FileFormatError
 
 from .conftest import ring
@@ -31,17 +39,22 @@ def test_first_splats_have_their_points_colours():
     colors = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
     g = from_points([[0, 0, 0], [1, 0, 0]], colors, kind="3d", sh_degree=2)
     assert g.sh.shape == (2, 9, 3)
-    torch.testing.assert_close(g.sh[:, 0] * 0.28209479177387814 + 0.5, torch.tensor(colors / 255, dtype=torch.float32))
+    torch.testing.assert_close(
+        g.sh[:, 0] * 0.28209479177387814 + 0.5, torch.tensor(colors / 255, dtype=torch.float32)
+    )
     assert float(g.sh[:, 1:].abs().max()) == 0
 
 
 def test_first_discs_are_turned_every_way_and_first_ellipsoids_none():
     points = np.random.default_rng(0).normal(size=(3000, 3))
     normals = from_points(points, kind="2d").normals()
-    # The mean of n random unit vectors has length of about 1 / sqrt(n) = 0.018; their covariance is I / 3.
+    # The mean of n random unit vectors has length of about 1 / sqrt(n) = 0.018; their covariance is
+    # I / 3.
     assert float(normals.mean(0).norm()) < 0.08
     torch.testing.assert_close(normals.T @ normals / 3000, torch.eye(3) / 3, rtol=0, atol=0.03)
-    torch.testing.assert_close(from_points(points, kind="3d").rotations(), torch.eye(3).expand(3000, 3, 3))
+    torch.testing.assert_close(
+        from_points(points, kind="3d").rotations(), torch.eye(3).expand(3000, 3, 3)
+    )
 
 
 def test_points_at_one_place_become_one_splat():
@@ -79,7 +92,9 @@ def test_random_points_surround_what_the_cameras_look_at():
 
 
 def test_random_points_lie_in_front_of_parallel_cameras():
-    cameras = [Camera.look_at([x, 0, 0], [x, 5, 0], width=8, height=8, fov_y=40) for x in (-1.0, 0.0, 1.0)]
+    cameras = [
+        Camera.look_at([x, 0, 0], [x, 5, 0], width=8, height=8, fov_y=40) for x in (-1.0, 0.0, 1.0)
+    ]
     points, _ = random_points(cameras, 1000)
     assert points[:, 1].mean() > 0.5
 
@@ -87,7 +102,9 @@ def test_random_points_lie_in_front_of_parallel_cameras():
 def test_extent_is_that_of_3dgs_and_one_for_a_single_camera():
     cameras = ring(4)
     centers = np.stack([c.position for c in cameras])
-    assert extent_of(cameras) == pytest.approx(1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    assert extent_of(cameras) == pytest.approx(
+        1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max()
+    )
     assert extent_of(cameras[:1]) == 1
 
 
@@ -121,7 +138,10 @@ def test_white_is_one_in_every_depth(dtype):
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((4, 5, 3), np.uint8), r"images\[0\] \(a.png\): got 5 x 4 px, its camera has 6 x 4"),
+        (
+            np.zeros((4, 5, 3), np.uint8),
+            r"images\[0\] \(a.png\): got 5 x 4 px, its camera has 6 x 4",
+        ),
         (np.zeros((4, 6), np.uint8), r"got shape \(4, 6\)"),
         (np.zeros((4, 6, 3), np.int32), "got int32"),
         (np.full((4, 6, 3), 1.5, np.float32), r"got values in \[1.5, 1.5\]"),
@@ -177,7 +197,9 @@ def test_colour_of_transparent_pixels_does_not_bleed_when_shrunk(tmp_path):
     pixels[:, 1::2] = [0, 255, 0, 0]  # green that nobody can see
     Image.fromarray(pixels).save(tmp_path / "a.png")
     views = load_views(Dataset([camera(8, 8)], [tmp_path / "a.png"]), max_size=4)
-    np.testing.assert_allclose(views.images[0].astype(float), np.tile([200, 100, 50, 127.5], (4, 4, 1)), atol=1)
+    np.testing.assert_allclose(
+        views.images[0].astype(float), np.tile([200, 100, 50, 127.5], (4, 4, 1)), atol=1
+    )
 
 
 def named(count, splits=None):

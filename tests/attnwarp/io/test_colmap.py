@@ -9,7 +9,10 @@ from attnwarp.io import FileFormatError, read_colmap, read_dataset
 
 IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 6}
 
-CAMERAS = [(7, "PINHOLE", 8, 6, (10.0, 11.0, 3.5, 3.25)), (3, "SIMPLE_PINHOLE", 8, 6, (12.5, 4.0, 3.0))]
+CAMERAS = [
+    (7, "PINHOLE", 8, 6, (10.0, 11.0, 3.5, 3.25)),
+    (3, "SIMPLE_PINHOLE", 8, 6, (12.5, 4.0, 3.0)),
+]
 
 
 def poses(n=3):
@@ -19,7 +22,16 @@ def poses(n=3):
         t = np.random.default_rng(i).normal(size=3) + np.array([0, 0, 4])
         # Ids and names in different orders, a name with a space and one in a folder.
         names = ["b/second view.png", "c.png", "a.png"]
-        out.append((90 - i, (w, x, y, z), tuple(t), 7 if i else 3, names[i] if i < 3 else f"d{i}.png", 2 * (i % 2)))
+        out.append(
+            (
+                90 - i,
+                (w, x, y, z),
+                tuple(t),
+                7 if i else 3,
+                names[i] if i < 3 else f"d{i}.png",
+                2 * (i % 2),
+            )
+        )
     return out
 
 
@@ -27,17 +39,22 @@ POINTS = [(5, (0.1, -2.5, 3e5), (0, 128, 255), 2), (1, (1 / 3, 0, -1), (9, 8, 7)
 
 
 def write_binary(folder, cameras=CAMERAS, images=None, points=POINTS):
-    """The binary layout of colmap.github.io/format.html and its reconstruction_io, little endian."""
+    """The binary layout of colmap.github.io/format.html and its reconstruction_io, little
+    endian."""
     folder.mkdir(parents=True, exist_ok=True)
     images = poses() if images is None else images
     data = struct.pack("<Q", len(cameras))
     for camera, model, w, h, params in cameras:
-        data += struct.pack("<IiQQ", camera, IDS.get(model, model), w, h) + struct.pack(f"<{len(params)}d", *params)
+        data += struct.pack("<IiQQ", camera, IDS.get(model, model), w, h) + struct.pack(
+            f"<{len(params)}d", *params
+        )
     (folder / "cameras.bin").write_bytes(data)
     data = struct.pack("<Q", len(images))
     for image, q, t, camera, name, keypoints in images:
         data += struct.pack("<I4d3dI", image, *q, *t, camera) + name.encode() + b"\0"
-        data += struct.pack("<Q", keypoints) + b"".join(struct.pack("<ddq", 1.5, 2.5, -1) for _ in range(keypoints))
+        data += struct.pack("<Q", keypoints) + b"".join(
+            struct.pack("<ddq", 1.5, 2.5, -1) for _ in range(keypoints)
+        )
     (folder / "images.bin").write_bytes(data)
     data = struct.pack("<Q", len(points))
     for point, xyz, rgb, track in points:
@@ -50,8 +67,13 @@ def write_binary(folder, cameras=CAMERAS, images=None, points=POINTS):
 def write_text(folder, cameras=CAMERAS, images=None, points=POINTS):
     folder.mkdir(parents=True, exist_ok=True)
     images = poses() if images is None else images
-    lines = ["# Camera list with one line of data per camera:", f"# Number of cameras: {len(cameras)}"]
-    lines += [" ".join(map(repr, [c, w, h, *p])).replace(" ", f" {m} ", 1) for c, m, w, h, p in cameras]
+    lines = [
+        "# Camera list with one line of data per camera:",
+        f"# Number of cameras: {len(cameras)}",
+    ]
+    lines += [
+        " ".join(map(repr, [c, w, h, *p])).replace(" ", f" {m} ", 1) for c, m, w, h, p in cameras
+    ]
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
     lines = ["# Image list with two lines of data per image:"]
     for image, q, t, camera, name, keypoints in images:
@@ -91,7 +113,9 @@ def test_cameras_images_and_points_are_those_of_the_file(tmp_path, write):
         u, v = fx * local[:, 0] / local[:, 2] + cx, fy * local[:, 1] / local[:, 2] + cy
         np.testing.assert_allclose(xy[front], np.c_[u, v][front], rtol=1e-9, atol=1e-9)
     assert np.array_equal(data.points, [xyz for _, xyz, _, _ in POINTS])
-    assert data.colors.dtype == np.uint8 and np.array_equal(data.colors, [rgb for _, _, rgb, _ in POINTS])
+    assert data.colors.dtype == np.uint8 and np.array_equal(
+        data.colors, [rgb for _, _, rgb, _ in POINTS]
+    )
 
 
 def test_text_and_binary_give_the_same_cameras_bit_for_bit(tmp_path):
@@ -110,7 +134,9 @@ def test_the_binary_model_wins_where_both_are_there(tmp_path):
 def test_a_quaternion_is_normalised_and_a_zero_one_refused(tmp_path):
     image = (1, (2.0, 0.0, 0.0, 0.0), (0, 0, 1), 7, "a.png", 0)
     write_text(tmp_path, images=[image])
-    assert np.array_equal(read_colmap(tmp_path, missing_images="none").cameras[0].rotation, np.eye(3))
+    assert np.array_equal(
+        read_colmap(tmp_path, missing_images="none").cameras[0].rotation, np.eye(3)
+    )
     write_text(tmp_path, images=[(1, (0, 0, 0, 0), (0, 0, 1), 7, "a.png", 0)])
     with pytest.raises(FileFormatError, match=r"image 'a.png': got quaternion"):
         read_colmap(tmp_path, missing_images="none")
@@ -120,7 +146,9 @@ def test_a_quaternion_is_normalised_and_a_zero_one_refused(tmp_path):
 
 
 @pytest.mark.parametrize("write", [write_binary, write_text])
-@pytest.mark.parametrize(("model", "count"), [("SIMPLE_RADIAL", 4), ("OPENCV", 8), ("FULL_OPENCV", 12)])
+@pytest.mark.parametrize(
+    ("model", "count"), [("SIMPLE_RADIAL", 4), ("OPENCV", 8), ("FULL_OPENCV", 12)]
+)
 def test_a_lens_model_with_distortion_is_named_with_the_remedy(tmp_path, write, model, count):
     lens = (7, model, 8, 6, (10.0, 4.0, 3.0, *[0.0] * (count - 3)))
     write(tmp_path, cameras=[lens, CAMERAS[1]])
@@ -210,7 +238,9 @@ def test_points_that_are_not_wanted_are_not_read(tmp_path, write):
 
 def test_missing_images_are_listed(tmp_path):
     write_binary(tmp_path / "sparse/0")
-    with pytest.raises(FileFormatError, match=r"3 of 3 images are missing: .*a\.png.*c\.png; put them there"):
+    with pytest.raises(
+        FileFormatError, match=r"3 of 3 images are missing: .*a\.png.*c\.png; put them there"
+    ):
         read_colmap(tmp_path)
 
 
@@ -242,7 +272,9 @@ def test_a_folder_that_is_both_kinds_or_none_is_not_guessed(tmp_path):
         read_dataset(tmp_path, format="colmap")
     write_binary(tmp_path / "sparse/0")
     (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(FileFormatError, match=r"both a transforms.json and a COLMAP model.*format="):
+    with pytest.raises(
+        FileFormatError, match=r"both a transforms.json and a COLMAP model.*format="
+    ):
         read_dataset(tmp_path)
     assert len(read_dataset(tmp_path, format="colmap", missing_images="none")) == 3
     with pytest.raises(FileFormatError, match="frames"):

@@ -36,7 +36,10 @@ def by_hand(path, columns, n, *, form="binary_little_endian", comments=(), types
             body += (" ".join(repr(float(v)) for v in values) + "\n").encode()
         else:
             order = "<" if form == "binary_little_endian" else ">"
-            codes = "".join({"float": "f", "double": "d", "uchar": "B"}[types.get(name, "float")] for name in columns)
+            codes = "".join(
+                {"float": "f", "double": "d", "uchar": "B"}[types.get(name, "float")]
+                for name in columns
+            )
             body += struct.pack(order + codes, *values)
     path.write_bytes(("\n".join([*head, "end_header"]) + "\n").encode() + body + extra)
     return path
@@ -57,7 +60,9 @@ def parse_by_hand(path):
     props = [line.split() for line in lines if line.startswith("property")]
     assert all(kind == "float" for _, kind, _ in props)
     (count,) = [int(line.split()[2]) for line in lines if line.startswith("element vertex")]
-    values = np.array(struct.unpack(f"<{count * len(props)}f", body), dtype=np.float32).reshape(count, len(props))
+    values = np.array(struct.unpack(f"<{count * len(props)}f", body), dtype=np.float32).reshape(
+        count, len(props)
+    )
     return lines, {prop[2]: values[:, i] for i, prop in enumerate(props)}
 
 
@@ -69,7 +74,9 @@ def model(n=7, kind="3d", degree=3, seed=0, **more):
 
     scales = torch.exp(tensor(n, 2 if kind == "2d" else 3) * 2 - 3)
     opacities = torch.sigmoid(tensor(n) * 4)
-    return Gaussians(kind, tensor(n, 3), tensor(n, 4), scales, opacities, tensor(n, (degree + 1) ** 2, 3), **more)
+    return Gaussians(
+        kind, tensor(n, 3), tensor(n, 4), scales, opacities, tensor(n, (degree + 1) ** 2, 3), **more
+    )
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -84,16 +91,22 @@ def test_a_file_made_by_hand_is_read_in_every_encoding(tmp_path, form, degree):
     for i in range(4):
         assert np.array_equal(g.quats[:, i].numpy(), columns[f"rot_{i}"])
     for row in range(n):
-        # exp and the sigmoid of the float32 in the file, in double, rounded once: half an ulp of float32.
+        # exp and the sigmoid of the float32 in the file, in double, rounded once: half an ulp of
+        # float32.
         for i in range(3):
-            assert g.scales[row, i].item() == pytest.approx(math.exp(float(columns[f"scale_{i}"][row])), rel=6e-8)
+            assert g.scales[row, i].item() == pytest.approx(
+                math.exp(float(columns[f"scale_{i}"][row])), rel=6e-8
+            )
         logit = float(columns["opacity"][row])
         assert g.opacities[row].item() == pytest.approx(1 / (1 + math.exp(-logit)), rel=6e-8)
         for channel in range(3):
             assert g.sh[row, 0, channel].item() == columns[f"f_dc_{channel}"][row]
             # Channel-major: all coefficients of red, then of green, then of blue.
             for k in range(rest // 3):
-                assert g.sh[row, 1 + k, channel].item() == columns[f"f_rest_{channel * (rest // 3) + k}"][row]
+                assert (
+                    g.sh[row, 1 + k, channel].item()
+                    == columns[f"f_rest_{channel * (rest // 3) + k}"][row]
+                )
 
 
 def test_further_properties_elements_and_missing_normals_do_not_matter(tmp_path):
@@ -118,11 +131,15 @@ def test_a_written_file_has_the_trainers_properties_in_their_order(tmp_path, kin
     for row in range(len(g)):
         for channel in range(3):
             for k in range(rest):
-                assert columns[f"f_rest_{channel * rest + k}"][row] == g.sh[row, 1 + k, channel].item()
+                assert (
+                    columns[f"f_rest_{channel * rest + k}"][row] == g.sh[row, 1 + k, channel].item()
+                )
         o = g.opacities[row].item()
         # The logarithm in double, rounded once to float32.
         assert columns["opacity"][row] == pytest.approx(math.log(o / (1 - o)), rel=1e-7, abs=1e-7)
-        assert columns["scale_1"][row] == pytest.approx(math.log(g.scales[row, 1].item()), rel=1e-7, abs=1e-7)
+        assert columns["scale_1"][row] == pytest.approx(
+            math.log(g.scales[row, 1].item()), rel=1e-7, abs=1e-7
+        )
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
@@ -143,7 +160,8 @@ def test_what_is_written_is_read_back(tmp_path, kind, antialiased, third_scale):
         assert torch.equal(getattr(back, name), getattr(g, name))
     assert np.array_equal(back.origin, origin)
     assert back.opacities[:2].tolist() == [0.0, 1.0]
-    # A float32 logarithm up to 104 in size is off by at most 3.8e-6, and so is what it stands for, relatively.
+    # A float32 logarithm up to 104 in size is off by at most 3.8e-6, and so is what it stands for,
+    # relatively.
     torch.testing.assert_close(back.scales, g.scales, rtol=4e-6, atol=0)
     torch.testing.assert_close(back.opacities, g.opacities, rtol=4e-6, atol=0)
 
@@ -153,7 +171,9 @@ def test_a_second_trip_through_a_file_changes_nothing_that_the_first_did_not(tmp
     once = read_ply(tmp_path / "a.ply")
     write_ply(tmp_path / "b.ply", once)
     twice = read_ply(tmp_path / "b.ply")
-    torch.testing.assert_close(twice.scales, once.scales, rtol=2.4e-7, atol=0)  # two roundings of float32
+    torch.testing.assert_close(
+        twice.scales, once.scales, rtol=2.4e-7, atol=0
+    )  # two roundings of float32
     assert torch.equal(twice.means, once.means) and torch.equal(twice.sh, once.sh)
 
 
@@ -186,7 +206,7 @@ def test_an_empty_model_makes_the_trip(tmp_path):
     assert len(back) == 0 and back.kind == "2d" and back.sh_degree == 1
 
 
-# --------------------------------------------------------------------------------------------------- other readers
+# -------- other readers
 
 
 def test_plyfile_and_open3d_read_the_points(tmp_path):
@@ -221,20 +241,34 @@ def test_plyfile_and_open3d_read_the_points(tmp_path):
 
 
 def test_a_file_that_gsplat_exports_is_read(tmp_path, monkeypatch):
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path / "none"))  # or gsplat might start to build for CUDA
+    monkeypatch.setenv(
+        "CUDA_HOME", str(tmp_path / "none")
+    )  # or gsplat might start to build for CUDA
     from gsplat.exporter import export_splats
 
     g = model(20)
     logits = torch.logit(g.opacities.double()).float()
-    export_splats(g.means, g.scales.log(), g.quats, logits, g.sh[:, :1], g.sh[:, 1:], save_to=str(tmp_path / "a.ply"))
+    export_splats(
+        g.means,
+        g.scales.log(),
+        g.quats,
+        logits,
+        g.sh[:, :1],
+        g.sh[:, 1:],
+        save_to=str(tmp_path / "a.ply"),
+    )
     back = read_ply(tmp_path / "a.ply")
-    assert torch.equal(back.sh, g.sh) and torch.equal(back.means, g.means) and torch.equal(back.quats, g.quats)
+    assert (
+        torch.equal(back.sh, g.sh)
+        and torch.equal(back.means, g.means)
+        and torch.equal(back.quats, g.quats)
+    )
     # float32 logarithms of size up to 12 on both ways.
     torch.testing.assert_close(back.scales, g.scales, rtol=2e-6, atol=0)
     torch.testing.assert_close(back.opacities, g.opacities, rtol=2e-6, atol=0)
 
 
-# -------------------------------------------------------------------------------------------------------- which kind
+# -------- which kind
 
 
 def test_two_scales_are_2d_and_three_are_3d(tmp_path):
@@ -279,7 +313,9 @@ def test_the_kind_can_be_forced_but_not_invented(tmp_path):
     path = by_hand(tmp_path / "b.ply", columns, 4, comments=["attnwarp kind 3d"])
     with pytest.raises(FileFormatError, match="scale_2: missing"):
         read_ply(path)
-    path = by_hand(tmp_path / "c.ply", columns, 4, comments=["attnwarp kind 3d", "SplatRenderMode: 2dgs"])
+    path = by_hand(
+        tmp_path / "c.ply", columns, 4, comments=["attnwarp kind 3d", "SplatRenderMode: 2dgs"]
+    )
     with pytest.raises(FileFormatError, match="contradict"):
         read_ply(path)
     assert read_ply(path, kind="2d").kind == "2d"
@@ -297,19 +333,23 @@ def test_the_kind_can_be_forced_but_not_invented(tmp_path):
     ],
 )
 def test_the_antialias_comments_of_other_programs_are_understood(tmp_path, comments, expected):
-    path = by_hand(tmp_path / "a.ply", columns_of(2, np.random.default_rng(0)), 2, comments=comments)
+    path = by_hand(
+        tmp_path / "a.ply", columns_of(2, np.random.default_rng(0)), 2, comments=comments
+    )
     assert read_ply(path).antialiased is expected
 
 
 def test_contradicting_antialias_comments_need_the_caller(tmp_path):
     columns = columns_of(2, np.random.default_rng(0))
-    path = by_hand(tmp_path / "a.ply", columns, 2, comments=["SplatRenderMode: mip", "antialiased 0"])
+    path = by_hand(
+        tmp_path / "a.ply", columns, 2, comments=["SplatRenderMode: mip", "antialiased 0"]
+    )
     with pytest.raises(FileFormatError, match=r"contradict.*antialiased=True or False"):
         read_ply(path)
     assert read_ply(path, antialiased=True).antialiased
 
 
-# ------------------------------------------------------------------------------------------------------------ origin
+# -------- origin
 
 
 def test_far_away_double_positions_are_kept_relative_to_a_rounded_origin(tmp_path):
@@ -334,7 +374,9 @@ def test_float64_means_far_away_lose_nothing_in_a_float32_file(tmp_path):
     g.origin = np.array([0.5, 0.0, 0.0])
     write_ply(tmp_path / "a.ply", g)
     back = read_ply(tmp_path / "a.ply")
-    assert np.abs(back.world_means() - g.world_means()).max() < 1e-6  # 4 x 2^-24, and an ulp of 1e6 in float64
+    assert (
+        np.abs(back.world_means() - g.world_means()).max() < 1e-6
+    )  # 4 x 2^-24, and an ulp of 1e6 in float64
 
 
 def test_double_positions_near_zero_and_exact_ones_need_no_origin(tmp_path):
@@ -352,7 +394,7 @@ def test_double_positions_near_zero_and_exact_ones_need_no_origin(tmp_path):
     assert np.array_equal(g.world_means(), np.full((3, 3), 123456.789))
 
 
-# --------------------------------------------------------------------------------------------------- malformed files
+# -------- malformed files
 
 
 def refused(path, *parts, reader=read_ply):
@@ -363,7 +405,9 @@ def refused(path, *parts, reader=read_ply):
     return caught.value
 
 
-@pytest.mark.parametrize("name", ["x", "f_dc_1", "opacity", "scale_0", "scale_1", "rot_3", "f_rest_4"])
+@pytest.mark.parametrize(
+    "name", ["x", "f_dc_1", "opacity", "scale_0", "scale_1", "rot_3", "f_rest_4"]
+)
 def test_a_missing_property_is_named(tmp_path, name):
     columns = columns_of(3, np.random.default_rng(0), rest=9)
     columns["f_rest_9" if name == "f_rest_4" else "spare"] = columns.pop(name)
@@ -377,7 +421,9 @@ def test_a_missing_property_is_named(tmp_path, name):
 def test_a_value_that_is_not_finite_is_named_with_its_first_row(tmp_path, name, value, form):
     columns = columns_of(6, np.random.default_rng(0), rest=9)
     columns[name][[3, 5]] = value
-    error = refused(by_hand(tmp_path / "a.ply", columns, 6, form=form), name, "row 3", "2 of 6", str(value))
+    error = refused(
+        by_hand(tmp_path / "a.ply", columns, 6, form=form), name, "row 3", "2 of 6", str(value)
+    )
     assert (error.field, error.row) == (name, 3)
 
 
@@ -392,7 +438,9 @@ def test_a_quaternion_without_direction_is_refused(tmp_path, value):
     columns = columns_of(6, np.random.default_rng(0))
     for i in range(4):
         columns[f"rot_{i}"][2] = value
-    assert refused(by_hand(tmp_path / "a.ply", columns, 6), "rot_0..3", "quaternion", "row 2").row == 2
+    assert (
+        refused(by_hand(tmp_path / "a.ply", columns, 6), "rot_0..3", "quaternion", "row 2").row == 2
+    )
 
 
 @pytest.mark.parametrize("log", [-150.0, 90.0])
@@ -445,8 +493,20 @@ def test_a_header_that_promises_too_much_does_not_eat_the_memory(tmp_path):
         (b"ply\nformat ascii 2.0\nend_header\n", "header"),
         (b"ply\nformat ascii 1.0\nelement vertex -3\nproperty float x\nend_header\n", ""),
         (b"ply\nformat ascii 1.0\nelement face 1\nproperty float x\nend_header\n1\n", "vertex"),
-        (b"ply\nformat ascii 1.0\ncomment \xff\nelement vertex 1\nproperty float x\nend_header\n1\n", "not ASCII"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float x\nend_header\n1 1\n", ""),
+        (
+            (
+                b"ply\nformat ascii 1.0\ncomment \xff\nelement vertex 1\nproperty float"
+                b" x\nend_header\n1\n"
+            ),
+            "not ASCII",
+        ),
+        (
+            (
+                b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float"
+                b" x\nend_header\n1 1\n"
+            ),
+            "",
+        ),
     ],
 )
 def test_what_is_not_a_ply_file_is_refused(tmp_path, reader, content, part):
@@ -471,13 +531,20 @@ def test_folders_and_absent_files_and_other_formats_say_so(tmp_path):
     refused(tmp_path / "p.ply", "point cloud", "read_points")
     path = by_hand(tmp_path / "c.ply", {"packed_position": [0.0]}, 1)
     refused(path, "compressed PLY")
-    path = by_hand(tmp_path / "o.ply", columns_of(1, np.random.default_rng(0)), 1, comments=["attnwarp origin 1 two 3"])
+    path = by_hand(
+        tmp_path / "o.ply",
+        columns_of(1, np.random.default_rng(0)),
+        1,
+        comments=["attnwarp origin 1 two 3"],
+    )
     refused(path, "origin", "three finite numbers")
 
 
 def test_point_clouds_with_bad_colours_or_values_are_refused(tmp_path):
     xyz = {name: [0.0, 1.0] for name in "xyz"}
-    path = by_hand(tmp_path / "a.ply", {**xyz, "red": [0.1, 0.2], "green": [0, 0], "blue": [0, 0]}, 2)
+    path = by_hand(
+        tmp_path / "a.ply", {**xyz, "red": [0.1, 0.2], "green": [0, 0], "blue": [0, 0]}, 2
+    )
     refused(path, "red", "uchar", reader=read_points)
     path = by_hand(tmp_path / "b.ply", {**xyz, "red": [1, 2]}, 2, types={"red": "uchar"})
     refused(path, "green", "missing", reader=read_points)
@@ -485,13 +552,18 @@ def test_point_clouds_with_bad_colours_or_values_are_refused(tmp_path):
     refused(path, "z", "row 1", reader=read_points)
 
 
-# ----------------------------------------------------------------------------------------------------------- writing
+# -------- writing
 
 
 def test_bad_values_are_refused_before_anything_is_written(tmp_path):
     write_ply(tmp_path / "a.ply", model())
     before = (tmp_path / "a.ply").read_bytes()
-    for name, value in (("means", float("nan")), ("quats", 0.0), ("opacities", 1.5), ("scales", -1.0)):
+    for name, value in (
+        ("means", float("nan")),
+        ("quats", 0.0),
+        ("opacities", 1.5),
+        ("scales", -1.0),
+    ):
         g = model()
         getattr(g, name)[2] = value
         with pytest.raises(ValueError, match=name):

@@ -23,7 +23,9 @@ def model(n=40, kind="3d", **more):
 
 
 def records(path):
-    """Each 32 bytes by the published layout: 3 f32 position, 3 f32 scale, 4 u8 rgba, 4 u8 quaternion."""
+    """Each 32 bytes by the published layout: 3 f32 position, 3 f32 scale, 4 u8 rgba, 4 u8
+    quaternion.
+    """
     data = path.read_bytes()
     assert len(data) % 32 == 0
     return [struct.unpack_from("<3f3f4B4B", data, at) for at in range(0, len(data), 32)]
@@ -34,7 +36,9 @@ def test_records_decode_to_the_splats_sorted_by_size_times_opacity(tmp_path, kin
     g = model(kind=kind)
     write_splat(tmp_path / "a.splat", g)
     rows = records(tmp_path / "a.splat")
-    importance = [float(np.prod(g.scales[i].double().numpy())) * g.opacities[i].item() for i in range(len(g))]
+    importance = [
+        float(np.prod(g.scales[i].double().numpy())) * g.opacities[i].item() for i in range(len(g))
+    ]
     order = sorted(range(len(g)), key=lambda i: -importance[i])
     assert len(rows) == len(g)
     for i, row in zip(order, rows, strict=True):
@@ -67,7 +71,9 @@ def test_a_far_origin_is_refused_unless_the_caller_leaves_it_out(tmp_path):
     with pytest.raises(ValueError, match="relative_to_origin=True"):
         write_splat(tmp_path / "a.splat", g)
     write_splat(tmp_path / "a.splat", g, relative_to_origin=True)
-    assert {row[:3] for row in records(tmp_path / "a.splat")} == {tuple(p) for p in g.means.tolist()}
+    assert {row[:3] for row in records(tmp_path / "a.splat")} == {
+        tuple(p) for p in g.means.tolist()
+    }
     g.origin = np.array([2.0, 0.0, 0.0])
     write_splat(tmp_path / "a.splat", g)
     world = {tuple(p) for p in g.world_means().astype(np.float32).tolist()}

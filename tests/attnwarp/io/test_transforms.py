@@ -7,7 +7,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
-from attnwarp.io import Dataset, FileFormatError, read_dataset, read_points, read_transforms, write_transforms
+from attnwarp.io import (
+    Dataset,
+    FileFormatError,
+    read_dataset,
+    read_points,
+    read_transforms,
+    write_transforms,
+)
 
 
 def image(path, size=(8, 6)):
@@ -65,7 +72,9 @@ def test_a_blender_file_gives_focal_length_from_the_angle_and_the_size_from_the_
     matrix = np.eye(4)
     matrix[2, 3] = 5
     frames = [{"file_path": "./train/r_0", "rotation": 0.01, "transform_matrix": matrix}]
-    data = read_transforms(write(tmp_path, frames, "transforms_train.json", camera_angle_x=math.radians(90)))
+    data = read_transforms(
+        write(tmp_path, frames, "transforms_train.json", camera_angle_x=math.radians(90))
+    )
     (camera,) = data.cameras
     # tan 45 = 1: half of 800 pixels; square pixels; the middle of the image.
     np.testing.assert_allclose(camera.K, [[400, 0, 400], [0, 400, 300], [0, 0, 1]], rtol=1e-15)
@@ -94,7 +103,14 @@ def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
     image(tmp_path / "b.png", (16, 12))
     frames = [
         {"file_path": "a.png", "transform_matrix": pose(0)},
-        {"file_path": "b.png", "transform_matrix": pose(1), "w": 16.0, "h": 12, "camera_angle_x": 1.0, "cx": 8},
+        {
+            "file_path": "b.png",
+            "transform_matrix": pose(1),
+            "w": 16.0,
+            "h": 12,
+            "camera_angle_x": 1.0,
+            "cx": 8,
+        },
     ]
     a, b = read_transforms(write(tmp_path, frames, **LENS)).cameras
     assert a.K.tolist() == [[10, 0, 3.5], [0, 11, 3.25], [0, 0, 1]]
@@ -106,18 +122,22 @@ def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
 def test_a_rotation_with_small_noise_becomes_the_nearest_rotation(tmp_path, noise):
     matrix = pose(4)
     image(tmp_path / "a.png")
-    noisy = matrix.astype(np.float32).astype(np.float64) if noise == "float32" else np.round(matrix, 5)
+    noisy = (
+        matrix.astype(np.float32).astype(np.float64) if noise == "float32" else np.round(matrix, 5)
+    )
     path = write(tmp_path, [{"file_path": "a.png", "transform_matrix": noisy}], **LENS)
     (camera,) = read_transforms(path).cameras
     R = camera.rotation
     assert np.abs(R @ R.T - np.eye(3)).max() < 1e-14
     # No further from the matrix it was rounded from than twice the rounding.
-    assert np.abs(R.T * [1, -1, -1] - matrix[:3, :3]).max() < (1.2e-7 if noise == "float32" else 2e-5)
+    assert np.abs(R.T * [1, -1, -1] - matrix[:3, :3]).max() < (
+        1.2e-7 if noise == "float32" else 2e-5
+    )
     np.testing.assert_allclose(camera.position, noisy[:3, 3], atol=1e-14)
 
 
 def test_a_clean_rotation_is_kept_bit_for_bit(tmp_path):
-    (camera, *_) = read_transforms(folder_of(tmp_path)).cameras
+    camera, *_ = read_transforms(folder_of(tmp_path)).cameras
     assert np.array_equal(camera.rotation.T * [1, -1, -1], pose(0)[:3, :3])
 
 
@@ -132,7 +152,9 @@ def test_a_clean_rotation_is_kept_bit_for_bit(tmp_path):
         (lambda m: m[:2], ["4 x 4"]),
     ],
 )
-def test_a_pose_that_is_not_rigid_is_refused_with_frame_and_size_of_the_error(tmp_path, change, parts):
+def test_a_pose_that_is_not_rigid_is_refused_with_frame_and_size_of_the_error(
+    tmp_path, change, parts
+):
     image(tmp_path / "a.png")
     image(tmp_path / "b.png")
     frames = [
@@ -180,9 +202,17 @@ def test_coefficients_of_zero_are_a_pinhole(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "part"),
-    [("", "empty"), ("{", "not JSON"), ("[]", "frames"), ("{}", "frames"), ('{"frames": []}', "frames"),
-     ('{"frames": [3]}', "frames[0]"), ('{"frames": [{}]}', "frames[0].file_path"), ("\xff", "not JSON")],
-)  # fmt: skip
+    [
+        ("", "empty"),
+        ("{", "not JSON"),
+        ("[]", "frames"),
+        ("{}", "frames"),
+        ('{"frames": []}', "frames"),
+        ('{"frames": [3]}', "frames[0]"),
+        ('{"frames": [{}]}', "frames[0].file_path"),
+        ("\xff", "not JSON"),
+    ],
+)
 def test_what_is_no_transforms_file_is_refused(tmp_path, text, part):
     (tmp_path / "transforms.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(FileFormatError) as caught:
@@ -207,7 +237,9 @@ def test_missing_images_are_listed_and_can_be_waived(tmp_path):
 def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
     path = folder_of(tmp_path)
     image(tmp_path / "images/001.png", (4, 3))
-    with pytest.raises(FileFormatError, match=r"001.png is 4 x 3, but its camera is 8 x 6.*resize_cameras=True"):
+    with pytest.raises(
+        FileFormatError, match=r"001.png is 4 x 3, but its camera is 8 x 6.*resize_cameras=True"
+    ):
         read_transforms(path)
     cameras = read_transforms(path, resize_cameras=True).cameras
     assert [(c.width, c.height) for c in cameras] == [(8, 6), (4, 3), (8, 6)]

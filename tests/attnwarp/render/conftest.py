@@ -11,12 +11,23 @@ import torch
 
 from attnwarp import Camera, Gaussians
 
-OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
+OUTPUTS = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_l1",
+    "distortion_l2_ndc",
+    "weight",
+)
 """The differentiable fields of a Render."""
 
 
 def camera_of(seed: int, width: int, height: int) -> Camera:
-    """A camera near (0, -3, 0.3) with unequal focal lengths, skew and an off-centre principal point."""
+    """A camera near (0, -3, 0.3) with unequal focal lengths, skew and an off-centre principal
+    point.
+    """
     rng = np.random.default_rng(seed)
     position = np.array([0.0, -3.0, 0.3]) + rng.uniform(-0.3, 0.3, 3)
     view = Camera.look_at(position, rng.uniform(-0.2, 0.2, 3), width=width, height=height, fov_y=55)
@@ -27,8 +38,9 @@ def camera_of(seed: int, width: int, height: int) -> Camera:
 
 
 def splats_of(seed: int, kind: str, count: int, camera: Camera, degree: int = 3) -> Gaussians:
-    """Random splats before a camera; among them, when there are enough: one crossing the camera plane, one behind it,
-    edge-on ones, a needle, opacities 0 and 1, equal depths, duplicates, one far off the image."""
+    """Random splats before a camera; among them, when there are enough: one crossing the camera
+    plane, one behind it, edge-on ones, a needle, opacities 0 and 1, equal depths, duplicates, one
+    far off the image."""
     rng = np.random.default_rng(seed + 1000)
     means = rng.normal(size=(count, 3)) * 0.5
     quats = rng.normal(size=(count, 4))
@@ -42,7 +54,9 @@ def splats_of(seed: int, kind: str, count: int, camera: Camera, degree: int = 3)
         means[1] = position + R.T @ np.array([0.2, -0.2, -0.1])  # centre behind, edge in front
         scales[1] = 0.4
         opacities[2], opacities[3] = 0.0, 1.0
-        means[4:7] = position + (R.T @ np.array([[0.1, 0.2, 2.5], [-0.2, 0.1, 2.5], [0.05, -0.1, 2.5]]).T).T
+        means[4:7] = (
+            position + (R.T @ np.array([[0.1, 0.2, 2.5], [-0.2, 0.1, 2.5], [0.05, -0.1, 2.5]]).T).T
+        )
         for name in (means, quats, scales, opacities, sh):
             name[7] = name[8]
         quats[9] = edge_on(means[9], camera, rng.uniform(0, 2 * np.pi), 1e-9)
@@ -54,7 +68,9 @@ def splats_of(seed: int, kind: str, count: int, camera: Camera, degree: int = 3)
 
 
 def edge_on(mean: np.ndarray, camera: Camera, roll: float, tilt: float) -> np.ndarray:
-    """Quaternion (wxyz) of a splat at ``mean`` whose normal makes pi/2 - ``tilt`` with the ray to it."""
+    """Quaternion (wxyz) of a splat at ``mean`` whose normal makes pi/2 - ``tilt`` with the ray to
+    it.
+    """
     ray = mean - camera.position
     ray = ray / np.linalg.norm(ray)
     side = np.cross(ray, [0.3, 0.5, 0.8])
@@ -95,17 +111,33 @@ def facing() -> Callable[..., Gaussians]:
     """Discs or balls at chosen points, facing a camera at the origin that looks along +z."""
 
     def make(
-        means: Any, scales: Any = 0.1, opacities: Any = 0.5, colors: Any = 1.0, kind: str = "2d", normals: Any = None
+        means: Any,
+        scales: Any = 0.1,
+        opacities: Any = 0.5,
+        colors: Any = 1.0,
+        kind: str = "2d",
+        normals: Any = None,
     ) -> Gaussians:
         points = torch.as_tensor(np.asarray(means), dtype=torch.float64).reshape(-1, 3)
         n = len(points)
         quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1)
         if normals is not None:
-            quats = torch.tensor(np.stack([quaternion_to(v) for v in np.asarray(normals).reshape(-1, 3)]))
-        size = torch.as_tensor(scales, dtype=torch.float64).expand(n, 2 if kind == "2d" else 3).clone()
+            quats = torch.tensor(
+                np.stack([quaternion_to(v) for v in np.asarray(normals).reshape(-1, 3)])
+            )
+        size = (
+            torch.as_tensor(scales, dtype=torch.float64).expand(n, 2 if kind == "2d" else 3).clone()
+        )
         opacity = torch.as_tensor(opacities, dtype=torch.float64).expand(n).clone()
         color = torch.as_tensor(colors, dtype=torch.float64).expand(n, 3)
-        return Gaussians("2d" if kind == "2d" else "3d", points, quats, size, opacity, Gaussians.sh_from_rgb(color))
+        return Gaussians(
+            "2d" if kind == "2d" else "3d",
+            points,
+            quats,
+            size,
+            opacity,
+            Gaussians.sh_from_rgb(color),
+        )
 
     return make
 
@@ -115,6 +147,8 @@ def front_camera() -> Callable[..., Camera]:
     """Camera at the origin looking along +z, principal point at the middle."""
 
     def make(size: int = 33, focal: float = 40.0) -> Camera:
-        return Camera(np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]), np.eye(4), size, size)
+        return Camera(
+            np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]), np.eye(4), size, size
+        )
 
     return make

@@ -1,4 +1,6 @@
-"""The numba backend against the float64 definition: values and gradients, every output and every parameter."""
+"""The numba backend against the float64 definition: values and gradients, every output and every
+parameter.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,22 @@ import torch
 from attnwarp import Camera, Gaussians
 from attnwarp.render import api, constants, cpu, reference, render
 
-OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
-MODES = [("2d", "intersection", False), ("2d", "center", False), ("3d", "center", False), ("3d", "peak", True)]
+OUTPUTS = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_l1",
+    "distortion_l2_ndc",
+    "weight",
+)
+MODES = [
+    ("2d", "intersection", False),
+    ("2d", "center", False),
+    ("3d", "center", False),
+    ("3d", "peak", True),
+]
 
 
 def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.Inputs:
@@ -22,16 +38,19 @@ def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.
 
 
 def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Smallest and largest value of each output when every threshold is moved by what float32 may round.
+    """Smallest and largest value of each output when every threshold is moved by what float32 may
+    round.
 
-    A pixel whose alpha is 1/255 to seven digits is drawn or not by rounding, in any renderer; what must hold is that
-    the float32 answer is one of the two.
+    A pixel whose alpha is 1/255 to seven digits is drawn or not by rounding, in any renderer; what
+    must hold is that the float32 answer is one of the two.
     """
     t = reference.Thresholds()
     versions = [reference.render(inputs)]
     for sign in (-1, 1):
         versions += [
-            reference.render(inputs, dataclasses.replace(t, alpha_min=t.alpha_min * (1 + sign * 2e-6))),
+            reference.render(
+                inputs, dataclasses.replace(t, alpha_min=t.alpha_min * (1 + sign * 2e-6))
+            ),
             # Transmittance is a product of up to 40 factors, each with its own rounding.
             reference.render(inputs, dataclasses.replace(t, stop=t.stop * (1 + sign * 2e-5))),
             reference.render(inputs, dataclasses.replace(t, median=t.median * (1 + sign * 5e-6))),
@@ -43,7 +62,10 @@ def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Ten
         absent = stack.isnan()
         low = torch.where(absent, torch.inf, stack).amin(0)
         high = torch.where(absent, -torch.inf, stack).amax(0)
-        result[name] = (torch.where(absent.any(0), -torch.inf, low), torch.where(absent.any(0), torch.inf, high))
+        result[name] = (
+            torch.where(absent.any(0), -torch.inf, low),
+            torch.where(absent.any(0), torch.inf, high),
+        )
         # NaN everywhere is an answer as well.
         result[name] = tuple(torch.where(absent.all(0), torch.nan, bound) for bound in result[name])
     return result
@@ -56,10 +78,12 @@ def excess(inputs: reference.Inputs) -> dict[str, float]:
     for name in OUTPUTS:
         value, (low, high) = getattr(actual, name).double(), expected[name]
         assert value.dtype == torch.float64
-        assert torch.equal(value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)), name
+        assert torch.equal(
+            value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)
+        ), name
         assert bool(value.isnan()[low.isnan()].all()), name
-        # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene units, weight in
-        # pixels, features of any size).
+        # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene
+        # units, weight in pixels, features of any size).
         beyond = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
         beyond = beyond[torch.isfinite(beyond)]
         worst[name] = max(0.0, float(beyond.max())) if beyond.numel() else 0.0
@@ -69,7 +93,9 @@ def excess(inputs: reference.Inputs) -> dict[str, float]:
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("block", range(8))
 def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_splats) -> None:
-    """Crossing the camera plane, edge-on, opacity 0 and 1, equal depths are in every scene of 12 splats or more."""
+    """Crossing the camera plane, edge-on, opacity 0 and 1, equal depths are in every scene of 12
+    splats or more.
+    """
     worst = dict.fromkeys(OUTPUTS, 0.0)
     for seed in range(25 * block, 25 * block + 25):
         rng = np.random.default_rng(seed)
@@ -77,8 +103,12 @@ def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_s
         camera = make_camera(seed, int(rng.integers(1, 20)), int(rng.integers(1, 20)))
         count = int(rng.integers(1, 40)) if seed % 5 == 0 else int(rng.integers(12, 40))
         splats = make_splats(seed, kind, count, camera, degree=seed % 4)
-        options: dict[str, object] = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
-        # With the distortion's near plane at the picture's, m lies in [0, 1]; at 0.2 it reaches -19 for what is nearer.
+        options: dict[str, object] = {
+            "depth": mode,
+            "antialiased": antialiased if kind == "3d" else None,
+        }
+        # With the distortion's near plane at the picture's, m lies in [0, 1]; at 0.2 it reaches -19
+        # for what is nearer.
         options["ndc"] = (constants.NEAR, constants.NDC_FAR)
         if seed % 3 == 0:
             options["features"] = torch.tensor(rng.normal(size=(count, seed % 7 + 1)))
@@ -90,7 +120,9 @@ def test_two_hundred_random_scenes_agree_to_1e_5(block: int, make_camera, make_s
 
 @pytest.mark.parametrize(("kind", "mode", "antialiased"), MODES)
 @pytest.mark.parametrize(("width", "height"), [(300, 35), (32, 32), (49, 130)])
-def test_pictures_of_many_tiles_agree(kind, mode, antialiased, width, height, make_camera, make_splats) -> None:
+def test_pictures_of_many_tiles_agree(
+    kind, mode, antialiased, width, height, make_camera, make_splats
+) -> None:
     """Whole tiles and cut ones, and splats that cover more tiles than a row of bits holds."""
     camera = make_camera(11, width, height)
     splats = make_splats(11, kind, 40, camera)
@@ -101,13 +133,18 @@ def test_pictures_of_many_tiles_agree(kind, mode, antialiased, width, height, ma
     if width == 300:
         # A row of bits holds 14 tiles: some splat must be wider.
         alone = [
-            render(splats.select(torch.tensor([k])), camera, backend="reference", **options) for k in range(0, 40, 4)
+            render(splats.select(torch.tensor([k])), camera, backend="reference", **options)
+            for k in range(0, 40, 4)
         ]
         assert max(int((view.alpha > 0).any(0).sum()) for view in alone) > 15 * constants.TILE
 
 
-@pytest.mark.parametrize(("kind", "mode", "antialiased"), [*MODES, ("3d", "peak", False), ("3d", "center", True)])
-@pytest.mark.parametrize(("harmonic", "size"), [(True, (29, 21)), (False, (29, 21)), (True, (70, 45))])
+@pytest.mark.parametrize(
+    ("kind", "mode", "antialiased"), [*MODES, ("3d", "peak", False), ("3d", "center", True)]
+)
+@pytest.mark.parametrize(
+    ("harmonic", "size"), [(True, (29, 21)), (False, (29, 21)), (True, (70, 45))]
+)
 def test_gradients_of_every_output_agree_with_autograd(
     kind, mode, antialiased, harmonic, size, make_camera, make_splats
 ) -> None:
@@ -121,11 +158,14 @@ def test_gradients_of_every_output_agree_with_autograd(
     weights: dict[str, torch.Tensor] = {}
     for backend in ("reference", "cpu"):
         leaves = [
-            t.clone().requires_grad_() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
+            t.clone().requires_grad_()
+            for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
         ]
         pose = torch.tensor(camera.world_to_camera).requires_grad_()
         extra = features.clone().requires_grad_()
-        behind = torch.linspace(0.1, 0.9, 3 if harmonic else 5, dtype=torch.float64).requires_grad_()
+        behind = torch.linspace(
+            0.1, 0.9, 3 if harmonic else 5, dtype=torch.float64
+        ).requires_grad_()
         view = render(
             Gaussians(kind, *leaves, origin=np.array([0.2, -0.1, 0.05])),
             camera,
@@ -143,18 +183,27 @@ def test_gradients_of_every_output_agree_with_autograd(
             value = torch.where(value.isnan(), 0.0, value).double()
             if name not in weights:
                 weights[name] = torch.randn(value.shape, generator=generator, dtype=torch.float64)
-            found = torch.autograd.grad((value * weights[name]).sum(), inputs, retain_graph=True, allow_unused=True)
+            found = torch.autograd.grad(
+                (value * weights[name]).sum(), inputs, retain_graph=True, allow_unused=True
+            )
             gradients[backend][name] = [
-                torch.zeros_like(leaf) if grad is None else grad for leaf, grad in zip(inputs, found, strict=True)
+                torch.zeros_like(leaf) if grad is None else grad
+                for leaf, grad in zip(inputs, found, strict=True)
             ]
     names = ("means", "quats", "scales", "opacities", "sh", "pose", "background", "features")
     for name in OUTPUTS:
-        for leaf, expected, actual in zip(names, gradients["reference"][name], gradients["cpu"][name], strict=True):
+        for leaf, expected, actual in zip(
+            names, gradients["reference"][name], gradients["cpu"][name], strict=True
+        ):
             assert torch.isfinite(actual).all(), (name, leaf)
-            # Sums over 600 pixels in float32, of the largest entry: the smallest carry its rounding. Edge-on splats
-            # have slopes of 1/cos that cancel between pixels.
+            # Sums over 600 pixels in float32, of the largest entry: the smallest carry its
+            # rounding. Edge-on splats have slopes of 1/cos that cancel between pixels.
             scale = float(expected.abs().max())
-            assert float((actual - expected).abs().max()) <= 1e-4 * scale + 1e-9, (name, leaf, scale)
+            assert float((actual - expected).abs().max()) <= 1e-4 * scale + 1e-9, (
+                name,
+                leaf,
+                scale,
+            )
 
 
 def test_gradients_reach_float32_parameters_in_their_own_type(make_camera, make_splats) -> None:
@@ -179,13 +228,22 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(kind, make_camera, make
         for count in (1, 2, 5):
             torch.set_num_threads(count)
             leaves = [
-                t.clone().requires_grad_() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
+                t.clone().requires_grad_()
+                for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
             ]
             pose = torch.tensor(camera.world_to_camera).requires_grad_()
             view = render(Gaussians(kind, *leaves), camera, pose=pose)
-            loss = view.color.sum() + view.depth.nan_to_num().sum() + view.distortion_l1.sum() + view.normal.sum()
+            loss = (
+                view.color.sum()
+                + view.depth.nan_to_num().sum()
+                + view.distortion_l1.sum()
+                + view.normal.sum()
+            )
             loss.backward()
-            seen.append([getattr(view, n).detach() for n in OUTPUTS] + [leaf.grad for leaf in (*leaves, pose)])
+            seen.append(
+                [getattr(view, n).detach() for n in OUTPUTS]
+                + [leaf.grad for leaf in (*leaves, pose)]
+            )
     finally:
         torch.set_num_threads(threads)
     for other in seen[1:]:
@@ -194,7 +252,9 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(kind, make_camera, make
             assert torch.equal(a.nan_to_num(-1), b.nan_to_num(-1))
 
 
-def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(make_camera, make_splats, monkeypatch) -> None:
+def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(
+    make_camera, make_splats, monkeypatch
+) -> None:
     camera = make_camera(3, 50, 40)
     start = make_splats(3, "2d", 300, camera)
 
@@ -210,7 +270,9 @@ def test_gradients_gathered_in_small_groups_of_tiles_are_the_same(make_camera, m
     assert torch.equal(whole, gradient())
 
 
-def test_more_runs_of_tiles_than_there_was_room_for_change_nothing(make_camera, make_splats, monkeypatch) -> None:
+def test_more_runs_of_tiles_than_there_was_room_for_change_nothing(
+    make_camera, make_splats, monkeypatch
+) -> None:
     camera = make_camera(3, 200, 160)
     splats = make_splats(3, "2d", 600, camera)
     expected = render(splats, camera)
@@ -218,19 +280,25 @@ def test_more_runs_of_tiles_than_there_was_room_for_change_nothing(make_camera, 
     again = render(splats, camera)
     assert expected.counters == again.counters and expected.counters["visible"] > 300
     for name in OUTPUTS:
-        assert torch.equal(getattr(expected, name).nan_to_num(-1), getattr(again, name).nan_to_num(-1)), name
+        assert torch.equal(
+            getattr(expected, name).nan_to_num(-1), getattr(again, name).nan_to_num(-1)
+        ), name
 
 
 @pytest.mark.parametrize("mode", ["intersection", "center"])
 def test_depth_of_a_splat_that_faces_the_camera_moves_with_it(mode, facing, front_camera) -> None:
-    """Closed form: everywhere z is the centre's, so every pixel's depth has the slope 1. The bounds of z fall together here."""
+    """Closed form: everywhere z is the centre's, so every pixel's depth has the slope 1. The bounds
+    of z fall together here.
+    """
     splats = facing([[0, 0, 3]], 0.3, 0.9)
     splats.means.requires_grad_()
     view = render(splats, front_camera(), backend="cpu", depth=mode)
     view.depth[view.valid].sum().backward()
     pixels = int(view.valid.sum())
     assert pixels > 50 and splats.means.grad is not None
-    assert splats.means.grad[0].tolist() == pytest.approx([0, 0, pixels], rel=1e-6, abs=1e-4 * pixels)
+    assert splats.means.grad[0].tolist() == pytest.approx(
+        [0, 0, pixels], rel=1e-6, abs=1e-4 * pixels
+    )
 
 
 def test_a_picture_wider_than_the_lists_can_say_is_refused(facing) -> None:
@@ -266,7 +334,9 @@ def test_it_works_in_a_forked_child(make_camera, make_splats) -> None:
     assert os.read(reading, 1) == b"1"
 
 
-def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(make_camera, make_splats) -> None:
+def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
+    make_camera, make_splats
+) -> None:
     camera = make_camera(4, 16, 16)
     splats = make_splats(4, "2d", 20, camera)
     means = splats.means.clone().requires_grad_()
@@ -278,9 +348,11 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(make
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
-def test_a_deep_scene_worked_off_from_the_front_is_the_same(kind, make_camera, make_splats, monkeypatch) -> None:
-    """Begun with the nearest splats only; tiles that are not opaque by then start again; and lists too long to be held
-    at once made for some tiles after the others. Same bits either way."""
+def test_a_deep_scene_worked_off_from_the_front_is_the_same(
+    kind, make_camera, make_splats, monkeypatch
+) -> None:
+    """Begun with the nearest splats only; tiles that are not opaque by then start again; and lists
+    too long to be held at once made for some tiles after the others. Same bits either way."""
     camera = make_camera(3, 50, 40)
     start = make_splats(3, kind, 2000, camera)
     results = []
@@ -291,7 +363,9 @@ def test_a_deep_scene_worked_off_from_the_front_is_the_same(kind, make_camera, m
         view = render(dataclasses.replace(start, means=means), camera)
         (view.color.sum() + view.depth.nan_to_num().sum()).backward()
         assert means.grad is not None
-        results.append([getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS] + [means.grad])
+        results.append(
+            [getattr(view, name).detach().nan_to_num(-1) for name in OUTPUTS] + [means.grad]
+        )
         results[-1].append(torch.tensor(view.counters["contributing"]))
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):

@@ -1,4 +1,6 @@
-"""The GPU backend without a GPU: what it refuses, and how it makes the outputs from composited features."""
+"""The GPU backend without a GPU: what it refuses, and how it makes the outputs from composited
+features.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from attnwarp.render import api, constants, cuda, reference, render
 
 def prepared(splats, camera, depth: str = "center") -> reference.Inputs:
     ndc = (constants.NDC_NEAR, constants.NDC_FAR)
-    return api._prepare(splats, camera, depth, None, None, None, constants.NEAR, None, None, ndc, on_cpu=False)
+    return api._prepare(
+        splats, camera, depth, None, None, None, constants.NEAR, None, None, ndc, on_cpu=False
+    )
 
 
 def square_pixels(camera: Camera) -> Camera:
@@ -23,8 +27,11 @@ def square_pixels(camera: Camera) -> Camera:
     return Camera(K, camera.world_to_camera, camera.width, camera.height)
 
 
-def brute_force(inputs: reference.Inputs, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Stands in for gsplat's kernels: the definition, compositing the same features over nothing."""
+def brute_force(
+    inputs: reference.Inputs, features: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Stands in for gsplat's kernels: the definition, compositing the same features over
+    nothing."""
     zero = torch.zeros(features.shape[1], dtype=torch.float64)
     swapped = dataclasses.replace(inputs, values=features.double(), harmonic=False, background=zero)
     view = reference.render(swapped)
@@ -52,7 +59,9 @@ def test_weights_need_no_gradients_from_the_caller(make_camera, make_splats) -> 
     camera = make_camera(3, 18, 14)
     splats = make_splats(3, "3d", 30, camera)
     splats = splats.select(torch.tensor([i for i in range(30) if i not in (0, 1, 7)]))
-    inputs = dataclasses.replace(prepared(splats, camera), means=splats.means.clone().requires_grad_())
+    inputs = dataclasses.replace(
+        prepared(splats, camera), means=splats.means.clone().requires_grad_()
+    )
     expected = reference.render(inputs)
     with torch.no_grad():
         made = cuda.composite(inputs, brute_force)
@@ -68,7 +77,10 @@ def test_what_gsplat_computes_differently_is_refused(make_camera, make_splats, m
     camera = square_pixels(make_camera(3, 8, 8))
     flat, solid = make_splats(3, "2d", 5, camera), make_splats(3, "3d", 5, camera)
     monkeypatch.delenv(cuda.ACCEPT_2D, raising=False)
-    with pytest.raises(ValueError, match="depth: got 'intersection', but gsplat knows the depth of a splat's centre"):
+    with pytest.raises(
+        ValueError,
+        match="depth: got 'intersection', but gsplat knows the depth of a splat's centre",
+    ):
         render(flat, camera, backend="cuda")
     with pytest.raises(ValueError, match="depth: got 'peak'"):
         render(solid, camera, backend="cuda", depth="peak")
@@ -85,12 +97,15 @@ def test_a_camera_with_skew_is_refused(make_camera, make_splats) -> None:
     assert skewed.K[0, 1] != 0
     # Before it is asked whether there is a GPU: the answer would be the same on one.
     with pytest.raises(
-        ValueError, match=r"camera: K\[0, 1\], its skew, is [-0-9.]+, but gsplat reads only.*backend 'cpu'"
+        ValueError,
+        match=r"camera: K\[0, 1\], its skew, is [-0-9.]+, but gsplat reads only.*backend 'cpu'",
     ):
         render(solid, skewed, backend="cuda", depth="center")
     cuda.refuse(prepared(solid, square_pixels(skewed)))
     # What the CPU draws depends on it: to leave it out would be a wrong picture, not a detail.
-    with_skew, without = (render(solid, camera, backend="cpu").color for camera in (skewed, square_pixels(skewed)))
+    with_skew, without = (
+        render(solid, camera, backend="cpu").color for camera in (skewed, square_pixels(skewed))
+    )
     assert float((with_skew - without).abs().max()) > 1e-2
 
 
@@ -98,7 +113,9 @@ def test_it_says_why_it_cannot_run(make_camera, make_splats, monkeypatch) -> Non
     camera = square_pixels(make_camera(3, 8, 8))
     solid = make_splats(3, "3d", 5, camera)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; use backend 'cpu'"):
+    with pytest.raises(
+        RuntimeError, match="backend: 'cuda' needs a GPU that torch can see; use backend 'cpu'"
+    ):
         render(solid, camera, backend="cuda", depth="center")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda.importlib.util, "find_spec", lambda name: None)

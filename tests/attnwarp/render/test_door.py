@@ -1,4 +1,5 @@
-"""The door: every argument is checked, small cases work, and a backend is chosen without surprises."""
+"""The door: every argument is checked, small cases work, and a backend is chosen without
+surprises."""
 
 from __future__ import annotations
 
@@ -39,22 +40,33 @@ def camera(width: int = 12, height: int = 10) -> Camera:
         ({"near": 0.0}, "near: got 0.0, expected a positive depth"),
         ({"near": float("nan")}, "near: got nan"),
         ({"ndc": (2.0, 1.0)}, "ndc: got"),
-        ({"background": [1.0, 0.0]}, r"background: got shape \(2\), expected \(3\)|background: got shape \(2,\)"),
+        (
+            {"background": [1.0, 0.0]},
+            r"background: got shape \(2\), expected \(3\)|background: got shape \(2,\)",
+        ),
         ({"background": [1.0, 0.0, float("inf")]}, "background: inf at index"),
         ({"features": torch.zeros(2, 5)}, "features: got shape"),
         ({"features": torch.zeros(3, 0)}, "features: got 0 channels"),
         ({"features": torch.zeros(3, 2, dtype=torch.float16)}, "features: got torch.float16"),
         ({"features": torch.full((3, 2), torch.nan)}, "features: nan at index"),
-        ({"features": torch.zeros(3, 2), "sh_degree": 1}, "sh_degree: has no meaning beside features"),
+        (
+            {"features": torch.zeros(3, 2), "sh_degree": 1},
+            "sh_degree: has no meaning beside features",
+        ),
         ({"sh_degree": 2}, "sh_degree: got 2, expected 0 to 1"),
         ({"antialiased": True}, "antialiased: applies to kind '3d' only"),
         ({"pose": torch.zeros(3, 4)}, "pose: got shape"),
         ({"pose": torch.eye(4) * 2}, "pose: got last row"),
-        ({"pose": torch.diag(torch.tensor([1.0, 1, 1.001, 1]))}, "pose: its rotation is mirrored or not orthonormal"),
+        (
+            {"pose": torch.diag(torch.tensor([1.0, 1, 1.001, 1]))},
+            "pose: its rotation is mirrored or not orthonormal",
+        ),
         ({"pose": torch.diag(torch.tensor([1.0, 1, -1, 1]))}, "pose: its rotation is mirrored"),
     ],
 )
-def test_a_bad_argument_is_named_with_what_came_and_what_was_expected(arguments: dict[str, Any], message: str) -> None:
+def test_a_bad_argument_is_named_with_what_came_and_what_was_expected(
+    arguments: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         render(gaussians(), camera(), **arguments)
 
@@ -94,7 +106,9 @@ def test_no_splats_and_small_images_work(backend: str, kind: str, size: tuple[in
 def test_both_precisions_are_taken(dtype: torch.dtype) -> None:
     view = render(gaussians(dtype=dtype), camera())
     assert view.color.dtype == torch.float32
-    assert render(gaussians(dtype=dtype), camera(), backend="reference").color.dtype == torch.float64
+    assert (
+        render(gaussians(dtype=dtype), camera(), backend="reference").color.dtype == torch.float64
+    )
 
 
 def test_a_pose_replaces_the_cameras() -> None:
@@ -128,6 +142,9 @@ def test_normal_from_depth_refuses_a_depth_of_another_size() -> None:
 
 
 def test_importing_the_door_loads_neither_numba_nor_gsplat() -> None:
-    code = "import sys, attnwarp.render; print([m for m in ('numba', 'gsplat', 'scipy') if m in sys.modules])"
+    code = (
+        "import sys, attnwarp.render; print([m for m in ('numba', 'gsplat', 'scipy') if m in"
+        " sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,4 +1,6 @@
-"""The numerically hard cases of rendering, each by name; both backends unless one of them is the oracle."""
+"""The numerically hard cases of rendering, each by name; both backends unless one of them is the
+oracle.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,23 @@ from attnwarp import Camera, Gaussians
 from attnwarp.render import constants, cpu, render
 
 BACKENDS = ("reference", "cpu")
-OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
+OUTPUTS = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_l1",
+    "distortion_l2_ndc",
+    "weight",
+)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("tilt", [89.0, 89.9, 89.99, 89.9999, 90.0])
-def test_case_2_an_edge_on_splat_stays_within_its_own_extent(backend, tilt, facing, front_camera) -> None:
+def test_case_2_an_edge_on_splat_stays_within_its_own_extent(
+    backend, tilt, facing, front_camera
+) -> None:
     angle = math.radians(tilt)
     sigma = 0.1
     splat = facing([[0, 0, 4]], sigma, 0.9, normals=[[math.sin(angle), 0, -math.cos(angle)]])
@@ -28,7 +41,8 @@ def test_case_2_an_edge_on_splat_stays_within_its_own_extent(backend, tilt, faci
     assert int(view.valid.sum()) > 5
     reach = constants.EXTENT_SIGMAS * sigma * math.sin(angle)
     assert float((view.depth[view.valid] - 4).abs().max()) <= reach * (1 + 1e-5)
-    # Along the disc it is drawn by the screen filter: never less than that, at the centre exactly the opacity.
+    # Along the disc it is drawn by the screen filter: never less than that, at the centre exactly
+    # the opacity.
     assert float(view.alpha[10, 10]) == pytest.approx(0.9, abs=1e-5)
     assert float(view.alpha[10, 11]) >= 0.9 * math.exp(-1) - 1e-5
 
@@ -37,8 +51,12 @@ def test_case_2_edge_on_weights_agree_with_float64(facing, front_camera) -> None
     rng = np.random.default_rng(0)
     tilts = np.pi / 2 - 10.0 ** rng.uniform(-9, -1, 60)
     roll = rng.uniform(0, 2 * np.pi, 60)
-    normals = np.stack([np.sin(tilts) * np.cos(roll), np.sin(tilts) * np.sin(roll), -np.cos(tilts)], -1)
-    points = np.stack([rng.uniform(-0.3, 0.3, 60), rng.uniform(-0.3, 0.3, 60), rng.uniform(2, 6, 60)], -1)
+    normals = np.stack(
+        [np.sin(tilts) * np.cos(roll), np.sin(tilts) * np.sin(roll), -np.cos(tilts)], -1
+    )
+    points = np.stack(
+        [rng.uniform(-0.3, 0.3, 60), rng.uniform(-0.3, 0.3, 60), rng.uniform(2, 6, 60)], -1
+    )
     splats = facing(points, 0.1, 0.3, normals=normals)
     camera = front_camera(31, 100.0)
     exact, fast = render(splats, camera, backend="reference"), render(splats, camera, backend="cpu")
@@ -55,7 +73,8 @@ def test_case_9_a_far_world_origin_changes_nothing(kind, offset, make_camera, ma
     shift = np.array([offset, -offset, offset / 2])
     here = render(splats, camera)
     there = render(dataclasses.replace(splats, origin=shift), camera.moved(shift))
-    # 1e-3 pixels of 1e6 metres: float64 leaves 2e-10 m, 1e-8 px. Pairs on a threshold may flip: at most a few.
+    # 1e-3 pixels of 1e6 metres: float64 leaves 2e-10 m, 1e-8 px. Pairs on a threshold may flip: at
+    # most a few.
     difference = (here.color - there.color).abs().amax(-1)
     assert int((difference > 1e-5).sum()) <= 2
     both = here.valid & there.valid
@@ -64,7 +83,9 @@ def test_case_9_a_far_world_origin_changes_nothing(kind, offset, make_camera, ma
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 @pytest.mark.parametrize("kind", ["2d", "3d"])
-def test_case_10_the_scale_of_the_scene_changes_nothing(kind, scale, make_camera, make_splats) -> None:
+def test_case_10_the_scale_of_the_scene_changes_nothing(
+    kind, scale, make_camera, make_splats
+) -> None:
     camera = make_camera(4, 40, 30)
     splats = make_splats(4, kind, 40, camera)
     pose = camera.world_to_camera.copy()
@@ -72,7 +93,10 @@ def test_case_10_the_scale_of_the_scene_changes_nothing(kind, scale, make_camera
     large = dataclasses.replace(splats, means=splats.means * scale, scales=splats.scales * scale)
     here = render(splats, camera, near=0.05)
     there = render(
-        large, Camera(camera.K, pose, 40, 30), near=0.05 * scale, ndc=(constants.NDC_NEAR * scale, 100 * scale)
+        large,
+        Camera(camera.K, pose, 40, 30),
+        near=0.05 * scale,
+        ndc=(constants.NDC_NEAR * scale, 100 * scale),
     )
     assert torch.equal(here.valid, there.valid)
     assert float((here.color - there.color).abs().max()) < 1e-5
@@ -84,7 +108,9 @@ def test_case_16_a_zero_quaternion_is_refused_by_name() -> None:
     quats = torch.ones(4, 4)
     quats[2] = 0
     with pytest.raises(ValueError, match="quats: zero quaternion at index 2"):
-        Gaussians("2d", torch.zeros(4, 3), quats, torch.ones(4, 2), torch.ones(4), torch.zeros(4, 1, 3))
+        Gaussians(
+            "2d", torch.zeros(4, 3), quats, torch.ones(4, 2), torch.ones(4), torch.zeros(4, 1, 3)
+        )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -92,7 +118,10 @@ def test_case_16_a_zero_quaternion_is_refused_by_name() -> None:
 @pytest.mark.parametrize("opacity", [0.0, 1.0])
 def test_cases_18_and_19_opacity_0_and_1(kind, opacity, backend, facing, front_camera) -> None:
     made = facing([[0, 0, 3], [0, 0, 4]], 0.3, [opacity, 0.5], kind=kind)
-    leaves = [t.clone().requires_grad_() for t in (made.means, made.quats, made.scales, made.opacities, made.sh)]
+    leaves = [
+        t.clone().requires_grad_()
+        for t in (made.means, made.quats, made.scales, made.opacities, made.sh)
+    ]
     view = render(Gaussians(kind, *leaves), front_camera(), backend=backend)
     seen = min(opacity, constants.ALPHA_MAX)
     assert view.alpha[16, 16].item() == pytest.approx(seen + (1 - seen) * 0.5, abs=1e-6)
@@ -114,19 +143,23 @@ def test_case_20_a_hundred_thousand_splats_on_one_ray(alpha, facing, front_camer
     expected = -np.expm1(logs[min(stop, count - 1)])
     assert abs(float(view.alpha[0, 0]) - expected) < 1e-4
     assert abs(float(view.weight.double().sum()) - float(view.alpha[0, 0])) < 2e-4
-    # The stop is there for a reason: the work is that of the splats before it, and a first attempt with the nearest.
+    # The stop is there for a reason: the work is that of the splats before it, and a first attempt
+    # with the nearest.
     assert view.counters["tile_pairs"] <= stop + 8 + cpu.FRONT
 
 
 def test_case_21_transmittance_ends_at_the_declared_stop(facing, front_camera) -> None:
-    """In exact arithmetic T is 1e-4 after the second opaque splat: the ray ends there, and that splat counts."""
+    """In exact arithmetic T is 1e-4 after the second opaque splat: the ray ends there, and that
+    splat counts.
+    """
     means = np.zeros((40, 3))
     means[:, 2] = np.linspace(2, 6, 40)
     for backend in BACKENDS:
         view = render(facing(means, 1.0, 1.0), front_camera(1, 30.0), backend=backend)
         left = mpmath.mpf(1) - mpmath.mpf(float(view.alpha[0, 0]))
         exact = mpmath.mpf("0.01") ** 2
-        # 0.01 * 0.01 is 1e-4 but for rounding: the ray ends there or one splat later, and what is left is at most 1e-4.
+        # 0.01 * 0.01 is 1e-4 but for rounding: the ray ends there or one splat later, and what is
+        # left is at most 1e-4.
         assert mpmath.mpf(0) <= left <= exact + mpmath.mpf("1e-6")
 
 
@@ -144,12 +177,15 @@ def test_case_22_depth_is_undefined_where_nothing_is_drawn(backend, facing, fron
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("kind", ["2d", "3d"])
-def test_case_23_a_permutation_of_the_input_changes_nothing(kind, backend, make_camera, make_splats) -> None:
+def test_case_23_a_permutation_of_the_input_changes_nothing(
+    kind, backend, make_camera, make_splats
+) -> None:
     camera = make_camera(6, 30, 20)
     splats = make_splats(6, kind, 60, camera)
     splats.means[20:50] = torch.tensor(
         camera.position
-        + np.c_[np.random.default_rng(0).uniform(-0.5, 0.5, (30, 2)), np.full(30, 3.0)] @ camera.rotation
+        + np.c_[np.random.default_rng(0).uniform(-0.5, 0.5, (30, 2)), np.full(30, 3.0)]
+        @ camera.rotation
     )
     # Without the twins (7 = 8): which of two equal splats is in front has no answer.
     splats = splats.select(torch.tensor([i for i in range(60) if i != 7]))
@@ -166,7 +202,9 @@ def test_case_23_a_permutation_of_the_input_changes_nothing(kind, backend, make_
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_case_24_a_needle_is_drawn_with_the_declared_low_pass(backend, facing, front_camera) -> None:
+def test_case_24_a_needle_is_drawn_with_the_declared_low_pass(
+    backend, facing, front_camera
+) -> None:
     """A 3D splat of 1e-6 thickness: its projected covariance is singular but for the 0.3 px^2."""
     scales = torch.tensor([1e-6, 0.3, 1e-6], dtype=torch.float64)
     splat = facing([[0, 0, 4.0]], scales, 0.8, kind="3d")
@@ -180,8 +218,12 @@ def test_case_24_a_needle_is_drawn_with_the_declared_low_pass(backend, facing, f
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_case_25_a_splat_below_a_pixel_keeps_its_share_when_antialiased(backend, front_camera, facing) -> None:
-    """Averaged over where its centre falls, an antialiased 3D splat covers what supersampling finds it to cover."""
+def test_case_25_a_splat_below_a_pixel_keeps_its_share_when_antialiased(
+    backend, front_camera, facing
+) -> None:
+    """Averaged over where its centre falls, an antialiased 3D splat covers what supersampling finds
+    it to cover.
+    """
     sigma, depth, focal = 0.01, 4.0, 40.0  # 0.1 pixels
     rng = np.random.default_rng(0)
     shifts = rng.uniform(-0.5, 0.5, (64, 2)) * depth / focal
@@ -190,7 +232,8 @@ def test_case_25_a_splat_below_a_pixel_keeps_its_share_when_antialiased(backend,
         splat = facing([[dx, dy, depth]], sigma, 0.5, kind="3d")
         view = render(splat, front_camera(9), backend=backend, antialiased=True)
         covered.append(float(view.alpha.double().sum()))
-    # Supersampled: the integral of the unblurred footprint, o 2 pi sigma_px^2, less what falls under 1/255.
+    # Supersampled: the integral of the unblurred footprint, o 2 pi sigma_px^2, less what falls
+    # under 1/255.
     peak = 0.5 * (sigma * focal / depth) ** 2 / ((sigma * focal / depth) ** 2 + constants.BLUR_3D)
     assert peak > constants.ALPHA_MIN
     exact = 0.5 * 2 * math.pi * (sigma * focal / depth) ** 2
@@ -201,7 +244,9 @@ def test_case_25_a_splat_below_a_pixel_keeps_its_share_when_antialiased(backend,
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_case_39_a_floor_that_crosses_the_camera_plane_is_drawn_right(backend, facing) -> None:
-    """One large splat under the camera: every pixel below the horizon sees the floor, none above it."""
+    """One large splat under the camera: every pixel below the horizon sees the floor, none above
+    it.
+    """
     camera = Camera.look_at([0, 0, 1], [0, 5, 1], width=48, height=40, fov_y=80)
     # World z up, floor at z = 0 below the camera, sigma 100 m: flat within the picture.
     quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64)
@@ -243,11 +288,19 @@ def test_the_outline_of_a_huge_splat_far_outside_of_the_picture_is_not_lost(kind
         # At the picture's middle the distance is about 3.2 sigmas: alpha is near 1/255.
         sigma = far / random.uniform(3.0, 3.3)
         scales = torch.full((1, 2 if kind == "2d" else 3), sigma, dtype=torch.float64)
-        splat = Gaussians(kind, means, torch.tensor([[1.0, 0, 0, 0]]).double(), scales, torch.ones(1).double(),
-                          torch.zeros(1, 1, 3).double())  # fmt: skip
+        splat = Gaussians(
+            kind,
+            means,
+            torch.tensor([[1.0, 0, 0, 0]]).double(),
+            scales,
+            torch.ones(1).double(),
+            torch.zeros(1, 1, 3).double(),
+        )
         truth = render(splat, camera, backend="reference").alpha
         seen = render(splat, camera, backend="cpu").alpha.double()
         inner = truth > constants.ALPHA_MIN * (1 + 1e-4)
         crossed += bool(inner.any()) and not bool(inner.all())
         assert float((seen - truth)[inner].abs().max() if inner.any() else 0) < 1e-6
-    assert crossed > 0 or far > 50 or kind == "3d"  # a blob out there covers all of the picture or nothing
+    assert (
+        crossed > 0 or far > 50 or kind == "3d"
+    )  # a blob out there covers all of the picture or nothing

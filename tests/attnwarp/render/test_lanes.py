@@ -50,7 +50,9 @@ def test_eight_float64_to_the_last_bits() -> None:
         for _ in range(50):
             x = scale * random.uniform(0.5, 2, 8)
             work(x, y)
-            for found, exact in zip(y.reshape(4, 8)[:3], (1 / x, 1 / np.sqrt(x), np.sqrt(x)), strict=True):
+            for found, exact in zip(
+                y.reshape(4, 8)[:3], (1 / x, 1 / np.sqrt(x), np.sqrt(x)), strict=True
+            ):
                 assert np.abs(found / exact - 1).max() < 1e-15
             assert np.abs(y[24:] - np.log(x)).max() < 1e-12 * max(1, np.abs(np.log(x)).max())
     work(np.zeros(8), y)
@@ -79,7 +81,9 @@ def test_bits_of_sixteen_words() -> None:
 
     random = np.random.default_rng(0)
     for wanted in (1, 1 << 15, 0x33 << 10, 0xFFFF):
-        words = random.integers(0, 1 << 16, 16).astype(np.int32) & random.integers(0, 1 << 16, 16).astype(np.int32)
+        words = random.integers(0, 1 << 16, 16).astype(np.int32) & random.integers(
+            0, 1 << 16, 16
+        ).astype(np.int32)
         places = [k for k in range(16) if int(words[k]) & wanted]
         found, order = work(words, wanted)
         assert found == sum(1 << k for k in places)
@@ -112,13 +116,16 @@ def test_a_row_of_squares_as_bits(begin, end) -> None:
     assert binning._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
     for column in range(0, 56, layout.SIDE):
         part = row[column : column + layout.SIDE]
-        assert binning._columns(code, 40 + column) == sum(1 << k for k, inside in enumerate(part) if inside)
+        assert binning._columns(code, 40 + column) == sum(
+            1 << k for k, inside in enumerate(part) if inside
+        )
     nothing = 32767 | -1 << 16
     assert binning._bits(nothing, 40) == binning._columns(nothing, 40) == 0
 
 
 def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
-    """numba itself looks at the file of a function only, not at those of what was inlined into it."""
+    """numba itself looks at the file of a function only, not at those of what was inlined into
+    it."""
     render = tmp_path / "render"
     shutil.copytree(Path(layout.__file__).parent, render / "_kernels")
     shutil.copy(Path(layout.__file__).parent.parent / "constants.py", render)

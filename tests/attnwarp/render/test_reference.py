@@ -1,4 +1,6 @@
-"""The definition itself: closed forms worked out by hand, and its gradients by finite differences in float64."""
+"""The definition itself: closed forms worked out by hand, and its gradients by finite differences
+in float64.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,16 @@ from attnwarp.render import constants, harmonics, render
 from attnwarp.render.api import normal_from_depth
 
 BACKENDS = ("reference", "cpu")
-OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1", "distortion_l2_ndc", "weight")
+OUTPUTS = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_l1",
+    "distortion_l2_ndc",
+    "weight",
+)
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -30,18 +41,27 @@ OUTPUTS = ("color", "alpha", "depth", "median_depth", "normal", "distortion_l1",
         ("3d", "center", True, 4),
     ],
 )
-def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, channels, make_camera, make_splats) -> None:
+def test_every_gradient_is_the_finite_difference(
+    kind, mode, antialiased, channels, make_camera, make_splats
+) -> None:
     """``channels``: of features in place of the harmonics."""
     camera = make_camera(8, 9, 7)
-    # Without ties (4, 5, 7), whose order jumps, and without the splat edge-on to 1e-9 (9), whose normal does.
+    # Without ties (4, 5, 7), whose order jumps, and without the splat edge-on to 1e-9 (9), whose
+    # normal does.
     start = make_splats(8, kind, 16, camera, degree=2)
     start = start.select(torch.tensor([i for i in range(16) if i not in (4, 5, 7, 9)]))
-    leaves = [t.clone() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)]
-    # Scales apart: which axis is the shortest, the normal of a 3D splat, must not change within a step.
+    leaves = [
+        t.clone() for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
+    ]
+    # Scales apart: which axis is the shortest, the normal of a 3D splat, must not change within a
+    # step.
     leaves[2] = leaves[2] * torch.linspace(1, 1.2, leaves[2].shape[1], dtype=torch.float64)
     # Inside (0, 1), so that a step to either side is a valid opacity.
     leaves[3] = leaves[3].clamp(0.01, 0.95)
-    leaves += [torch.tensor(camera.world_to_camera), torch.tensor([0.2, 0.5, 0.8], dtype=torch.float64)]
+    leaves += [
+        torch.tensor(camera.world_to_camera),
+        torch.tensor([0.2, 0.5, 0.8], dtype=torch.float64),
+    ]
     generator = torch.Generator().manual_seed(0)
     if channels is not None:
         for k, shape in ((4, (len(start), channels)), (6, (channels,))):
@@ -63,7 +83,9 @@ def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, channe
         for name in OUTPUTS:
             value = getattr(view, name)
             value = torch.where(value.isnan(), 0.0, value)
-            weights.setdefault(name, torch.randn(value.shape, generator=generator, dtype=torch.float64))
+            weights.setdefault(
+                name, torch.randn(value.shape, generator=generator, dtype=torch.float64)
+            )
             total = total + (value * weights[name]).sum()
         return total
 
@@ -76,10 +98,12 @@ def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, channe
             if k == 5:
                 direction[3] = 0
             expected = float((gradient * direction).sum())
-            # Central differences: h^2 of truncation and 1e-16 * loss / h of rounding, about 1e-6 of the gradient here.
+            # Central differences: h^2 of truncation and 1e-16 * loss / h of rounding, about 1e-6 of
+            # the gradient here.
             tolerance = 2e-5 * scale * math.sqrt(leaf.numel()) + 1e-6
             slopes: list[float] = []
-            # A threshold crossed within the step would read as a slope of 1/h: the best of three steps counts.
+            # A threshold crossed within the step would read as a slope of 1/h: the best of three
+            # steps counts.
             for h in (1e-6, 1e-7, 3e-8):
                 if slopes and abs(slopes[-1] - expected) <= tolerance:
                     break
@@ -89,7 +113,11 @@ def test_every_gradient_is_the_finite_difference(kind, mode, antialiased, channe
                     moved[k] = leaf + sign * h * direction
                     ends.append(float(loss(moved)))
                 slopes.append((ends[0] - ends[1]) / (2 * h))
-            assert min(abs(slope - expected) for slope in slopes) <= tolerance, (k, expected, slopes)
+            assert min(abs(slope - expected) for slope in slopes) <= tolerance, (
+                k,
+                expected,
+                slopes,
+            )
 
 
 def test_the_gradient_of_normals_from_depth_is_the_finite_difference(make_camera) -> None:
@@ -107,10 +135,17 @@ def test_the_gradient_of_normals_from_depth_is_the_finite_difference(make_camera
 
     depth.requires_grad_()
     pose.requires_grad_()
-    # Steps of 1e-6 in depths of 3: h^2 of truncation, 1e-16 / h of rounding; the NaN stays one and must have gradient 0.
+    # Steps of 1e-6 in depths of 3: h^2 of truncation, 1e-16 / h of rounding; the NaN stays one and
+    # must have gradient 0.
     assert torch.autograd.gradcheck(normals, (depth, pose), eps=1e-6, atol=1e-6, rtol=1e-6)
-    (gradient,) = torch.autograd.grad(normals(depth, pose).square().sum() + normals(depth, pose).sum(), depth)
-    assert bool(gradient.isfinite().all()) and float(gradient[2, 4]) == 0 and float(gradient.abs().max()) > 0.1
+    (gradient,) = torch.autograd.grad(
+        normals(depth, pose).square().sum() + normals(depth, pose).sum(), depth
+    )
+    assert (
+        bool(gradient.isfinite().all())
+        and float(gradient[2, 4]) == 0
+        and float(gradient.abs().max()) > 0.1
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -119,7 +154,9 @@ def test_one_splat_at_its_centre(backend, facing, front_camera) -> None:
     view = render(splat, front_camera(), backend=backend, background=[1, 1, 1])
     middle = (16, 16)
     assert float(view.alpha[middle]) == pytest.approx(0.6, abs=1e-6)
-    assert view.color[middle].tolist() == pytest.approx([0.6 * c + 0.4 for c in (0.2, 0.4, 0.8)], abs=1e-6)
+    assert view.color[middle].tolist() == pytest.approx(
+        [0.6 * c + 0.4 for c in (0.2, 0.4, 0.8)], abs=1e-6
+    )
     assert float(view.depth[middle]) == pytest.approx(4, abs=1e-6)
     assert float(view.median_depth[middle]) == pytest.approx(4, abs=1e-6)
     assert view.normal[middle].tolist() == pytest.approx([0, 0, -0.6], abs=1e-6)
@@ -136,7 +173,9 @@ def test_one_splat_at_its_centre(backend, facing, front_camera) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_two_splats_one_behind_the_other(backend, facing, front_camera) -> None:
-    pair = facing([[0, 0, 5], [0, 0, 3]], scales=0.5, opacities=[0.7, 0.4], colors=[[1, 0, 0], [0, 1, 0]])
+    pair = facing(
+        [[0, 0, 5], [0, 0, 3]], scales=0.5, opacities=[0.7, 0.4], colors=[[1, 0, 0], [0, 1, 0]]
+    )
     view = render(pair, front_camera(), backend=backend)
     near, far = 0.4, 0.6 * 0.7
     at = (16, 16)
@@ -147,17 +186,22 @@ def test_two_splats_one_behind_the_other(backend, facing, front_camera) -> None:
     assert float(view.median_depth[at]) == pytest.approx(5, abs=1e-6)
     assert float(view.distortion_l1[at]) == pytest.approx(2 * near * far * 2, abs=1e-6)
     m = [100 / 99.8 * (1 - 0.2 / z) for z in (3, 5)]
-    assert float(view.distortion_l2_ndc[at]) == pytest.approx(near * far * (m[0] - m[1]) ** 2, rel=1e-5)
+    assert float(view.distortion_l2_ndc[at]) == pytest.approx(
+        near * far * (m[0] - m[1]) ** 2, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("tilt", [0, 30, 60, 75, 85])
-def test_a_plane_of_splats_gives_the_planes_depth_by_intersection(backend, tilt, facing, front_camera) -> None:
+def test_a_plane_of_splats_gives_the_planes_depth_by_intersection(
+    backend, tilt, facing, front_camera
+) -> None:
     normal = np.array([0, math.sin(math.radians(tilt)), -math.cos(math.radians(tilt))])
     side, along = np.array([1.0, 0, 0]), np.cross(normal, [1.0, 0, 0])
     rng = np.random.default_rng(0)
-    # Splats wider than a pixel even when tilted by 85 degrees: narrower ones are drawn by the screen filter, beyond
-    # 3.33 of their sigmas, where depth is bounded to their extent (docs/rendering.md says what that costs).
+    # Splats wider than a pixel even when tilted by 85 degrees: narrower ones are drawn by the
+    # screen filter, beyond 3.33 of their sigmas, where depth is bounded to their extent
+    # (docs/rendering.md says what that costs).
     grid = np.stack(np.meshgrid(np.arange(-12, 13), np.arange(-12, 13)), -1).reshape(-1, 2) * 0.02
     grid = grid + rng.uniform(-0.005, 0.005, grid.shape)
     points = np.array([0, 0, 4.0]) + grid[:, :1] * side + grid[:, 1:] * along
@@ -180,7 +224,9 @@ def test_a_plane_of_splats_gives_the_planes_depth_by_intersection(backend, tilt,
     # And the surface's normal from depth is the plane's.
     found = view.normal_from_depth[seen & ~view.normal_from_depth.isnan().any(-1)].double()
     assert len(found) > 50
-    assert float((found @ torch.tensor(normal)).min()) > (1 - 1e-9 if backend == "reference" else 0.99)
+    assert float((found @ torch.tensor(normal)).min()) > (
+        1 - 1e-9 if backend == "reference" else 0.99
+    )
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -198,7 +244,9 @@ def test_peak_depth_of_a_thin_ellipsoid_is_that_of_its_disc(backend, facing, fro
 
 
 def test_harmonics_are_orthonormal() -> None:
-    """Independent of signs and order: the integral of Y_j Y_k over the sphere is 1 if j = k, else 0."""
+    """Independent of signs and order: the integral of Y_j Y_k over the sphere is 1 if j = k, else
+    0.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(12)
     phi = np.arange(24) * 2 * np.pi / 24
     z, p = np.meshgrid(nodes, phi, indexing="ij")
@@ -221,7 +269,8 @@ def test_harmonics_agree_with_scipy() -> None:
     for degree in range(4):
         for order in range(-degree, degree + 1):
             y = sph_harm_y(degree, abs(order), polar, azimuth)
-            # scipy's carry the Condon-Shortley sign, which is that of the splat files' convention for odd orders.
+            # scipy's carry the Condon-Shortley sign, which is that of the splat files' convention
+            # for odd orders.
             part = y.imag if order < 0 else y.real
             expected.append(part * (math.sqrt(2) if order else 1))
     ours = harmonics.basis(torch.tensor(d), 3).numpy().T

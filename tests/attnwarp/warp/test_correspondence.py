@@ -53,11 +53,15 @@ def sphere(camera, radius=1.0):
 
 
 def homography(source, target, normal, offset):
-    """The source position of target pixels on the plane normal . X = offset: K_s (R + t n^T / d) K_t^-1."""
+    """The source position of target pixels on the plane normal . X = offset: K_s (R + t n^T / d)
+    K_t^-1.
+    """
     relative = source.world_to_camera @ np.linalg.inv(target.world_to_camera)
     n = target.rotation @ np.asarray(normal, float)
     d = offset - np.dot(normal, target.position)
-    return source.K @ (relative[:3, :3] + np.outer(relative[:3, 3], n) / d) @ np.linalg.inv(target.K)
+    return (
+        source.K @ (relative[:3, :3] + np.outer(relative[:3, 3], n) / d) @ np.linalg.inv(target.K)
+    )
 
 
 def apply(H, xy):
@@ -72,7 +76,9 @@ def skewed(camera):
     return Camera(K, camera.world_to_camera, camera.width, camera.height)
 
 
-@pytest.mark.parametrize("change", [lambda c: c, skewed], ids=["plain", "skew_fx_fy_principal_point_outside"])
+@pytest.mark.parametrize(
+    "change", [lambda c: c, skewed], ids=["plain", "skew_fx_fy_principal_point_outside"]
+)
 def test_a_plane_moves_by_its_homography(change):
     # Hard cases 12 and 13: the whole K^-1, and no wrap for a principal point outside the image.
     source, target = change(orbit(0, height=1)), change(orbit(25, height=1.5))
@@ -96,14 +102,19 @@ def test_focal_lengths_from_1_to_1e5_px_keep_their_position(focal):
     depth = np.full((64, 64), 2.0)
     # A pure shift along x at constant depth moves every pixel by f * t / z.
     c = correspond(source, target, depth)
-    assert torch.allclose(c.xy, torch.from_numpy(target.pixel_centers() + np.array([0.15, 0])), rtol=0, atol=1e-9)
+    assert torch.allclose(
+        c.xy, torch.from_numpy(target.pixel_centers() + np.array([0.15, 0])), rtol=0, atol=1e-9
+    )
 
 
 def test_points_at_and_behind_the_camera_are_masked_before_the_divide():
-    # Hard case 4: the source stands in the row of surface, so that points lie before, in and behind its plane.
+    # Hard case 4: the source stands in the row of surface, so that points lie before, in and behind
+    # its plane.
     target = Camera(np.array([[1.0, 0, 2.5], [0, 1.0, 0.5], [0, 0, 1]]), np.eye(4), 5, 1)
     depth = np.array([[1.0, 2.0, 3.0, 4.0, 5.0]])
-    source = Camera(target.K, np.block([[np.eye(3), np.array([[0.0], [0], [-3]])], [np.zeros((1, 3)), 1]]), 5, 1)
+    source = Camera(
+        target.K, np.block([[np.eye(3), np.array([[0.0], [0], [-3]])], [np.zeros((1, 3)), 1]]), 5, 1
+    )
     c = correspond(source, target, depth)
     assert c.z.tolist() == [[-2, -1, 0, 1, 2]]
     assert c.defined.tolist() == [[False, False, False, True, True]]
@@ -145,8 +156,8 @@ def test_a_view_corresponds_to_itself_and_its_features_keep_their_bits():
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
 def test_a_tiny_baseline_keeps_its_digits(offset):
-    # Hard case 7: a baseline of 1e-6 at depth 1e-3 moves pixels by about half a pixel; a world at 1e6 has steps of
-    # 1.2e-10, so positions there can differ by 1e-4 of it.
+    # Hard case 7: a baseline of 1e-6 at depth 1e-3 moves pixels by about half a pixel; a world at
+    # 1e6 has steps of 1.2e-10, so positions there can differ by 1e-4 of it.
     mpmath.mp.dps = 60
     focal, depth, baseline = 500.0, 1e-3, 1e-6
     K = np.array([[focal, 0, 3.5], [0, focal, 2.0], [0, 0, 1]])
@@ -162,7 +173,11 @@ def test_a_tiny_baseline_keeps_its_digits(offset):
     worst = mpmath.mpf(0)
     for i in range(4):
         for j in range(7):
-            ray = [(mpmath.mpf(j) + 0.5 - K[0, 2]) / focal, (mpmath.mpf(i) + 0.5 - K[1, 2]) / focal, 1]
+            ray = [
+                (mpmath.mpf(j) + 0.5 - K[0, 2]) / focal,
+                (mpmath.mpf(i) + 0.5 - K[1, 2]) / focal,
+                1,
+            ]
             p = relative * mpmath.matrix([*(depth * r for r in ray), 1])
             x, y = focal * p[0] / p[2] + K[0, 2], focal * p[1] / p[2] + K[1, 2]
             worst = max(worst, abs(x - float(c.xy[i, j, 0])), abs(y - float(c.xy[i, j, 1])))
@@ -171,7 +186,8 @@ def test_a_tiny_baseline_keeps_its_digits(offset):
 
 
 def test_opposed_views_share_no_visible_surface_of_a_plane_between_them():
-    # Hard case 8: each camera looks away from the other, so that all the target sees lies behind the source.
+    # Hard case 8: each camera looks away from the other, so that all the target sees lies behind
+    # the source.
     target = orbit(0)
     away = Camera.look_at((4.1, 0, 0), (8, 0, 0), width=64, height=64, fov_y=45)
     c = correspond(away, target, np.full((64, 64), 4.0))
@@ -206,7 +222,10 @@ def test_the_scale_of_the_scene_changes_no_mask(scale):
 
     source, target = orbit(0, height=1), orbit(40, height=1.5)
     depth, source_depth = (sphere(camera)[0] for camera in (target, source))
-    here, there = correspond(source, target, depth), correspond(scaled(source), scaled(target), depth * scale)
+    here, there = (
+        correspond(source, target, depth),
+        correspond(scaled(source), scaled(target), depth * scale),
+    )
     assert torch.equal(in_bounds(here), in_bounds(there))
     seen = sample_depth(source_depth, here)
     assert torch.equal(torch.isnan(seen), torch.isnan(sample_depth(source_depth * scale, there)))
@@ -243,7 +262,8 @@ def test_a_rotation_that_is_not_orthonormal_is_refused_by_how_much():
 
 
 def test_taps_across_an_edge_are_rejected():
-    # Hard case 26: a step from 2 to 3; the row of centres that falls between the two sides has no depth.
+    # Hard case 26: a step from 2 to 3; the row of centres that falls between the two sides has no
+    # depth.
     depth = torch.full((6, 6), 2.0)
     depth[:, 3:] = 3.0
     halved = resize_depth(depth, (2, 2))
@@ -252,7 +272,9 @@ def test_taps_across_an_edge_are_rejected():
     assert torch.isnan(between[:, 1]).all()
     assert torch.isfinite(between[:, [0, 2]]).all()
     blended = resize_depth(depth, (6, 3), spread=None)
-    assert torch.allclose(blended[:, 1], torch.tensor(2.4, dtype=torch.float64))  # harmonic mean of 2 and 3
+    assert torch.allclose(
+        blended[:, 1], torch.tensor(2.4, dtype=torch.float64)
+    )  # harmonic mean of 2 and 3
     hole = depth.clone()
     hole[0, 1] = torch.nan
     assert torch.isnan(resize_depth(hole, (6, 3))[0, 0])
@@ -260,7 +282,8 @@ def test_taps_across_an_edge_are_rejected():
 
 
 def test_depth_on_a_grid_never_lies_between_two_surfaces():
-    # Hard case 26 on an outline: every answer is the sphere's or the wall's own depth at the exact centre.
+    # Hard case 26 on an outline: every answer is the sphere's or the wall's own depth at the exact
+    # centre.
     camera = orbit(20, size=512, height=0.5)
     ball, wall = sphere(camera)[0], plane_depth(camera, (1, 0, 0), -2.0)
     small = camera.resize(64, 64)
@@ -269,11 +292,13 @@ def test_depth_on_a_grid_never_lies_between_two_surfaces():
     off = np.fmin(*(np.abs(z / surface - 1) for surface in exact))
     answered = np.isfinite(z)
     assert answered.mean() > 0.9
-    # A quarter of the tap spread bounds what blending on the curved sphere can do between neighbours at 512.
+    # A quarter of the tap spread bounds what blending on the curved sphere can do between
+    # neighbours at 512.
     assert np.nanmax(off[answered]) < 0.005
     nearest = np.nanmin(np.stack(exact), axis=0)
     wrong = np.abs(z / nearest - 1) > 0.02
-    # At the outline itself the 512 image's pixel beside the centre may show the other surface: a handful.
+    # At the outline itself the 512 image's pixel beside the centre may show the other surface: a
+    # handful.
     assert wrong.sum() <= 8
 
 
@@ -293,7 +318,8 @@ def test_depth_of_a_slanted_plane_is_exact_in_1_over_z(size):
 
 @pytest.mark.parametrize("size", [(64, 64), (32, 32), (32, 64)])
 def test_features_of_any_size_are_read_at_u_times_s(size):
-    # Hard case 28: a linear ramp over the image is the same ramp at every size; warping it gives the position itself.
+    # Hard case 28: a linear ramp over the image is the same ramp at every size; warping it gives
+    # the position itself.
     source, target = orbit(0, size=512, height=1), orbit(20, size=512, height=1)
     depth = plane_depth(target, (1, 0, 0), 0.0)
     h, w = size
@@ -308,14 +334,18 @@ def test_features_of_any_size_are_read_at_u_times_s(size):
         assert inner.float().mean() > 0.5
         assert (warped - position)[:, inner].abs().max() < 1e-5
     # And the layer's own positions are the image's, at the same rays.
-    exact = apply(homography(source, target, (1, 0, 0), 0.0), target.resize(w, h).pixel_centers() * [512 / w, 512 / h])
+    exact = apply(
+        homography(source, target, (1, 0, 0), 0.0),
+        target.resize(w, h).pixel_centers() * [512 / w, 512 / h],
+    )
     known = layer.defined.numpy()
     assert np.abs(layer.xy.numpy() * [512 / w, 512 / h] - exact)[known].max() < 1e-6
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float16, 5e-4), (torch.bfloat16, 4e-3)])
 def test_half_precision_features_are_blended_in_float32(dtype, bound):
-    # Hard case 29, against the same stored values in float64. At 512 px a half-precision grid would be off by taps.
+    # Hard case 29, against the same stored values in float64. At 512 px a half-precision grid would
+    # be off by taps.
     source, target = orbit(0, size=512, height=1), orbit(25, size=512, height=1)
     c = correspond(source, target, plane_depth(target, (1, 0, 0), 0.0))
     features = torch.rand(3, 512, 512, generator=torch.Generator().manual_seed(1)).to(dtype)
@@ -337,7 +367,9 @@ def test_a_half_precision_grid_is_refused(dtype):
 
 def test_nan_in_a_grid_is_masked_before_sampling():
     # Hard case 36.
-    xy = torch.tensor([[[1.5, 1.5], [torch.nan, 1.5], [1.5, torch.inf], [-torch.inf, 2.5]]], dtype=torch.float64)
+    xy = torch.tensor(
+        [[[1.5, 1.5], [torch.nan, 1.5], [1.5, torch.inf], [-torch.inf, 2.5]]], dtype=torch.float64
+    )
     features = torch.full((1, 3, 3), 7.0)
     for mode in ("bilinear", "nearest"):
         assert sample_at(features, xy, mode=mode).tolist() == [[[7, 0, 0, 0]]]
@@ -364,9 +396,12 @@ def test_sampling_agrees_with_opencv_remap():
     c = correspond(source, target, np.fmin(sphere(target)[0], 5.0))
     image = np.random.default_rng(0).random((96, 96, 3)).astype(np.float32)
     warped, mask = sample(torch.from_numpy(image).permute(2, 0, 1), c)
-    # OpenCV counts pixel centres as integers, and rounds positions to 1/32 px: its own error is up to half of that.
+    # OpenCV counts pixel centres as integers, and rounds positions to 1/32 px: its own error is up
+    # to half of that.
     index = np.nan_to_num(c.xy.numpy() - 0.5, nan=-10).astype(np.float32)
-    expected = cv2.remap(image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    expected = cv2.remap(
+        image, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     difference = np.abs(warped.permute(1, 2, 0).numpy() - expected)[mask.numpy()]
     assert mask.float().mean() > 0.5
     assert difference.max() < 2 / 64
@@ -376,7 +411,9 @@ def test_sampling_agrees_with_opencv_remap():
 def test_sampling_agrees_with_grid_sample_and_so_does_its_gradient():
     source, target = orbit(0, size=40, height=1, width=56), orbit(30, size=40, height=1.3, width=56)
     c = correspond(source, target, np.full((40, 56), 4.2))
-    features = torch.randn(2, 3, 20, 28, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    features = torch.randn(
+        2, 3, 20, 28, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     features.requires_grad_(True)
     warped, mask = sample(features, c)
     grid = 2 * c.xy / torch.tensor([56, 40]) - 1
@@ -385,13 +422,16 @@ def test_sampling_agrees_with_grid_sample_and_so_does_its_gradient():
     )
     assert mask.float().mean() > 0.5
     assert (warped - expected).abs().max() < 1e-6  # SNAP moves a position by up to 1e-7 px
-    ours, theirs = (torch.autograd.grad(v.square().sum(), features, retain_graph=True)[0] for v in (warped, expected))
+    ours, theirs = (
+        torch.autograd.grad(v.square().sum(), features, retain_graph=True)[0]
+        for v in (warped, expected)
+    )
     assert (ours - theirs).abs().max() < 1e-5
 
 
 def test_integer_centres_are_align_corners_on_indices():
-    # The published slip, replayed with the calls it was made of: unproject at j, project to u, grid_sample with
-    # align_corners=True, on the layer's own grid.
+    # The published slip, replayed with the calls it was made of: unproject at j, project to u,
+    # grid_sample with align_corners=True, on the layer's own grid.
     source, target = orbit(0, size=64, height=1), orbit(30, size=64, height=1.3)
     depth = np.fmin(sphere(target)[0], 5.0)
     c = correspond(source, target, depth, pixel_centers="integer")
@@ -399,9 +439,13 @@ def test_integer_centres_are_align_corners_on_indices():
     u, _ = source.project(target.unproject(np.stack([j, i], axis=-1), depth))
     assert np.abs(c.xy.numpy() - 0.5 - u).max() < 1e-9
     for h, w in ((64, 64), (32, 48)):
-        features = torch.randn(3, h, w, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+        features = torch.randn(
+            3, h, w, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+        )
         grid = torch.from_numpy(2 * u / 63 - 1)[None]
-        expected = torch.nn.functional.grid_sample(features[None], grid, padding_mode="border", align_corners=True)[0]
+        expected = torch.nn.functional.grid_sample(
+            features[None], grid, padding_mode="border", align_corners=True
+        )[0]
         warped, mask = sample(features, c)
         assert (warped - expected).abs().max() < 1e-5
         inside = (u >= 0).all(-1) & (u < 64).all(-1)
@@ -415,8 +459,8 @@ def test_integer_centres_are_align_corners_on_indices():
 )
 @pytest.mark.parametrize("size", [64, 32])
 def test_the_half_pixel_slip_costs_a_share_of_the_layers_own_pixel(turn, expected, size):
-    # A unit sphere 3 radii from both cameras: median slip 0.14 px of the layer at yaw 30, exactly 1 px at roll 90,
-    # whatever the layer; 8 times that in a 512 image at 64, 16 times at 32.
+    # A unit sphere 3 radii from both cameras: median slip 0.14 px of the layer at yaw 30, exactly 1
+    # px at roll 90, whatever the layer; 8 times that in a 512 image at 64, 16 times at 32.
     source, target = orbit(0, distance=3.0).resize(size, size), turn(3.0).resize(size, size)
     depth, normal = sphere(target)
     slipped = correspond(source, target, depth, pixel_centers="integer")
@@ -454,7 +498,8 @@ def test_the_sources_own_depth_answers_where_its_taps_do():
     assert torch.isnan(seen[~inside]).all()
     known = torch.isfinite(seen)
     assert known.sum() > 0.3 * inside.sum()
-    # Inverse depth is linear on a plane, except where the border clamps a tap: within half a pixel of the image's end.
+    # Inverse depth is linear on a plane, except where the border clamps a tap: within half a pixel
+    # of the image's end.
     inner = known & ((c.xy > 0.5) & (c.xy < 127.5)).all(-1)
     assert (seen / c.z - 1)[inner].abs().max() < 1e-9
 
@@ -467,12 +512,24 @@ def test_the_sources_own_depth_answers_where_its_taps_do():
             r"target_depth: got shape \(5, 64\), expected \(64, 64\).*correspond_at",
         ),
         (lambda c, d: correspond(c, c, d.astype(int)), r"target_depth: got torch\.int64"),
-        (lambda c, d: correspond(c, c, d[0]), r"target_depth: got shape \(64,\), expected \(H, W\)"),
+        (
+            lambda c, d: correspond(c, c, d[0]),
+            r"target_depth: got shape \(64,\), expected \(H, W\)",
+        ),
         (lambda c, d: correspond(c, c, d, pixel_centers="integers"), r"did you mean 'integer'"),
         (lambda c, d: resize_depth(d, (0, 4)), r"size: got \(0, 4\)"),
-        (lambda c, d: resize_depth(d, (4, 4), interpolation="cubic"), r"interpolation: got 'cubic'"),
-        (lambda c, d: layer_size(c.resize(50, 50), c, (32, 30)), r"feature grid 25 x 23\.4375; give source_size"),
-        (lambda c, d: sample_at(torch.ones(1, 4, 4), torch.ones(4, 4, 3)), r"xy: got shape \(4, 4, 3\)"),
+        (
+            lambda c, d: resize_depth(d, (4, 4), interpolation="cubic"),
+            r"interpolation: got 'cubic'",
+        ),
+        (
+            lambda c, d: layer_size(c.resize(50, 50), c, (32, 30)),
+            r"feature grid 25 x 23\.4375; give source_size",
+        ),
+        (
+            lambda c, d: sample_at(torch.ones(1, 4, 4), torch.ones(4, 4, 3)),
+            r"xy: got shape \(4, 4, 3\)",
+        ),
     ],
 )
 def test_the_doors_say_what_came_and_what_was_expected(call, message):
@@ -485,5 +542,7 @@ def test_views_of_different_sizes_keep_their_fractions():
     depth = plane_depth(target, (1, 0, 0), 0.0)
     layer = correspond_at(source, target, depth, (16, 16))
     assert (layer.source.height, layer.source.width) == (25, 50)
-    full = correspond(source, target.resize(16, 16), plane_depth(target.resize(16, 16), (1, 0, 0), 0.0))
+    full = correspond(
+        source, target.resize(16, 16), plane_depth(target.resize(16, 16), (1, 0, 0), 0.0)
+    )
     assert torch.allclose(layer.xy * 4, full.xy, rtol=0, atol=1e-6)

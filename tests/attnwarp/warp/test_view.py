@@ -1,4 +1,6 @@
-"""Visibility rules and presets against closed forms of spheres and planes, and the published claims about them."""
+"""Visibility rules and presets against closed forms of spheres and planes, and the published claims
+about them.
+"""
 
 import dataclasses
 import json
@@ -62,12 +64,16 @@ def plane_depth(camera, normal, offset):
 
 
 def faces(camera, points, normals):
-    """The closed form for a convex body: a point is seen exactly where its outward normal looks at the camera."""
+    """The closed form for a convex body: a point is seen exactly where its outward normal looks at
+    the camera.
+    """
     return ((camera.position - points) * normals).sum(-1) > 0
 
 
 def area(camera, normal):
-    """Area of the unit sphere behind each pixel, up to a constant: z^3 / (distance cos), distance and cos as there."""
+    """Area of the unit sphere behind each pixel, up to a constant: z^3 / (distance cos), distance
+    and cos as there.
+    """
     ray = camera.position - normal
     z = -(ray @ camera.rotation.T)[..., 2]
     return z**3 / (ray * normal).sum(-1)
@@ -77,7 +83,9 @@ def shell(n=20_000, kind="2d"):
     """A unit sphere of surfels (Fibonacci lattice)."""
     k = np.arange(n) + 0.5
     polar, turn = np.arccos(1 - 2 * k / n), np.pi * (1 + 5**0.5) * k
-    p = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=-1)
+    p = np.stack(
+        [np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=-1
+    )
     # The rotation that takes z to p: about z x p, half the angle in the quaternion.
     q = np.stack([1 + p[:, 2], -p[:, 1], p[:, 0], np.zeros(n)], axis=-1)
     spacing = float(np.sqrt(4 * np.pi / n))
@@ -111,7 +119,9 @@ def test_opposed_views_of_a_sphere_have_an_empty_mask():
     # Hard case 8: at 4 radii two opposed cameras see caps that do not meet.
     source, target = orbit(0), orbit(180)
     (depth, normal), (source_depth, _) = sphere(target), sphere(source)
-    view = warp_surfaces(source, target, Surface(depth, normal), Surface(source_depth), preset("corrected"))
+    view = warp_surfaces(
+        source, target, Surface(depth, normal), Surface(source_depth), preset("corrected")
+    )
     assert np.isfinite(depth).sum() > 1000
     assert not view.mask.any()
     assert not view.at((16, 16)).mask.any()
@@ -119,8 +129,9 @@ def test_opposed_views_of_a_sphere_have_an_empty_mask():
 
 @pytest.mark.parametrize("yaw", [0, 20, 60])
 def test_depth_agreement_with_exact_depth_is_exact_visibility_of_a_sphere_before_a_wall(yaw):
-    # The wall is hidden where the segment to the source camera meets the sphere: a closed form. Interior pixels only:
-    # taps across the outline do not answer, and a pixel whose neighbours differ is on it.
+    # The wall is hidden where the segment to the source camera meets the sphere: a closed form.
+    # Interior pixels only: taps across the outline do not answer, and a pixel whose neighbours
+    # differ is on it.
     source, target = orbit(0, size=256, height=1), orbit(yaw, size=256, height=1)
     wall = ((1, 0, 0), -1.5)
 
@@ -145,7 +156,8 @@ def test_depth_agreement_with_exact_depth_is_exact_visibility_of_a_sphere_before
     hidden = np.isfinite(depth) & in_bounds(c).numpy() & ~visible
     answers = depth_agrees(c, source_depth, relative=1e9).numpy()  # where the taps answer at all
     assert not (got & hidden & answers).any()
-    # Within 2 % of the sphere's rim both surfaces come together, and the slope term must keep them apart there too.
+    # Within 2 % of the sphere's rim both surfaces come together, and the slope term must keep them
+    # apart there too.
     kept = (got & visible).sum() / max(1, (visible & answers).sum())
     assert kept > 0.995
     assert yaw == 0 or hidden.sum() > 500
@@ -153,7 +165,8 @@ def test_depth_agreement_with_exact_depth_is_exact_visibility_of_a_sphere_before
 
 @pytest.mark.parametrize("gap", [0.3, 0.03, 0.005])
 def test_a_card_just_above_its_ground_hides_what_lies_under_it(gap):
-    # A fixed threshold of 15 mm misses a card 5 mm above its ground whole; relative + slope misses none (interior).
+    # A fixed threshold of 15 mm misses a card 5 mm above its ground whole; relative + slope misses
+    # none (interior).
     source = Camera.look_at((0, 0, 3), (0, 0, 0), width=256, height=256, fov_y=40, up=(0, 1, 0))
     target = Camera.look_at((2.0, 0, 2.2), (0, 0, 0), width=256, height=256, fov_y=40)
 
@@ -163,7 +176,8 @@ def test_a_card_just_above_its_ground_hides_what_lies_under_it(gap):
         on = (np.abs(p[..., 0]) < 0.4) & (np.abs(p[..., 1]) < 0.4)
         return np.where(on, top, ground), on
 
-    # The target is told the ground's depth everywhere: what lies under the card is what must be rejected.
+    # The target is told the ground's depth everywhere: what lies under the card is what must be
+    # rejected.
     ground = plane_depth(target, (0, 0, 1), 0.0)
     c = correspond(source, target, ground)
     agrees = depth_agrees(c, card(source)[0]).numpy()
@@ -190,12 +204,16 @@ def test_the_scale_of_the_scene_changes_no_rule(scale):
         depth, normal = sphere(camera)
         wall = plane_depth(camera, (1, 0, 0), -1.5)
         on = ~(depth > np.nan_to_num(wall, nan=np.inf)) & np.isfinite(depth)
-        return Surface(size * np.where(on, depth, wall), np.where(on[..., None], normal, [1.0, 0, 0]))
+        return Surface(
+            size * np.where(on, depth, wall), np.where(on[..., None], normal, [1.0, 0, 0])
+        )
 
     source, target = orbit(0, height=1), orbit(40, height=1)
     settings = preset("corrected", depth_relative=1e-4)
     here = warp_surfaces(source, target, surface(target, 1.0), surface(source, 1.0), settings)
-    there = warp_surfaces(scaled(source), scaled(target), surface(target, scale), surface(source, scale), settings)
+    there = warp_surfaces(
+        scaled(source), scaled(target), surface(target, scale), surface(source, scale), settings
+    )
     for name, rule in here.rules.items():
         # Rounding alone may decide a pixel that lies exactly on a limit.
         assert (rule != there.rules[name]).sum() <= 1, name
@@ -260,16 +278,22 @@ def test_photometric_is_the_mean_over_channels():
 
 
 def test_angles_near_0_and_180_keep_their_digits():
-    # Hard case 17, against mpmath. An arccosine of the same vectors returns exactly 180 below 1e-8 rad.
+    # Hard case 17, against mpmath. An arccosine of the same vectors returns exactly 180 below 1e-8
+    # rad.
     mpmath.mp.dps = 50
     for small in (1e-3, 1e-7, 1e-9, 1e-12):
         a = [1.0, 0.0, 0.0]
         for b in ([1.0, small, 0.0], [-1.0, 0.0, small]):
             exact = mpmath.atan2(mpmath.mpf(small), b[0])
-            got = angle_between(torch.tensor(a, dtype=torch.float64) * 3, torch.tensor(b, dtype=torch.float64) * 0.1)
+            got = angle_between(
+                torch.tensor(a, dtype=torch.float64) * 3, torch.tensor(b, dtype=torch.float64) * 0.1
+            )
             degrees = mpmath.degrees(exact)
-            # The distance from the nearer of 0 and 180 in float64 has an absolute error of half an ulp of 180.
-            assert abs(degrees - got.item()) < 3e-14 + 1e-5 * abs(mpmath.degrees(small)) * (b[0] > 0)
+            # The distance from the nearer of 0 and 180 in float64 has an absolute error of half an
+            # ulp of 180.
+            assert abs(degrees - got.item()) < 3e-14 + 1e-5 * abs(mpmath.degrees(small)) * (
+                b[0] > 0
+            )
     # Just under 180 the half angle's complement keeps what the arccosine of -1 + 5e-17 has lost.
     a = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
     b = torch.tensor([-1.0, 1e-8, 0.0], dtype=torch.float64)
@@ -281,15 +305,16 @@ def test_angles_near_0_and_180_keep_their_digits():
 
 
 def kept_by_the_camera_frame_test(source, target):
-    """Shares of the target's sphere, by area: of what both see, and of what only the target sees."""
+    """Shares of the target's sphere, by area: of what both see, and of what only the target
+    sees."""
     depth, normal = sphere(target)
     kept = camera_frame(correspond(source, target, depth), normal).numpy()
     both = faces(source, normal, normal) & np.isfinite(depth)
     only = np.isfinite(depth) & ~both
     weight = np.nan_to_num(area(target, normal))
-    return (weight * (kept & both)).sum() / weight[both].sum(), (weight * (kept & only)).sum() / max(
-        weight[only].sum(), 1e-300
-    )
+    return (weight * (kept & both)).sum() / weight[both].sum(), (
+        weight * (kept & only)
+    ).sum() / max(weight[only].sum(), 1e-300)
 
 
 @pytest.mark.parametrize(
@@ -297,8 +322,11 @@ def kept_by_the_camera_frame_test(source, target):
     [(30, 1.0, 0.0), (60, 1.0, 0.0), (75, 0.27, 0.0), (90, 0.10, 0.0), (135, 0.0, 0.40)],
 )
 def test_the_camera_frame_test_throws_away_co_visible_surface_as_yaw_grows(yaw, of_both, of_hidden):
-    both, hidden = kept_by_the_camera_frame_test(orbit(0, distance=3, size=256), orbit(yaw, distance=3, size=256))
-    # 0.012: the figures are quoted to a percent, and the area near the outline is integrated on a pixel grid.
+    both, hidden = kept_by_the_camera_frame_test(
+        orbit(0, distance=3, size=256), orbit(yaw, distance=3, size=256)
+    )
+    # 0.012: the figures are quoted to a percent, and the area near the outline is integrated on a
+    # pixel grid.
     assert abs(both - of_both) < 0.012
     assert abs(hidden - of_hidden) < 0.012
 
@@ -321,7 +349,9 @@ def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():
         view = warp_surfaces(source, target, Surface(depth), None, settings)
         assert view.mask.sum() > 1000
         assert (view.correspondence.z[view.mask] < 0).all()
-        tested = warp_surfaces(source, target, Surface(depth), None, dataclasses.replace(settings, in_front=True))
+        tested = warp_surfaces(
+            source, target, Surface(depth), None, dataclasses.replace(settings, in_front=True)
+        )
         assert not tested.mask.any()
         assert not in_front(tested.correspondence)[view.mask].any()
 
@@ -340,14 +370,23 @@ def test_the_filters_on_gaussians_are_those_on_points(kind):
     clear = np.ones(len(n), dtype=bool)
     for camera in (source, target):
         clear &= np.abs(((camera.position - n) * n).sum(-1)) > 1e-3
-    assert np.array_equal(gaussian_filter(shells, source, target, "facing").numpy()[clear], same[clear])
+    assert np.array_equal(
+        gaussian_filter(shells, source, target, "facing").numpy()[clear], same[clear]
+    )
 
-    turned = [np.where(s[:, None], n, -n) @ camera.rotation.T for s, camera in zip(seen, (source, target), strict=True)]
+    turned = [
+        np.where(s[:, None], n, -n) @ camera.rotation.T
+        for s, camera in zip(seen, (source, target), strict=True)
+    ]
     cosine = (turned[0] * turned[1]).sum(-1)
     clear &= np.abs(cosine - 0.5) > 1e-3
     within = cosine > 0.5
-    assert np.array_equal(gaussian_filter(shells, source, target, "camera_frame").numpy()[clear], within[clear])
-    assert np.array_equal(gaussian_filter(shells, source, target, "printed").numpy()[clear], ~within[clear])
+    assert np.array_equal(
+        gaussian_filter(shells, source, target, "camera_frame").numpy()[clear], within[clear]
+    )
+    assert np.array_equal(
+        gaussian_filter(shells, source, target, "printed").numpy()[clear], ~within[clear]
+    )
     ray = source.position - n
     incidence = np.abs((ray * n).sum(-1)) / np.linalg.norm(ray, axis=-1)
     clear &= np.abs(incidence - 0.5) > 1e-3
@@ -375,17 +414,25 @@ def test_splats_of_a_sphere_warp_like_the_sphere(kind):
     for camera in (source, target):
         ray = camera.position - normal
         cosines.append((ray * normal).sum(-1) / np.linalg.norm(ray, axis=-1))
-    # Steeper than that, depth changes by some percent a pixel at this size, and its taps may be rejected.
+    # Steeper than that, depth changes by some percent a pixel at this size, and its taps may be
+    # rejected.
     inner = visible & (np.fmin(*cosines) > 0.5)
     assert mask[inner].mean() > 0.99
     # Splats reach past the outline: less than a pixel all around it, of a radius of 30 px.
     assert (mask & ~visible).sum() < 2 / 30 * visible.sum()
     exact, _ = source.project(normal)
     error = np.linalg.norm(view.correspondence.xy.numpy() - exact, axis=-1)[mask & inner]
-    # A flat splat, cut off at 3 sigma, stands off the sphere by at most (3 * 0.6 * 0.025)^2 / 2 = 1e-3 scene units,
-    # which at this yaw is 0.03 px.
+    # A flat splat, cut off at 3 sigma, stands off the sphere by at most (3 * 0.6 * 0.025)^2 / 2 =
+    # 1e-3 scene units, which at this yaw is 0.03 px.
     assert np.median(error) < 0.03
-    assert set(view.rules) == {"defined", "in_bounds", "in_front", "opaque", "depth_agrees", "facing"}
+    assert set(view.rules) == {
+        "defined",
+        "in_bounds",
+        "in_front",
+        "opaque",
+        "depth_agrees",
+        "facing",
+    }
     assert torch.equal(view.mask, torch.stack(list(view.rules.values())).all(0))
     assert view.target.counters["splats"] == 20_000
 
@@ -397,28 +444,39 @@ def test_both_doors_give_the_same_view():
         kept = splats.select(gaussian_filter(splats, source, target, settings.gaussian_filter))
         seen = render_surface(kept, target, settings)
         seen = dataclasses.replace(seen, image=render_surface(splats, target, settings).image)
-        parts = warp_surfaces(source, target, seen, render_surface(splats, source, settings), settings)
+        parts = warp_surfaces(
+            source, target, seen, render_surface(splats, source, settings), settings
+        )
         assert torch.equal(whole.mask, parts.mask), name
         assert list(whole.rules) == list(parts.rules)
     given = np.zeros((64, 64, 3))
-    released = warp_view(splats, source, target, PRESETS["released"], source_image=given, target_image=given)
+    released = warp_view(
+        splats, source, target, PRESETS["released"], source_image=given, target_image=given
+    )
     assert released.rules["photometric"].sum() == released.correspondence.defined.sum()
 
 
 def test_the_truths_own_surface_warps_to_within_a_thousandth_of_a_pixel():
-    # The calibration: exact depth in, exact positions out, at image size; and at 32 by 1 / z interpolation.
+    # The calibration: exact depth in, exact positions out, at image size; and at 32 by 1 / z
+    # interpolation.
     source, target = orbit(0, size=256, height=0.3), orbit(30, size=256)
     (depth, normal), (source_depth, source_normal) = sphere(target), sphere(source)
     settings = preset("corrected", depth_relative=1e-4)
-    view = warp_surfaces(source, target, Surface(depth, normal), Surface(source_depth, source_normal), settings)
+    view = warp_surfaces(
+        source, target, Surface(depth, normal), Surface(source_depth, source_normal), settings
+    )
     exact, _ = source.project(normal)
     assert np.abs(view.correspondence.xy.numpy() - exact)[view.mask.numpy()].max() < 1e-9
     layer = view.at((32, 32))
     small = sphere(target.resize(32, 32))[1]
     exact_layer, _ = source.resize(32, 32).project(small)
-    error = 8 * np.linalg.norm(layer.correspondence.xy.numpy() - exact_layer, axis=-1)[layer.mask.numpy()]
+    error = (
+        8
+        * np.linalg.norm(layer.correspondence.xy.numpy() - exact_layer, axis=-1)[layer.mask.numpy()]
+    )
     assert layer.mask.sum() > 200
-    # The four taps lie half an image pixel around the centre: what is left is the sphere's curvature over that.
+    # The four taps lie half an image pixel around the centre: what is left is the sphere's
+    # curvature over that.
     assert np.median(error) < 6e-3
     assert view.at((32, 32)) is layer
 
@@ -430,9 +488,17 @@ def test_every_rule_can_be_varied_alone():
     source, target = orbit(0, size=32), orbit(40, size=32)
     (depth, normal), (source_depth, source_normal) = sphere(target), sphere(source)
     image = np.zeros((32, 32, 3))
-    seen = [Surface(d, n, np.isfinite(d) * 1.0, image) for d, n in ((depth, normal), (source_depth, source_normal))]
+    seen = [
+        Surface(d, n, np.isfinite(d) * 1.0, image)
+        for d, n in ((depth, normal), (source_depth, source_normal))
+    ]
     bare = WarpSettings(
-        in_front=False, opaque=None, depth_agreement=False, normal_test="none", photometric=None, segment=False
+        in_front=False,
+        opaque=None,
+        depth_agreement=False,
+        normal_test="none",
+        photometric=None,
+        segment=False,
     )
     run = lambda s, **more: warp_surfaces(source, target, *seen, s, **more)  # noqa: E731
     assert list(run(bare).rules) == ["defined", "in_bounds"]
@@ -497,7 +563,10 @@ def test_the_presets_are_the_table():
         ({"depth_relative": "small"}, r"depth_relative: got 'small', expected a number"),
         ({"depth_slope": float("nan")}, r"depth_slope: got nan"),
         ({"in_front": 1}, r"in_front: got 1, expected true or false"),
-        ({"pixel_centres": "half"}, r"warp setting: got 'pixel_centres'.*did you mean 'pixel_centers'"),
+        (
+            {"pixel_centres": "half"},
+            r"warp setting: got 'pixel_centres'.*did you mean 'pixel_centers'",
+        ),
     ],
 )
 def test_a_wrong_setting_is_refused_by_name(change, message):
@@ -510,11 +579,17 @@ def test_a_wrong_setting_is_refused_by_name(change, message):
 def test_a_rule_says_what_it_needs():
     camera = orbit(0, size=4)
     depth = np.full((4, 4), 3.0)
-    with pytest.raises(ValueError, match=r"source_surface\.depth: got None, but the rule depth_agreement needs it"):
+    with pytest.raises(
+        ValueError, match=r"source_surface\.depth: got None, but the rule depth_agreement needs it"
+    ):
         warp_surfaces(camera, camera, Surface(depth))
-    with pytest.raises(ValueError, match=r"target_surface\.normal: got None, but the rule normal_test='facing'"):
+    with pytest.raises(
+        ValueError, match=r"target_surface\.normal: got None, but the rule normal_test='facing'"
+    ):
         warp_surfaces(camera, camera, Surface(depth), Surface(depth))
-    with pytest.raises(ValueError, match=r"source_surface\.image: got None, but the rule photometric"):
+    with pytest.raises(
+        ValueError, match=r"source_surface\.image: got None, but the rule photometric"
+    ):
         warp_surfaces(camera, camera, Surface(depth), Surface(depth), PRESETS["released"])
 
 
@@ -524,7 +599,9 @@ def test_a_rule_says_what_it_needs():
 def test_a_mask_at_feature_size_counts_what_it_covers():
     mask = torch.zeros(8, 8, dtype=torch.bool)
     mask[:, :4] = True
-    mask[3:5, 4:] = True  # what the bilinear 4 pixels around the middle of the right half see, a quarter of its area
+    mask[3:5, 4:] = (
+        True  # what the bilinear 4 pixels around the middle of the right half see, a quarter of its area
+    )
     assert resize_mask(mask, (1, 2)).tolist() == [[True, False]]
     assert resize_mask(mask, (1, 2), "bilinear").tolist() == [[True, True]]
     assert resize_mask(mask, (1, 2), "nearest").tolist() == [[True, True]]
@@ -538,7 +615,9 @@ def test_resizing_a_mask_agrees_with_torch():
     mask = torch.rand(96, 64, generator=torch.Generator().manual_seed(0)) > 0.45
     full = mask.double()[None, None]
     area = torch.nn.functional.interpolate(full, size=(12, 16), mode="area")[0, 0]
-    bilinear = torch.nn.functional.interpolate(full, size=(12, 16), mode="bilinear", align_corners=False)[0, 0]
+    bilinear = torch.nn.functional.interpolate(
+        full, size=(12, 16), mode="bilinear", align_corners=False
+    )[0, 0]
     assert torch.equal(resize_mask(mask, (12, 16)), area > 0.5)
     assert torch.equal(resize_mask(mask, (12, 16), "bilinear"), bilinear > 0.5)
     # Overlaps that are not whole: each third of 4 pixels covers 1 and a third of them.
@@ -550,7 +629,9 @@ def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():
     source, target = orbit(0, size=64), orbit(10, size=64)
     depth = plane_depth(target, (1, 0, 0), 0.0)
     depth[:, 31:33] = np.nan  # both taps of the 32 grid's column 15 keep one pixel, column 16 too
-    view = warp_surfaces(source, target, Surface(depth), None, preset("paper", gaussian_filter="none"))
+    view = warp_surfaces(
+        source, target, Surface(depth), None, preset("paper", gaussian_filter="none")
+    )
     undefined = torch.isnan(resize_depth(depth, (32, 32)))
     assert undefined.any()
     assert not view.at((32, 32)).mask[undefined].any()

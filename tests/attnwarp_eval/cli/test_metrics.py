@@ -61,7 +61,10 @@ def write(path, rgb):
 def data(tmp_path):
     """Three views, three ways of naming the same picture's kind, and the arrays behind them."""
     random = np.random.default_rng(0)
-    arrays = {group: {v: random_picture(random) for v in VIEWS} for group in ("renders", "edited", "originals")}
+    arrays = {
+        group: {v: random_picture(random) for v in VIEWS}
+        for group in ("renders", "edited", "originals")
+    }
     for group, suffix in (("renders", "png"), ("edited", "tif"), ("originals", "PNG")):
         for view, picture in arrays[group].items():
             write(tmp_path / group / f"{view}.{suffix}", picture)
@@ -78,7 +81,9 @@ def everything(folder, models, *more):
     options = [f"--{group}={folder / group}" for group in ("renders", "edited", "originals")]
     chosen = [f"--{kind}={name}" for kind, name in models.items()]
     out = ["--out", folder / "out"] if "--out" not in more else []
-    return call("metrics", *options, f"--source-edit={folder / 'edit.png'}", *PROMPTS, *chosen, *out, *more)
+    return call(
+        "metrics", *options, f"--source-edit={folder / 'edit.png'}", *PROMPTS, *chosen, *out, *more
+    )
 
 
 def saved(folder):
@@ -95,14 +100,19 @@ def test_the_whole_row_is_what_the_encoders_and_pixels_give(data, models):
     assert done.exit_code == 0, done.output
     found = saved(folder)["metrics"]
     renders, edited, originals = (
-        {v: a.astype(np.float64) / 255 for v, a in arrays[g].items()} for g in ("renders", "edited", "originals")
+        {v: a.astype(np.float64) / 255 for v, a in arrays[g].items()}
+        for g in ("renders", "edited", "originals")
     )
     errors = [((edited[v] - renders[v]) ** 2).mean() for v in VIEWS]
     expected = {v: -10 * math.log10(e) for v, e in zip(VIEWS, errors, strict=True)}
     assert list(found["edit.psnr_mean"]["views"]) == list(VIEWS)  # view2 before view10
     assert found["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
-    assert found["edit.psnr_mean"]["value"] == pytest.approx(np.mean(list(expected.values())), abs=1e-4)
-    assert found["edit.psnr_pooled"]["value"] == pytest.approx(-10 * math.log10(np.mean(errors)), abs=1e-4)
+    assert found["edit.psnr_mean"]["value"] == pytest.approx(
+        np.mean(list(expected.values())), abs=1e-4
+    )
+    assert found["edit.psnr_pooled"]["value"] == pytest.approx(
+        -10 * math.log10(np.mean(errors)), abs=1e-4
+    )
 
     clip, dino = load_encoder(models["clip"]), load_encoder(models["dino"])
     (source,) = clip.images([arrays["source"] / 255])
@@ -114,22 +124,33 @@ def test_the_whole_row_is_what_the_encoders_and_pixels_give(data, models):
             ("clip_similarity", cosine(now, target)),
             ("clip_image", cosine(now, source)),
             ("clip_directional", cosine(unit(now) - unit(was), unit(target) - unit(before))),
-            ("dino_image", cosine(dino.images([renders[v]]), dino.images([arrays["source"] / 255]))),
+            (
+                "dino_image",
+                cosine(dino.images([renders[v]]), dino.images([arrays["source"] / 255])),
+            ),
         ):
             assert found[f"embedding.{key}"]["views"][v] == pytest.approx(value, abs=1e-4)
-    lpips = load_encoder(models["perceptual"]).distance(list(edited.values()), list(renders.values()))
+    lpips = load_encoder(models["perceptual"]).distance(
+        list(edited.values()), list(renders.values())
+    )
     assert found["perceptual.distance"]["value"] == pytest.approx(lpips.mean(), rel=1e-4)
     for key, row in found.items():
-        assert (row["unit"], row["direction"]) == (metric(key).unit, metric(key).direction) and row["n"] == 3
+        assert (row["unit"], row["direction"]) == (metric(key).unit, metric(key).direction) and row[
+            "n"
+        ] == 3
 
 
 def test_what_is_saved_says_what_was_measured_with_what(data, models):
     folder, _ = data
     done = everything(folder, models)
     about = saved(folder)
-    assert about["inputs"]["prompt"] == PROMPTS[1] and about["inputs"]["renders"] == str(folder / "renders")
+    assert about["inputs"]["prompt"] == PROMPTS[1] and about["inputs"]["renders"] == str(
+        folder / "renders"
+    )
     for kind in ("clip", "dino", "perceptual"):
-        assert about["encoders"][kind] == json.loads(json.dumps(load_encoder(models[kind]).about.to_dict()))
+        assert about["encoders"][kind] == json.loads(
+            json.dumps(load_encoder(models[kind]).about.to_dict())
+        )
     text = (folder / "out" / "metrics.md").read_text()
     for expected in (
         "| Edit PSNR, pooled |", "| CLIP directional similarity |", "| view10 |", about["encoders"]["clip"]["weights_sha256"],
@@ -137,7 +158,11 @@ def test_what_is_saved_says_what_was_measured_with_what(data, models):
     ):  # fmt: skip
         assert expected in text
     assert not about["not_computed"] and not about["unpaired"]
-    for title in ("Edit PSNR, mean of the views", "DINO single-image similarity", "Perceptual distance"):
+    for title in (
+        "Edit PSNR, mean of the views",
+        "DINO single-image similarity",
+        "Perceptual distance",
+    ):
         assert title in done.stdout
     assert str(folder / "out" / "metrics.json") in done.stdout.replace("\n", "")
 
@@ -154,33 +179,56 @@ def test_json_goes_to_stdout_alone(data, models):
     [
         ("edited", {"Edit PSNR": "needs --edited", "Perceptual distance": "needs --edited"}),
         ("originals", {"CLIP directional similarity": "needs --originals"}),
-        ("source-edit", {f"{n} single-image similarity": "needs --source-edit" for n in ("CLIP", "DINO")}),
+        (
+            "source-edit",
+            {f"{n} single-image similarity": "needs --source-edit" for n in ("CLIP", "DINO")},
+        ),
         ("source-prompt", {"CLIP directional similarity": "needs --source-prompt"}),
-        ("prompt", {"CLIP similarity": "needs --prompt", "CLIP directional similarity": "needs --prompt"}),
+        (
+            "prompt",
+            {"CLIP similarity": "needs --prompt", "CLIP directional similarity": "needs --prompt"},
+        ),
     ],
 )
 def test_what_is_left_out_costs_its_figures_and_the_reason_is_said(data, models, left_out, reasons):
     folder, _ = data
     options = {
-        "renders": folder / "renders", "edited": folder / "edited", "originals": folder / "originals",
-        "source-edit": folder / "edit.png", "prompt": PROMPTS[1], "source-prompt": PROMPTS[3], "out": folder / "out",
-    } | models  # fmt: skip
-    done = call("metrics", *(f"--{name}={value}" for name, value in options.items() if name != left_out))
+        "renders": folder / "renders",
+        "edited": folder / "edited",
+        "originals": folder / "originals",
+        "source-edit": folder / "edit.png",
+        "prompt": PROMPTS[1],
+        "source-prompt": PROMPTS[3],
+        "out": folder / "out",
+    } | models
+    done = call(
+        "metrics", *(f"--{name}={value}" for name, value in options.items() if name != left_out)
+    )
     assert done.exit_code == 0, done.output
     assert saved(folder)["not_computed"] == reasons
     for title, reason in reasons.items():
         assert f"not computed: {title}: {reason}" in done.stderr
-    assert len(saved(folder)["metrics"]) == 7 - len(reasons) - ("Edit PSNR" in reasons)  # Edit PSNR has two rows
+    assert len(saved(folder)["metrics"]) == 7 - len(reasons) - (
+        "Edit PSNR" in reasons
+    )  # Edit PSNR has two rows
 
 
 def test_pixels_alone_need_no_encoder(data):
     folder, _ = data
     off = ("--clip=none", "--dino=none", "--perceptual=none")
     done = call(
-        "metrics", f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", *off, "--out", folder / "out"
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        *off,
+        "--out",
+        folder / "out",
     )
     assert done.exit_code == 0, done.output
-    assert set(saved(folder)["metrics"]) == {"edit.psnr_mean", "edit.psnr_pooled"} and saved(folder)["encoders"] == {}
+    assert (
+        set(saved(folder)["metrics"]) == {"edit.psnr_mean", "edit.psnr_pooled"}
+        and saved(folder)["encoders"] == {}
+    )
     assert saved(folder)["not_computed"]["Perceptual distance"] == "left out by --perceptual none"
 
 
@@ -188,7 +236,10 @@ def test_nothing_that_can_be_computed_is_wrong_usage(data):
     folder, _ = data
     done = call("metrics", f"--edited={folder / 'edited'}", "--out", folder / "out")
     assert done.exit_code == 2
-    assert "nothing can be computed: Edit PSNR: needs --renders; CLIP similarity: needs --renders and" in done.stderr
+    assert (
+        "nothing can be computed: Edit PSNR: needs --renders; CLIP similarity: needs --renders and"
+        in done.stderr
+    )
     assert not (folder / "out").exists()
 
 
@@ -209,14 +260,23 @@ def test_names_that_never_meet_are_told_apart(data):
     folder, _ = data
     for path in (folder / "edited").iterdir():
         path.rename(path.with_name(f"edit_{path.name}"))
-    done = call("metrics", f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", "--out", folder / "out")
+    done = call(
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        "--out",
+        folder / "out",
+    )
     assert done.exit_code == 2
     assert (
-        "no name stands in all of --renders (view1, view2, view10) and --edited (edit_view1, edit_view2" in done.stderr
+        "no name stands in all of --renders (view1, view2, view10) and --edited (edit_view1,"
+        " edit_view2" in done.stderr
     )
 
 
-@pytest.mark.parametrize("group, suffix", [("edited", "tif"), ("originals", "PNG"), ("masks", "png")])
+@pytest.mark.parametrize(
+    "group, suffix", [("edited", "tif"), ("originals", "PNG"), ("masks", "png")]
+)
 def test_a_pair_of_different_sizes_names_both(data, models, group, suffix):
     folder, _ = data
     for view in VIEWS:
@@ -224,15 +284,23 @@ def test_a_pair_of_different_sizes_names_both(data, models, group, suffix):
     write(folder / group / f"view2.{suffix}", np.zeros((20, 24, 3), np.uint8))
     done = everything(folder, models, f"--mask={folder / 'masks'}")
     assert done.exit_code == 2
-    for part in (f"{group}/view2.{suffix} is 24 x 20 px, but ", "view2.png is 48 x 40: a pair must have one size"):
+    for part in (
+        f"{group}/view2.{suffix} is 24 x 20 px, but ",
+        "view2.png is 48 x 40: a pair must have one size",
+    ):
         assert part in done.stderr
 
 
 def test_views_beyond_one_batch_and_pairs_with_holes_keep_their_own_values(tmp_path, models):
     random = np.random.default_rng(1)
     names = [f"{i}" for i in range(2 * BATCH + 1)]
-    sizes = {name: (40, 48) if int(name) % 3 else (50, 36) for name in names}  # sizes differ from view to view
-    arrays = {g: {n: random_picture(random, sizes[n]) for n in names} for g in ("renders", "edited", "originals")}
+    sizes = {
+        name: (40, 48) if int(name) % 3 else (50, 36) for name in names
+    }  # sizes differ from view to view
+    arrays = {
+        g: {n: random_picture(random, sizes[n]) for n in names}
+        for g in ("renders", "edited", "originals")
+    }
     here = {"renders": names, "edited": names[1::2], "originals": names[2::3]}
     for group, some in here.items():
         for name in some:
@@ -245,7 +313,10 @@ def test_views_beyond_one_batch_and_pairs_with_holes_keep_their_own_values(tmp_p
     expected = {n: cosine(clip.images([arrays["renders"][n] / 255])[0], source) for n in names}
     assert found["embedding.clip_image"]["views"] == pytest.approx(expected, abs=1e-5)
     assert list(found["embedding.clip_directional"]["views"]) == here["originals"]
-    errors = {n: (((arrays["edited"][n] / 255.0) - (arrays["renders"][n] / 255.0)) ** 2).mean() for n in here["edited"]}
+    errors = {
+        n: (((arrays["edited"][n] / 255.0) - (arrays["renders"][n] / 255.0)) ** 2).mean()
+        for n in here["edited"]
+    }
     expected = {n: -10 * math.log10(e) for n, e in errors.items()}
     assert found["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
     assert found["edit.psnr_pooled"]["value"] == pytest.approx(
@@ -277,17 +348,33 @@ def test_views_that_did_not_change_have_no_direction(data, models):
 def test_a_figure_undefined_everywhere_is_too_little(data, models):
     folder, _ = data
     done = call(
-        "metrics", f"--renders={folder / 'renders'}", f"--originals={folder / 'originals'}", "--prompt", "a bear",
-        "--source-prompt", "a  bear ", f"--clip={models['clip']}", "--out", folder / "out",
-    )  # fmt: skip
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--originals={folder / 'originals'}",
+        "--prompt",
+        "a bear",
+        "--source-prompt",
+        "a  bear ",
+        f"--clip={models['clip']}",
+        "--out",
+        folder / "out",
+    )
     # The similarity to the prompt has values, so this is no failure; the direction has none.
-    assert done.exit_code == 0 and saved(folder)["metrics"]["embedding.clip_directional"]["value"] is None
+    assert (
+        done.exit_code == 0
+        and saved(folder)["metrics"]["embedding.clip_directional"]["value"] is None
+    )
     for path in (folder / "masks" / f"{v}.png" for v in VIEWS):
         write(path, np.zeros((40, 48), np.uint8))
     done = call(
-        "metrics", f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", f"--mask={folder / 'masks'}",
-        "--perceptual=none", "--out", folder / "out",
-    )  # fmt: skip
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        f"--mask={folder / 'masks'}",
+        "--perceptual=none",
+        "--out",
+        folder / "out",
+    )
     assert done.exit_code == 3 and "every figure is undefined on these pictures" in done.stderr
     assert "3 masks are black all over" in done.stderr
 
@@ -299,9 +386,14 @@ def test_a_mask_leaves_out_what_is_black_and_divides_by_the_rest(data):
     write(folder / "masks" / "view1.png", inside)
     write(folder / "masks" / "view2.png", np.dstack([inside] * 3))
     done = call(
-        "metrics", f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", f"--mask={folder / 'masks'}",
-        "--perceptual=none", "--out", folder / "out",
-    )  # fmt: skip
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        f"--mask={folder / 'masks'}",
+        "--perceptual=none",
+        "--out",
+        folder / "out",
+    )
     assert done.exit_code == 0, done.output
     assert "1 of --renders without one in --mask: view10" in done.stderr
     views = saved(folder)["metrics"]["edit.psnr_mean"]["views"]
@@ -315,16 +407,27 @@ def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
     folder, arrays = data
     inside = np.zeros((40, 48), np.uint8)
     inside[:, 16:] = 255
-    for view, mask in zip(VIEWS, (inside, np.full_like(inside, 255), np.zeros_like(inside)), strict=True):
+    for view, mask in zip(
+        VIEWS, (inside, np.full_like(inside, 255), np.zeros_like(inside)), strict=True
+    ):
         write(folder / "masks" / f"{view}.png", mask)
     done = everything(folder, models, f"--mask={folder / 'masks'}")
     assert done.exit_code == 0, done.output
     row = saved(folder)["metrics"]["perceptual.distance"]
     encoder = load_encoder(models["perceptual"], "perceptual")
-    edited, renders = ([arrays[g][v].astype(np.float32) / 255 for v in VIEWS] for g in ("edited", "renders"))
+    edited, renders = (
+        [arrays[g][v].astype(np.float32) / 255 for v in VIEWS] for g in ("edited", "renders")
+    )
     put = np.concatenate([renders[0][:, :16], edited[0][:, 16:]], axis=1)
-    part, whole = 1.5 * encoder.distance([put], renders[:1])[0], encoder.distance(edited[1:2], renders[1:2])[0]
-    assert row["views"] == {"view1": pytest.approx(part), "view2": pytest.approx(whole), "view10": None}
+    part, whole = (
+        1.5 * encoder.distance([put], renders[:1])[0],
+        encoder.distance(edited[1:2], renders[1:2])[0],
+    )
+    assert row["views"] == {
+        "view1": pytest.approx(part),
+        "view2": pytest.approx(whole),
+        "view10": None,
+    }
     assert row["value"] == pytest.approx((part + whole) / 2)
     assert (row["n"], row["undefined"]) == (2, ["view10"])
     assert "1 masks are black all over" in done.stderr
@@ -337,11 +440,25 @@ def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
 @pytest.mark.parametrize(
     "spoil, complaint",
     [
-        (lambda f: (f / "renders" / "view2.png").write_bytes(b"none"), r"view2\.png: cannot be read as an image"),
-        (lambda f: cut(f / "renders" / "view2.png"), r"view2\.png: the picture is damaged \(image file is truncated"),
+        (
+            lambda f: (f / "renders" / "view2.png").write_bytes(b"none"),
+            r"view2\.png: cannot be read as an image",
+        ),
+        (
+            lambda f: cut(f / "renders" / "view2.png"),
+            r"view2\.png: the picture is damaged \(image file is truncated",
+        ),
         (lambda f: (f / "edit.png").unlink(), r"edit\.png: there is no such file"),
-        (lambda f: cv2.imwrite(str(f / "edited" / "view2.tif"), np.zeros((40, 48, 3), np.float32)), "holds float32"),
-        (lambda f: write(f / "renders" / "view2.jpg", np.zeros((40, 48, 3), np.uint8)), r"have one name; pictures are"),
+        (
+            lambda f: cv2.imwrite(
+                str(f / "edited" / "view2.tif"), np.zeros((40, 48, 3), np.float32)
+            ),
+            "holds float32",
+        ),
+        (
+            lambda f: write(f / "renders" / "view2.jpg", np.zeros((40, 48, 3), np.uint8)),
+            r"have one name; pictures are",
+        ),
         (
             lambda f: [p.unlink() for p in (f / "edited").iterdir()],
             r"--edited: .*edited holds no picture, expected files",
@@ -383,7 +500,10 @@ def test_other_folders_and_flags_that_will_not_do(data, models):
         ),
         ((one, "--prompt=x", "--clip=dino-small"), "is of kind 'dino', expected 'clip'"),
         ((one, "--prompt=x", "--clip=clap"), "--clip: encoder 'clap': unknown; did you mean"),
-        ((one, "--prompt=x", "--background=red"), "--background: got 'red', expected black, white or r,g,b"),
+        (
+            (one, "--prompt=x", "--background=red"),
+            "--background: got 'red', expected black, white or r,g,b",
+        ),
         (
             (one, "--prompt=x", f"--clip={models['clip']}", "--device=gpu"),
             "device 'gpu': unknown, expected cpu or cuda",
@@ -396,10 +516,13 @@ def test_other_folders_and_flags_that_will_not_do(data, models):
 def test_16_bits_grey_and_transparent_pictures_are_read_as_documented(tmp_path):
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
     assert np.array_equal(
-        read_picture(write(tmp_path / "g.png", grey)), np.repeat(grey[..., None] / np.float32(255), 3, 2)
+        read_picture(write(tmp_path / "g.png", grey)),
+        np.repeat(grey[..., None] / np.float32(255), 3, 2),
     )
     deep = np.dstack([grey.astype(np.uint16) * 257 + 5] * 3).clip(0, 65535).astype(np.uint16)
-    np.testing.assert_allclose(read_picture(write(tmp_path / "d.png", deep)), deep / 65535, atol=1e-7)
+    np.testing.assert_allclose(
+        read_picture(write(tmp_path / "d.png", deep)), deep / 65535, atol=1e-7
+    )
     clear = np.zeros((2, 2, 4), np.uint8)
     clear[0] = (200, 100, 50, 255)
     clear[1] = (200, 100, 50, 51)  # a fifth
@@ -417,22 +540,41 @@ def test_transparency_is_laid_over_the_chosen_background_before_it_is_measured(t
     clear = np.zeros((40, 48, 4), np.uint8)
     write(tmp_path / "renders" / "a.png", clear)
     write(tmp_path / "edited" / "a.png", np.full((40, 48, 3), 255, np.uint8))
-    for background, expected in (("black", 0.0), ("white", "inf"), ("0.5,0.5,0.5", -20 * math.log10(0.5))):
+    for background, expected in (
+        ("black", 0.0),
+        ("white", "inf"),
+        ("0.5,0.5,0.5", -20 * math.log10(0.5)),
+    ):
         call(
-            "metrics", f"--renders={tmp_path / 'renders'}", f"--edited={tmp_path / 'edited'}", "--perceptual=none",
-            f"--background={background}", "--out", tmp_path / "out",
-        )  # fmt: skip
+            "metrics",
+            f"--renders={tmp_path / 'renders'}",
+            f"--edited={tmp_path / 'edited'}",
+            "--perceptual=none",
+            f"--background={background}",
+            "--out",
+            tmp_path / "out",
+        )
         value = saved(tmp_path)["metrics"]["edit.psnr_pooled"]["value"]
-        assert value == (expected if isinstance(expected, str) else pytest.approx(expected, abs=1e-5))
+        assert value == (
+            expected if isinstance(expected, str) else pytest.approx(expected, abs=1e-5)
+        )
 
 
 def test_a_long_prompt_is_cut_and_that_is_said(data, models):
     folder, _ = data
     done = call(
-        "metrics", f"--renders={folder / 'renders'}", "--prompt", "bear " * 40, f"--clip={models['clip']}",
-        "--out", folder / "out",
-    )  # fmt: skip
-    assert done.exit_code == 0 and "--prompt is longer than the encoder takes: its last 18 tokens" in done.stderr
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        "--prompt",
+        "bear " * 40,
+        f"--clip={models['clip']}",
+        "--out",
+        folder / "out",
+    )
+    assert (
+        done.exit_code == 0
+        and "--prompt is longer than the encoder takes: its last 18 tokens" in done.stderr
+    )
 
 
 def test_the_encoders_are_listed_and_one_is_described(models):
@@ -446,7 +588,9 @@ def test_the_encoders_are_listed_and_one_is_described(models):
         "lpips:FILE_OR_FOLDER",
     ):
         assert name in listed
-    assert [row["bundled"] for row in json.loads(call("encoders", "--json").stdout)] == [True] * 3 + [False] * 3
+    assert [row["bundled"] for row in json.loads(call("encoders", "--json").stdout)] == [
+        True
+    ] * 3 + [False] * 3
     about = json.loads(call("encoders", models["clip"], "--json").stdout)
     assert about == load_encoder(models["clip"]).about.to_dict()
     assert "weights_sha256" in call("encoders", models["dino"]).stdout
@@ -454,19 +598,39 @@ def test_the_encoders_are_listed_and_one_is_described(models):
     assert wrong.exit_code == 2 and "did you mean 'dinov2:FOLDER'" in wrong.stderr
 
 
-def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_named_is_an_error(data, monkeypatch):
+def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_named_is_an_error(
+    data, monkeypatch
+):
     import importlib.util
 
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name.endswith("bundled") else found(name))
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *a: None if name.endswith("bundled") else found(name),
+    )
     folder, _ = data
-    pairs = (f"--renders={folder / 'renders'}", f"--edited={folder / 'edited'}", "--out", folder / "out")
+    pairs = (
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        "--out",
+        folder / "out",
+    )
     done = call("metrics", *pairs)
-    assert done.exit_code == 0 and set(saved(folder)["metrics"]) == {"edit.psnr_mean", "edit.psnr_pooled"}
-    reason = "needs --perceptual: encoder 'perceptual-small': this installation carries no bundled weights"
+    assert done.exit_code == 0 and set(saved(folder)["metrics"]) == {
+        "edit.psnr_mean",
+        "edit.psnr_pooled",
+    }
+    reason = (
+        "needs --perceptual: encoder 'perceptual-small': this installation carries no bundled"
+        " weights"
+    )
     assert saved(folder)["not_computed"]["Perceptual distance"].startswith(reason)
     done = call("metrics", *pairs, "--perceptual=perceptual-small")
-    assert done.exit_code == 2 and "--perceptual: encoder 'perceptual-small': this installation" in done.stderr
+    assert (
+        done.exit_code == 2
+        and "--perceptual: encoder 'perceptual-small': this installation" in done.stderr
+    )
 
 
 def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypatch):
@@ -479,6 +643,13 @@ def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypat
     asked = []
     monkeypatch.setattr(measure, "load_encoder", lambda *a, **k: asked.append((a, k)) or encoder)
     folder, _ = data
-    done = call("metrics", f"--renders={folder / 'renders'}", "--prompt=a bear", "--out", folder / "out")
-    assert asked == [(("clip-small", "clip"), {"device": "cpu"})]  # the default, and nothing that no figure needs
-    assert done.exit_code == 0 and "clip-small is small and was trained on random rendered scenes" in done.stderr
+    done = call(
+        "metrics", f"--renders={folder / 'renders'}", "--prompt=a bear", "--out", folder / "out"
+    )
+    assert asked == [
+        (("clip-small", "clip"), {"device": "cpu"})
+    ]  # the default, and nothing that no figure needs
+    assert (
+        done.exit_code == 0
+        and "clip-small is small and was trained on random rendered scenes" in done.stderr
+    )

@@ -12,13 +12,17 @@ from attnwarp_eval.statistics.intervals import Interval
 
 
 def around(value: float) -> Interval:
-    return Interval(value, 0.9 * value, 1.1 * value, scenes=3, views=9, undefined=0, detectable=0.1, p=0.01)
+    return Interval(
+        value, 0.9 * value, 1.1 * value, scenes=3, views=9, undefined=0, detectable=0.1, p=0.01
+    )
 
 
 @pytest.mark.parametrize("log", [True, False])
 def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
     random = np.random.default_rng(0)
-    points = {f"variant {k}": tuple(around(v) for v in (1 + 0.02 * random.random(2))) for k in range(8)}
+    points = {
+        f"variant {k}": tuple(around(v) for v in (1 + 0.02 * random.random(2))) for k in range(8)
+    }
     points["alone"] = (around(10.0), around(10.0))
     with figures.drawing(tmp_path / "front.svg") as (axes,):
         figures.cost_front(axes, points, x="seconds", y="error", title="front", log=log)

@@ -1,4 +1,6 @@
-"""Which effects a scene needs, what is planned for them, and materials, lamps, fog and lens against closed forms."""
+"""Which effects a scene needs, what is planned for them, and materials, lamps, fog and lens against
+closed forms.
+"""
 
 import functools
 import json
@@ -45,7 +47,15 @@ def test_each_effect_is_found_in_the_scene_that_calls_for_it_and_planned(name):
     made = plan(scene)
     assert (made.integrator, made.sensor) == EXPECTED[name]
     # Nothing is needed that the scene has no cause for.
-    for other in ("medium", "subsurface", "depth_of_field", "caustics", "glossy", "motion", "dispersion"):
+    for other in (
+        "medium",
+        "subsurface",
+        "depth_of_field",
+        "caustics",
+        "glossy",
+        "motion",
+        "dispersion",
+    ):
         assert found[other].needed == (other == name)
 
 
@@ -55,14 +65,17 @@ def test_evidence_names_the_words_of_the_file_and_what_mitsuba_made_of_them():
     assert any("plugin dielectric" in e for e in found["refraction"].evidence)
     assert any("BSDF flag Delta" in e for e in found["specular"].evidence)
     assert any(
-        "ThinLens" in e or "thinlens" in e for e in detect.detect(SCENES["depth_of_field"]())["depth_of_field"].evidence
+        "ThinLens" in e or "thinlens" in e
+        for e in detect.detect(SCENES["depth_of_field"]())["depth_of_field"].evidence
     )
 
 
 def test_a_file_and_a_loaded_scene_that_disagree_are_refused(monkeypatch):
     scene, real = SCENES["refraction"](), transport.called_for
     monkeypatch.setattr(
-        transport, "called_for", lambda spec: {k: v for k, v in real(spec).items() if k != "refraction"}
+        transport,
+        "called_for",
+        lambda spec: {k: v for k, v in real(spec).items() if k != "refraction"},
     )
     with pytest.raises(SceneError, match=r"shows refraction .* that the file does not"):
         detect.detect(scene)
@@ -73,7 +86,9 @@ def test_glossy_things_smooth_shading_and_textures_are_told_apart():
     found = detect.detect(make([FLOOR, gold], [SUN, SKY]))
     assert found["glossy"].needed and not found["specular"].needed and not found["caustics"].needed
     assert not found["textures"].needed
-    checked = FLOOR | {"texture": {"type": "checker", "colors": ["#ffffff", "#404040"], "size": 0.5}}
+    checked = FLOOR | {
+        "texture": {"type": "checker", "colors": ["#ffffff", "#404040"], "size": 0.5}
+    }
     found = detect.detect(make([checked, ball()], [SUN, SKY]))
     assert found["textures"].needed and any("Bitmap" in e for e in found["textures"].evidence)
 
@@ -84,7 +99,9 @@ def test_what_is_not_simulated_is_named():
     found = detect.detect(make([FLOOR, moving, prism], [SKY], 8))
     for name in ("motion", "dispersion", "polarisation"):
         assert found[name].needed and not found[name].simulated
-    text = "\n".join(detect.describe(make([FLOOR, moving], [SKY]), detect.report(make([FLOOR, moving], [SKY]))))
+    text = "\n".join(
+        detect.describe(make([FLOOR, moving], [SKY]), detect.report(make([FLOOR, moving], [SKY])))
+    )
     assert "NOT SIMULATED" in text and "motion" in text
 
 
@@ -97,7 +114,8 @@ def test_a_caustic_behind_a_lens_is_named_as_not_simulated():
 
 
 def test_a_scene_that_calls_for_what_is_not_simulated_is_never_certified():
-    # Both sides are the same plan, so that every picture is equal: the comparison alone certifies each time.
+    # Both sides are the same plan, so that every picture is equal: the comparison alone certifies
+    # each time.
     lens = make([FLOOR, ball(GLASS)], [POINT], 8, cameras={"lens": {"aperture": 0.1}})
     moving = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SKY])
     mirrors = make([FLOOR, ball(MIRROR)], [POINT], 4)
@@ -112,7 +130,11 @@ def test_a_scene_that_calls_for_what_is_not_simulated_is_never_certified():
         assert found.verdict == "can't tell" and missing in found.not_simulated
     still = make([FLOOR, ball()], [SKY])
     found = proof.prove(still, against=plan(still), size=8)
-    assert (found.verdict, found.of_simulated, found.not_simulated) == ("certified", "certified", ())
+    assert (found.verdict, found.of_simulated, found.not_simulated) == (
+        "certified",
+        "certified",
+        (),
+    )
     # A difference is a difference whatever else is missing.
     lit = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SUN, SKY])
     refused = proof.prove(lit, replace(plan(lit), passes=plan(lit).passes[:1]), size=8)
@@ -122,7 +144,10 @@ def test_a_scene_that_calls_for_what_is_not_simulated_is_never_certified():
 def test_ideal_mirrors_alone_polarise_nothing_and_metal_and_glass_do():
     mirrors = [ball(MIRROR, name="a"), ball(MIRROR, (1.5, 0, 0.7), name="b")]
     metal = ball({"type": "metal", "metal": "Al"}, (0, 1.5, 0.7), name="c")
-    calls = lambda objects: "polarisation" in transport.called_for(make([FLOOR, *objects], [SKY], 8).spec)  # noqa: E731
+
+    def calls(objects):
+        return "polarisation" in transport.called_for(make([FLOOR, *objects], [SKY], 8).spec)
+
     assert not calls(mirrors) and not calls([metal])
     assert calls([*mirrors, metal]) and calls([ball(GLASS)])
 
@@ -130,7 +155,9 @@ def test_ideal_mirrors_alone_polarise_nothing_and_metal_and_glass_do():
 def test_the_command_line_ends_with_3_and_names_what_is_not_simulated(monkeypatch):
     scene = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SKY], size=8)
     monkeypatch.setattr("attnwarp_eval.scene.file.load_scene", lambda name: scene)
-    monkeypatch.setattr(detect, "measure", functools.partial(detect.measure, size=8, spp=4, rounds=2))
+    monkeypatch.setattr(
+        detect, "measure", functools.partial(detect.measure, size=8, spp=4, rounds=2)
+    )
     result = CliRunner().invoke(app, ["scenes", "effects", "moving", "--prove"])
     assert result.exit_code == 3, result.output
     assert "not simulated: motion" in " ".join(result.output.split())
@@ -152,7 +179,8 @@ def test_a_large_lamp_is_left_to_camera_paths_and_a_small_one_is_not():
     assert plan(make([FLOOR, ball(GLASS), lamp(0.1)], [], 8)).integrator == "path + ptracer"
 
 
-# The words of a file -------------------------------------------------------------------------------------------------
+# The words of a file
+# --------------------------------------------------------------------------------------------------
 
 
 def refused(match, *args, **kwargs):
@@ -162,21 +190,49 @@ def refused(match, *args, **kwargs):
 
 def test_contradictions_are_refused_with_the_remedy():
     fog = {"sigma_t": 0.1}
-    refused("'medium' is forbidden, but the scene calls for it .*take away 'medium'", [FLOOR], [SKY],
-            medium=fog, effects={"forbid": ["medium"]})  # fmt: skip
-    refused("'medium' is pinned, but nothing here causes it", [FLOOR], [SKY], effects={"pin": ["medium"]})
-    refused("'dispersion' is not simulated, so it cannot be pinned", [FLOOR, ball(GLASS | {"abbe": 30})], [SKY], 8,
-            effects={"pin": ["dispersion"]})  # fmt: skip
+    refused(
+        "'medium' is forbidden, but the scene calls for it .*take away 'medium'",
+        [FLOOR],
+        [SKY],
+        medium=fog,
+        effects={"forbid": ["medium"]},
+    )
+    refused(
+        "'medium' is pinned, but nothing here causes it",
+        [FLOOR],
+        [SKY],
+        effects={"pin": ["medium"]},
+    )
+    refused(
+        "'dispersion' is not simulated, so it cannot be pinned",
+        [FLOOR, ball(GLASS | {"abbe": 30})],
+        [SKY],
+        8,
+        effects={"pin": ["dispersion"]},
+    )
     refused("is pinned as well", [FLOOR], [SKY], effects={"pin": ["direct"], "forbid": ["direct"]})
     refused("every picture needs the geometry", [FLOOR], [SKY], effects={"forbid": ["geometry"]})
-    refused("bounces: got 1, but object 'ball' is glass: .*say at least 3", [FLOOR, ball(GLASS)], [SKY])
-    refused("bounces: got 1, but object 'ball' is mirror: .*say at least 2", [FLOOR, ball(MIRROR)], [SKY])
-    blob = {"type": "body", "parts": [{"type": "ellipsoid", "center": [0, 0, 1], "radii": [1, 1, 1]}]}
+    refused(
+        "bounces: got 1, but object 'ball' is glass: .*say at least 3", [FLOOR, ball(GLASS)], [SKY]
+    )
+    refused(
+        "bounces: got 1, but object 'ball' is mirror: .*say at least 2",
+        [FLOOR, ball(MIRROR)],
+        [SKY],
+    )
+    blob = {
+        "type": "body",
+        "parts": [{"type": "ellipsoid", "center": [0, 0, 1], "radii": [1, 1, 1]}],
+    }
     plastic = ball({"type": "plastic"})
     refused("'ball' is plastic and its shape a body; plastic can be a sphere, a box or a rectangle",
             [FLOOR, plastic | {"shape": blob}], [SKY])  # fmt: skip
     assert plan(make([FLOOR, plastic], [SKY]))
-    allowed = make([FLOOR, ball()], [SKY], effects={"pin": ["environment"], "forbid": ["medium", "interreflection"]})
+    allowed = make(
+        [FLOOR, ball()],
+        [SKY],
+        effects={"pin": ["environment"], "forbid": ["medium", "interreflection"]},
+    )
     assert detect.detect(allowed)["environment"].source == "pinned"
 
 
@@ -200,14 +256,19 @@ cameras: {look_at: [0, 0, 0], radius: 3, source: {yaw: 0, height: 1}, targets: [
 """
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
-    with pytest.raises(SceneError, match=r"wrong\.yaml:14: effects\.forbid: 'medium' is pinned as well"):
+    with pytest.raises(
+        SceneError, match=r"wrong\.yaml:14: effects\.forbid: 'medium' is pinned as well"
+    ):
         load_scene(path)
     path.write_text(text.replace("medium: {sigma_t: 0.2}", "medium: {sigma: 0.2}"))
     with pytest.raises(
-        SceneError, match=r"wrong\.yaml:8: medium\.sigma: unknown key 'sigma'; did you mean 'sigma_t'\?"
+        SceneError,
+        match=r"wrong\.yaml:8: medium\.sigma: unknown key 'sigma'; did you mean 'sigma_t'\?",
     ):
         load_scene(path)
-    path.write_text(text.replace("lights: [{type: sky, horizon: '#ffffff', zenith: '#ffffff'}]", "lights: []"))
+    path.write_text(
+        text.replace("lights: [{type: sky, horizon: '#ffffff', zenith: '#ffffff'}]", "lights: []")
+    )
     with pytest.raises(SceneError, match="lights: there is none, and no object has an 'emission'"):
         load_scene(path)
 
@@ -232,14 +293,20 @@ def test_materials_that_cannot_be_are_refused(said, message):
 
 def test_keys_that_say_what_was_meant_anyway_change_no_hash_and_others_do():
     bare = make([FLOOR], [SKY])
-    same = make([FLOOR | {"material": {"type": "diffuse"}, "emission": None}], [SKY], medium=None, effects={"pin": []})
+    same = make(
+        [FLOOR | {"material": {"type": "diffuse"}, "emission": None}],
+        [SKY],
+        medium=None,
+        effects={"pin": []},
+    )
     assert same.content_hash == bare.content_hash and same.world_hash == bare.world_hash
     lens = make([FLOOR], [SKY], cameras={"lens": {"aperture": 0.1}})
     assert lens.content_hash != bare.content_hash and lens.world_hash == bare.world_hash
     assert make([FLOOR], [SKY], medium={"sigma_t": 1}).world_hash != bare.world_hash
 
 
-# Materials, lamps, fog and lens against closed forms -----------------------------------------------------------------
+# Materials, lamps, fog and lens against closed forms
+# --------------------------------------------------------------------------------------------------
 
 
 def looking_down(objects, lights, *, size=8, height=4.0, fov=5.0, **rest):
@@ -257,25 +324,30 @@ def test_a_point_light_gives_intensity_over_squared_distance_and_a_spot_the_same
     at = [1.0, 0, 2.0]
     expected = ALBEDO / math.pi * 3.0 * (2 / math.sqrt(5)) / 5
     point = looking_down([WHITE], [{"type": "point", "position": at, "intensity": 3.0}])
-    spot = looking_down([WHITE], [{"type": "spot", "position": at, "target": [0, 0, 0], "intensity": 3.0}])
-    # The view is 0.35 wide, over which the light changes by a few percent and evenly: the mean is that of the middle.
+    spot = looking_down(
+        [WHITE], [{"type": "spot", "position": at, "target": [0, 0, 0], "intensity": 3.0}]
+    )
+    # The view is 0.35 wide, over which the light changes by a few percent and evenly: the mean is
+    # that of the middle.
     assert np.allclose(point, expected, rtol=0.01) and np.allclose(spot, expected, rtol=0.01)
     away = {"type": "spot", "position": at, "target": [3, 0, 0], "intensity": 3.0, "cutoff": 20}
     assert (looking_down([WHITE], [away]) == 0).all()
 
 
 def test_a_square_lamp_gives_the_irradiance_of_its_form_factor():
-    # Point below the middle of a parallel rectangle: four corner rectangles of a x b at height h, each
-    # (1 / 2 pi) (A atan(B') + B atan(A')), Howell's catalogue of configuration factors, B-3.
+    # Point below the middle of a parallel rectangle: four corner rectangles of a x b at height h,
+    # each (1 / 2 pi) (A atan(B') + B atan(A')), Howell's catalogue of configuration factors, B-3.
     a = b = 0.75 / 3
-    corner = a / math.hypot(1, a) * math.atan(b / math.hypot(1, a)) + b / math.hypot(1, b) * math.atan(
-        a / math.hypot(1, b)
-    )
+    corner = a / math.hypot(1, a) * math.atan(b / math.hypot(1, a)) + b / math.hypot(
+        1, b
+    ) * math.atan(a / math.hypot(1, b))
     factor = 4 * corner / (2 * math.pi)
     scene = make([WHITE, LAMP], [], spp=256)
     camera = Camera.look_at((2, 0, 1), (0, 0, 0), width=8, height=8, fov_y=1)
     got = renderer.render_plan(scene, camera, plan(scene), 0).mean()
-    assert got == pytest.approx(ALBEDO * 4.0 * factor, rel=0.01)  # 16,384 samples of a lamp seen whole: noise 0.1 %
+    assert got == pytest.approx(
+        ALBEDO * 4.0 * factor, rel=0.01
+    )  # 16,384 samples of a lamp seen whole: noise 0.1 %
 
 
 def test_a_lamp_shines_where_it_faces_and_is_black_behind():
@@ -290,7 +362,8 @@ def test_fog_takes_light_as_beer_and_lambert_say():
     black = WHITE | {"emission": {"radiance": 2.0}}
     del black["texture"]
     fog = {"sigma_t": 0.5, "albedo": 0.0, "box": {"center": [0, 0, 1], "size": [20, 20, 2.5]}}
-    # The camera stands outside at 4; the fog reaches from -0.25 to 2.25, the lamp at 0 shines up through 2.25 of it.
+    # The camera stands outside at 4; the fog reaches from -0.25 to 2.25, the lamp at 0 shines up
+    # through 2.25 of it.
     got = looking_down([black], [], bounces=4, medium=fog)
     assert np.allclose(got, 2.0 * math.exp(-0.5 * 2.25), rtol=0.03)
     inside = looking_down([black], [], bounces=4, height=1.5, medium=fog)
@@ -317,17 +390,26 @@ def test_a_pane_lets_through_what_fresnel_says():
 
 
 def test_a_mirror_shows_what_stands_before_it_times_its_tint():
-    mirror = {k: v for k, v in FLOOR.items() if k != "texture"} | {"material": MIRROR | {"tint": "#bcbcbc"}}
-    lamp = LAMP | {"shape": {"type": "rectangle", "center": [0, 0, 6], "size": [8, 8], "facing": [0, 0, -1]}}
+    mirror = {k: v for k, v in FLOOR.items() if k != "texture"} | {
+        "material": MIRROR | {"tint": "#bcbcbc"}
+    }
+    lamp = LAMP | {
+        "shape": {"type": "rectangle", "center": [0, 0, 6], "size": [8, 8], "facing": [0, 0, -1]}
+    }
     assert np.allclose(looking_down([mirror, lamp], [], bounces=4), 4.0 * ALBEDO, rtol=1e-3)
 
 
 def test_a_glass_ball_bends_rays_as_snell_says():
-    # Through the middle of a ball nothing is bent; elsewhere it turns the picture upside down: a ball lens focuses at
-    # n r / 2 (n - 1) = 1.5 r from its centre, far before the wall.
+    # Through the middle of a ball nothing is bent; elsewhere it turns the picture upside down: a
+    # ball lens focuses at n r / 2 (n - 1) = 1.5 r from its centre, far before the wall.
     left = {
         "name": "left",
-        "shape": {"type": "rectangle", "center": [-8, -20, 0], "size": [40, 80], "facing": [1, 0, 0]},
+        "shape": {
+            "type": "rectangle",
+            "center": [-8, -20, 0],
+            "size": [40, 80],
+            "facing": [1, 0, 0],
+        },
     }
     scene = make([left | {"emission": {"radiance": 1.0}}, ball(GLASS, (0, 0, 0), 0.5)], [], 8)
     camera = Camera.look_at((4, 0, 0), (0, 0, 0), width=64, height=64, fov_y=30)
@@ -339,7 +421,9 @@ def test_a_glass_ball_bends_rays_as_snell_says():
     through, direct = owner == 1, owner == 0
     assert direct.any() and through.sum() > 400
     side = np.sign(np.median(columns[bright & direct]) - 31.5)
-    near = through & (np.abs(columns - 31.5) > 3) & (np.hypot(columns - 31.5, columns.T - 31.5) < 12)
+    near = (
+        through & (np.abs(columns - 31.5) > 3) & (np.hypot(columns - 31.5, columns.T - 31.5) < 12)
+    )
     assert (bright == (np.sign(columns - 31.5) == -side))[near].mean() > 0.97
 
 
@@ -360,7 +444,8 @@ def test_a_lens_blurs_a_far_dot_over_its_circle_of_confusion():
 
     sharp, light = spread(6.0)
     wide, same = spread(3.0)
-    # Radius of the circle: f A |1/z - 1/focus| px; the dot itself is 2 * 0.01 / 6 * f = 0.6 px wide.
+    # Radius of the circle: f A |1/z - 1/focus| px; the dot itself is 2 * 0.01 / 6 * f = 0.6 px
+    # wide.
     assert sharp <= 2 and wide == pytest.approx(2 * f * aperture * (1 / 3 - 1 / 6) + 0.6, abs=1.5)
     assert light == pytest.approx(same, rel=0.15)  # light is spread, not lost
 
@@ -377,12 +462,14 @@ def test_a_lens_refuses_a_principal_point_off_the_middle():
     K = scene.source.K.copy()
     K[0, 2] += 3
     with pytest.raises(ValueError, match=r"principal point .* but a lens needs it there"):
-        renderer.render_plan(scene, Camera(K, scene.source.world_to_camera, 32, 32), plan(scene, 1), 0)
+        renderer.render_plan(
+            scene, Camera(K, scene.source.world_to_camera, 32, 32), plan(scene, 1), 0
+        )
 
 
 def test_light_paths_and_camera_paths_agree_on_a_caustic_that_both_can_find():
-    # A large lamp through a ball of glass: camera paths find its caustic too, without any of the machinery of light
-    # paths, of which pixels they are for, and of adding the two up.
+    # A large lamp through a ball of glass: camera paths find its caustic too, without any of the
+    # machinery of light paths, of which pixels they are for, and of adding the two up.
     scene = make([FLOOR, ball(GLASS), LAMP], [], 8, size=16)
     camera_paths = plan(scene, 64)
     assert camera_paths.integrator == "path"
@@ -408,7 +495,11 @@ def test_following_only_the_beam_upon_the_glass_shows_the_same_caustic_with_less
         ("path", "any", False, 1), ("path", "rough", True, -1), ("ptracer", "any", True, 1),
     ]  # fmt: skip
     whole = Plan(
-        (Pass((0,), "path", 9, 1, 1, 64, False, 10, "smooth"), Pass((0,), "ptracer", 9, 1, 1, 1024, False, 10)), ()
+        (
+            Pass((0,), "path", 9, 1, 1, 64, False, 10, "smooth"),
+            Pass((0,), "ptracer", 9, 1, 1, 1024, False, 10),
+        ),
+        (),
     )
     a, b = (
         np.stack([renderer.render_plan(scene, scene.source, made, first + k) for k in range(12)])
@@ -438,20 +529,34 @@ def test_pictures_lit_by_lamps_converge_to_the_light_that_ray_casting_finds(name
         "shape": {"type": "sphere", "center": [1, 1, 2.5], "radius": 0.4},
         "emission": {"radiance": 9.0},
     }
-    spot = {"type": "spot", "position": [1, 1, 3], "target": [0, 0, 0], "intensity": 8.0, "cutoff": 40, "beam": 10}
+    spot = {
+        "type": "spot",
+        "position": [1, 1, 3],
+        "target": [0, 0, 0],
+        "intensity": 8.0,
+        "cutoff": 40,
+        "beam": 10,
+    }
     objects, lights = {
-        "point": ([], [POINT]), "spot": ([], [spot]), "square": ([LAMP], []), "globe": ([globe], []),
-    }[name]  # fmt: skip
+        "point": ([], [POINT]),
+        "spot": ([], [spot]),
+        "square": ([LAMP], []),
+        "globe": ([globe], []),
+    }[name]
     scene = make([FLOOR, ball(), *objects], lights, size=32)
     geometry, camera = Geometry(scene), scene.source
     image = renderer.render_plan(scene, camera, plan(scene, 64), 0)
     hits = geometry.trace(camera)
-    flat = [a.reshape(-1, *a.shape[2:])[hits.valid.ravel()] for a in (hits.point, hits.normal, hits.primitive_id)]
+    flat = [
+        a.reshape(-1, *a.shape[2:])[hits.valid.ravel()]
+        for a in (hits.point, hits.normal, hits.primitive_id)
+    ]
     light = irradiance(scene, geometry, *flat, rays=64)
     expected = np.zeros_like(image, dtype=np.float64)
     expected[hits.valid] = object_albedo(scene, geometry, flat[0], flat[2]) / np.pi * light
     expected[hits.valid] += emitted(scene, geometry, flat[2])
-    # Rays go through the middles of pixels only and 64 points stand for a lamp: edges of shadows differ, means do not.
+    # Rays go through the middles of pixels only and 64 points stand for a lamp: edges of shadows
+    # differ, means do not.
     assert image.mean() == pytest.approx(expected.mean(), rel=0.02)
     assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.98
 
@@ -459,14 +564,17 @@ def test_pictures_lit_by_lamps_converge_to_the_light_that_ray_casting_finds(name
 def test_geometry_of_glass_is_its_first_surface():
     plain, glass = make([FLOOR, ball()], [SKY]), make([FLOOR, ball(GLASS)], [SKY], 8)
     a, b = (Geometry(scene).trace(scene.source) for scene in (plain, glass))
-    assert np.array_equal(a.object_id, b.object_id) and np.array_equal(a.depth, b.depth, equal_nan=True)
+    assert np.array_equal(a.object_id, b.object_id) and np.array_equal(
+        a.depth, b.depth, equal_nan=True
+    )
     foggy = make([FLOOR, ball()], [SKY], medium={"sigma_t": 0.1})
     position, object_id = renderer.position_and_shape(foggy, foggy.source)
     assert np.array_equal(object_id, a.object_id) or (object_id == a.object_id).mean() > 0.995
     assert np.isfinite(position[object_id >= 0]).all()
 
 
-# The command line ----------------------------------------------------------------------------------------------------
+# The command line
+# --------------------------------------------------------------------------------------------------
 
 
 def test_the_command_line_prints_effects_and_plan_for_people_and_as_json():
@@ -476,7 +584,11 @@ def test_the_command_line_prints_effects_and_plan_for_people_and_as_json():
     assert out["plan"]["integrator"] == "direct" and out["plan"]["sensor"]["type"] == "perspective"
     assert out["everything_on"]["integrator"] == "volpath" and out["cost"]["seconds"][0] > 0
     text = runner.invoke(app, ["scenes", "effects", "spheres", "--prove"]).stdout
-    assert "plan: direct" in text and "because the sky is smooth" in text and "everything on: volpath" in text
+    assert (
+        "plan: direct" in text
+        and "because the sky is smooth" in text
+        and "everything on: volpath" in text
+    )
     assert "proof: certified" in text and "smallest difference that could have been seen" in text
     assert runner.invoke(app, ["scenes", "effects", "sphere"]).exit_code == 2
 

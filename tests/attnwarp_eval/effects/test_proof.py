@@ -1,4 +1,6 @@
-"""The proof of a plan: its statistics against closed forms, scipy and planted truths; its ladder on real pictures."""
+"""The proof of a plan: its statistics against closed forms, scipy and planted truths; its ladder on
+real pictures.
+"""
 
 import math
 import re
@@ -18,15 +20,20 @@ SHAPE = (12, 16, 16, 3)
 
 
 def noise(rng, kind="normal", size=0.1):
-    # Pictures of mean 1: pixels with normal noise, or skewed like few samples of a bright light (skewness 2).
-    return 1 + size * (rng.standard_normal(SHAPE) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE) - 1)
+    # Pictures of mean 1: pixels with normal noise, or skewed like few samples of a bright light
+    # (skewness 2).
+    return 1 + size * (
+        rng.standard_normal(SHAPE) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE) - 1
+    )
 
 
 def test_welch_agrees_with_scipy_where_spreads_and_numbers_differ():
     rng = np.random.default_rng(0)
     a, b = rng.normal(1, 0.5, (11, 40)), rng.normal(1.1, 2.0, (17, 40))
     ours, theirs = proof.welch(a, b), stats.ttest_ind(b, a, equal_var=False)
-    assert np.allclose(ours.p, theirs.pvalue, rtol=1e-9) and np.allclose(ours.freedom, theirs.df, rtol=1e-9)
+    assert np.allclose(ours.p, theirs.pvalue, rtol=1e-9) and np.allclose(
+        ours.freedom, theirs.df, rtol=1e-9
+    )
     assert np.allclose(ours.difference / ours.error, theirs.statistic, rtol=1e-9)
 
 
@@ -61,9 +68,12 @@ def test_over_200_true_nulls_it_refuses_at_its_stated_rate(kind):
     rng = np.random.default_rng(2)
     refused = 0
     for _ in range(200):
-        refused += any(level.differs for level in proof.levels(noise(rng, kind), noise(rng, kind), alpha=0.05))
-    # 200 trials at 5 %: 99.9 % of binomial counts are at most 21. Blocks are made of the pixels, so that the three
-    # levels refuse together more often than independent ones and the whole a little less: at least 2.
+        refused += any(
+            level.differs for level in proof.levels(noise(rng, kind), noise(rng, kind), alpha=0.05)
+        )
+    # 200 trials at 5 %: 99.9 % of binomial counts are at most 21. Blocks are made of the pixels, so
+    # that the three levels refuse together more often than independent ones and the whole a little
+    # less: at least 2.
     assert 2 <= refused <= 21
 
 
@@ -81,7 +91,8 @@ def test_a_difference_of_two_percent_is_found_every_time_and_never_certified():
     for _ in range(200):
         a, b = noise(rng), 1.02 * noise(rng)
         picture = proof.levels(a, b)[-1]
-        # The difference's standard error is 0.1 / sqrt(12 * 768) * sqrt 2 = 0.15 %: 2 % is fourteen of them.
+        # The difference's standard error is 0.1 / sqrt(12 * 768) * sqrt 2 = 0.15 %: 2 % is fourteen
+        # of them.
         assert picture.differs and not proof.equivalence(a, b).equal
 
 
@@ -100,14 +111,17 @@ def test_equivalence_certifies_the_equal_and_hardly_ever_what_lies_on_its_margin
     rng = np.random.default_rng(6)
     equal = [proof.equivalence(noise(rng), noise(rng)).equal for _ in range(200)]
     edge = [proof.equivalence(1.01 * noise(rng), noise(rng)).equal for _ in range(200)]
-    # 2.33 is the normal quantile; with 22 degrees of freedom 1.5 % lie beyond it. Binomial, 99.9 %: at most 9.
+    # 2.33 is the normal quantile; with 22 degrees of freedom 1.5 % lie beyond it. Binomial, 99.9 %:
+    # at most 9.
     assert sum(equal) > 195 and sum(edge) <= 9
 
 
 def test_noise_too_great_for_the_margin_is_not_certified_though_nothing_differs():
     rng = np.random.default_rng(7)
     a, b = (1 + 3 * rng.standard_normal(SHAPE) for _ in range(2))
-    assert not proof.equivalence(a, b).equal and not any(level.differs for level in proof.levels(a, b))
+    assert not proof.equivalence(a, b).equal and not any(
+        level.differs for level in proof.levels(a, b)
+    )
 
 
 def test_the_stated_smallest_difference_is_found_four_times_in_five():
@@ -119,13 +133,19 @@ def test_the_stated_smallest_difference_is_found_four_times_in_five():
 
 
 def synthetic(trial, kind="normal", brighter=1.0):
-    """What a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls with the samples."""
+    """What a renderer hands to the ladder: seeded pictures of mean 1, whose noise falls with the
+    samples.
+    """
 
     def pictures(side, spp, first, count):
         out = []
         for k in range(count):
             rng = np.random.default_rng((trial, side, first + k, spp))
-            grain = rng.standard_normal(SHAPE[1:]) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE[1:]) - 1
+            grain = (
+                rng.standard_normal(SHAPE[1:])
+                if kind == "normal"
+                else rng.gamma(1.0, 1.0, SHAPE[1:]) - 1
+            )
             out.append((brighter if side else 1.0) * (1 + 0.3 / math.sqrt(spp) * grain))
         return np.stack(out)
 
@@ -136,8 +156,9 @@ def synthetic(trial, kind="normal", brighter=1.0):
 @pytest.mark.parametrize(("alpha", "range_"), [(0.01, (0, 8)), (0.05, (1, 21)), (0.2, (14, 59))])
 def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, alpha, range_):
     found = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
-    # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same pixels refuse together, so
-    # that the whole keeps a little below its rate. At 20 %, two rungs at the full rate each would refuse about 70.
+    # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same
+    # pixels refuse together, so that the whole keeps a little below its rate. At 20 %, two rungs at
+    # the full rate each would refuse about 70.
     assert range_[0] <= found.count("refused") <= range_[1]
     assert found.count("certified") == 200 - found.count("refused")
 
@@ -156,7 +177,8 @@ def test_the_paired_test_agrees_with_scipy():
     assert math.isclose(ours.p, theirs.pvalue, rel_tol=1e-9)
 
 
-# On real pictures ----------------------------------------------------------------------------------------------------
+# On real pictures
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["diffuse", "refraction", "medium", "depth_of_field"])
@@ -206,19 +228,53 @@ GLOBE = {
 @pytest.mark.parametrize(
     ("scene", "change", "words"),
     [
-        (lambda: make([FLOOR, ball(), LAMP], [SUN]), lambda p: p[:1], "object 'lamp', a lamp, shines in no pass"),
-        (lambda: make([FLOOR, ball()], [SUN, POINT]), lambda p: p[1:], r"lights\[0\], a sun, shines in no pass"),
-        (lambda: make([FLOOR, ball()], [SKY], "unlimited"), lambda p: [replace(p[0], max_depth=9)], "needs no end"),
-        (lambda: make([FLOOR, ball(MIRROR)], [SKY], 6), lambda p: [replace(p[0], max_depth=6)], "specular.* needs 7 edges"),
-        (lambda: make([FLOOR, ball()], [SKY], 2), lambda p: [replace(p[0], integrator="direct")], "direct have 2 edges"),
+        (
+            lambda: make([FLOOR, ball(), LAMP], [SUN]),
+            lambda p: p[:1],
+            "object 'lamp', a lamp, shines in no pass",
+        ),
+        (
+            lambda: make([FLOOR, ball()], [SUN, POINT]),
+            lambda p: p[1:],
+            r"lights\[0\], a sun, shines in no pass",
+        ),
+        (
+            lambda: make([FLOOR, ball()], [SKY], "unlimited"),
+            lambda p: [replace(p[0], max_depth=9)],
+            "needs no end",
+        ),
+        (
+            lambda: make([FLOOR, ball(MIRROR)], [SKY], 6),
+            lambda p: [replace(p[0], max_depth=6)],
+            "specular.* needs 7 edges",
+        ),
+        (
+            lambda: make([FLOOR, ball()], [SKY], 2),
+            lambda p: [replace(p[0], integrator="direct")],
+            "direct have 2 edges",
+        ),
         (SCENES["caustics"], lambda p: p[1:], "shines in no pass"),
         (SCENES["caustics"], lambda p: p[:2], "taken away and no paths from the light put it back"),
-        (lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8), lambda p: p[1:], "shines in no pass where .* is smooth"),
-        (lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8), lambda p: [replace(p[0], first="any")], "caustic of object 'globe'"),
-        (SCENES["medium"], lambda p: [*p, replace(p[0], integrator="path")], "volpath, in every pass"),
+        (
+            lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8),
+            lambda p: p[1:],
+            "shines in no pass where .* is smooth",
+        ),
+        (
+            lambda: make([FLOOR, ball(GLASS), GLOBE], [], 8),
+            lambda p: [replace(p[0], first="any")],
+            "caustic of object 'globe'",
+        ),
+        (
+            SCENES["medium"],
+            lambda p: [*p, replace(p[0], integrator="path")],
+            "volpath, in every pass",
+        ),
     ],
-)  # fmt: skip
-def test_a_plan_with_something_missing_is_refused_by_its_structure_with_the_reason(scene, change, words):
+)
+def test_a_plan_with_something_missing_is_refused_by_its_structure_with_the_reason(
+    scene, change, words
+):
     made = scene()
     good = plan(made)
     assert not list(proof._lacks(made, good, caustic="caustics" in called_for(made.spec)))
@@ -239,7 +295,9 @@ def test_another_lens_than_the_scenes_is_refused():
     wrong = replace(plan(scene), lens=Lens(0.3, 3.0))
     assert "the lens is another" in next(proof._lacks(scene, wrong, caustic=False))
     bare = SCENES["diffuse"]()
-    assert "says no lens" in next(proof._lacks(bare, replace(plan(bare), lens=Lens(0.3, 3.0)), caustic=False))
+    assert "says no lens" in next(
+        proof._lacks(bare, replace(plan(bare), lens=Lens(0.3, 3.0)), caustic=False)
+    )
 
 
 def test_glass_alone_is_planned_with_paths_through_it_and_anything_else_alone_with_one_bounce():
@@ -271,11 +329,15 @@ def test_too_little_time_ends_in_cannot_tell_and_says_what_could_have_been_seen(
 @pytest.mark.parametrize("name", ["refraction", "diffuse"])
 def test_over_200_true_nulls_of_real_pictures_it_refuses_at_its_stated_rate(name):
     scene = SCENES[name]().with_size(16, 16)
-    made = plan(scene, 16)  # the fewest samples and the seeds that the proof itself takes when it has time
+    made = plan(
+        scene, 16
+    )  # the fewest samples and the seeds that the proof itself takes when it has time
     refused = 0
     for trial in range(200):
         a, b = (
-            np.stack([render_plan(scene, scene.source, made, first + 12 * trial + i) for i in range(12)])
+            np.stack(
+                [render_plan(scene, scene.source, made, first + 12 * trial + i) for i in range(12)]
+            )
             for first in (10_000, 20_000)
         )
         refused += any(level.differs for level in proof.levels(a, b, alpha=0.05))
@@ -290,7 +352,10 @@ def test_the_caustic_of_a_point_light_is_certified_but_for_what_is_not_simulated
 
 def test_everything_on_is_never_volpathmis():
     for make_scene in SCENES.values():
-        assert {step.integrator for step in everything_on(make_scene()).passes} <= {"volpath", "ptracer"}
+        assert {step.integrator for step in everything_on(make_scene()).passes} <= {
+            "volpath",
+            "ptracer",
+        }
 
 
 def test_an_effect_that_is_not_in_a_plan_cannot_be_left_out_of_it():

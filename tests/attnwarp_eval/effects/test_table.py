@@ -1,4 +1,6 @@
-"""The table of all scenes: what it says, that it goes on where it was, and pictures that show a difference."""
+"""The table of all scenes: what it says, that it goes on where it was, and pictures that show a
+difference.
+"""
 
 import functools
 import json
@@ -30,7 +32,9 @@ def small(monkeypatch):
 def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, tmp_path):
     made = []
     real = table._entry
-    monkeypatch.setattr(table, "_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a))
+    monkeypatch.setattr(
+        table, "_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
+    )
     quick = Settings(prove=False, rounds=2)
     collect(["spheres", "glass"], tmp_path, quick)
     collect(["spheres", "glass", "mirror"], tmp_path, quick)
@@ -40,7 +44,10 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert "refraction" in by_name["glass"]["needed"] and "specular" in by_name["mirror"]["needed"]
     assert by_name["spheres"]["left_out"] == ["interreflection"]
     text = (tmp_path / "detect.md").read_text()
-    assert "| mirror | interreflection, specular, environment | " in text and " | path | not asked | " in text
+    assert (
+        "| mirror | interreflection, specular, environment | " in text
+        and " | path | not asked | " in text
+    )
     assert text.count(".jpg)") == 3 and "3 scenes, 0 of their plans certified" in text
     # Another setting is another entry; a picture that is gone is drawn again.
     collect(["glass"], tmp_path, Settings(prove=False, rounds=3))
@@ -54,12 +61,18 @@ def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(
     (entry,) = collect(["spheres"], tmp_path, Settings(rounds=0, pictures=False, budget=240))
     assert entry["proof"]["verdict"] == "certified", entry["proof"]
     ((_, _, _, _, verdict, bound, smallest, *times),) = table.table([entry]).rows
-    assert verdict == "certified" and float(bound.rstrip("%")) < 1 and "picture" in smallest and "pixel" in smallest
+    assert (
+        verdict == "certified"
+        and float(bound.rstrip("%")) < 1
+        and "picture" in smallest
+        and "pixel" in smallest
+    )
     assert times == ["–"] * 5
 
 
 def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeypatch):
-    # Synthetic renderings: the capped ones have mean 0.8, those without a cap 1; noise and time are planted.
+    # Synthetic renderings: the capped ones have mean 0.8, those without a cap 1; noise and time are
+    # planted.
     scene = make([FLOOR, ball()], [SKY], 1, size=8)
     free = detect.everything_on(scene.with_size(8, 8), 4, capped=False)
     full = detect.everything_on(scene.with_size(8, 8), 4)
@@ -68,7 +81,11 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
 
     def render(scene, camera, made, seed):
         mean, noise, seconds = (
-            (1.0, 0.04, 3.0) if made == free else (0.8, 0.03, 2.0) if made == full else (0.8, 0.02, 1.0)
+            (1.0, 0.04, 3.0)
+            if made == free
+            else (0.8, 0.03, 2.0)
+            if made == full
+            else (0.8, 0.02, 1.0)
         )
         clock[0] += seconds * (1 + seed % 5)  # the machine is slow in some rounds, for all alike
         return mean + noise * np.random.default_rng((seed, int(seconds))).standard_normal((8, 8, 3))
@@ -76,8 +93,13 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     monkeypatch.setattr(detect, "render_plan", render)
     cost = detect.measure(scene, size=8, spp=4, rounds=40)
     low, high = cost.cap.bias_interval
-    # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192) = 0.054 %.
-    assert cost.cap.bias == pytest.approx(-0.2, abs=0.0025) and low < -0.2 < high and high - low < 0.003
+    # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192)
+    # = 0.054 %.
+    assert (
+        cost.cap.bias == pytest.approx(-0.2, abs=0.0025)
+        and low < -0.2 < high
+        and high - low < 0.003
+    )
     assert cost.faster == pytest.approx(3) and cost.cap.faster == pytest.approx(2)
     assert cost.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
     assert cost.interval[0] < cost.at_equal_noise < cost.interval[1]
@@ -87,10 +109,15 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     )
     about = detect.report(scene, cost=cost) | {"cost": cost.to_dict()}
     text = "\n".join(detect.describe(scene, about))
-    assert "not for the same error: the scene's cap of 1 bounces changes the picture's light by -20" in text
+    assert (
+        "not for the same error: the scene's cap of 1 bounces changes the picture's light by -20"
+        in text
+    )
     row = table._times(json.loads(json.dumps(cost.to_dict())))
     assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
-    endless = detect.measure(make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3)
+    endless = detect.measure(
+        make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3
+    )
     assert endless.cap is None and table._times(endless.to_dict())[2] == "no cap"
 
 
@@ -102,7 +129,10 @@ def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak
 
 
 def test_the_interval_of_the_light_cut_off_is_scipys():
-    a, b = np.random.default_rng(0).uniform(0.7, 0.9, 7), np.random.default_rng(1).uniform(0.95, 1.05, 9)
+    a, b = (
+        np.random.default_rng(0).uniform(0.7, 0.9, 7),
+        np.random.default_rng(1).uniform(0.95, 1.05, 9),
+    )
     theirs = stats.ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.95)
     bias, ours = detect._cut(a, b)
     assert np.allclose(np.expm1(theirs), ours, rtol=1e-9) and ours[0] < bias < ours[1]
@@ -111,14 +141,20 @@ def test_the_interval_of_the_light_cut_off_is_scipys():
 def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, tmp_path):
     scene = make([FLOOR], [SUN, SKY])
     same = side_by_side(scene, tmp_path / "same.jpg")["largest_difference"]
+
     # The plan of a careless planner: the sun alone.
-    without_sky = lambda scene, spp=None: table.replace(plan(scene, spp), passes=plan(scene, spp).passes[:1])  # noqa: E731
+    def without_sky(scene, spp=None):
+        return table.replace(plan(scene, spp), passes=plan(scene, spp).passes[:1])
+
     monkeypatch.setattr(table, "plan", without_sky)
     dark = side_by_side(scene, tmp_path / "dark.jpg")["largest_difference"]
     assert same < 0.01 < 0.1 < dark
     picture = cv2.imread(str(tmp_path / "dark.jpg"))
     assert picture.shape == (16, 3 * 16 + 8, 3)
-    assert picture[:, -16:].mean() < 60 and abs(cv2.imread(str(tmp_path / "same.jpg"))[:, -16:].mean() - 127.5) < 6
+    assert (
+        picture[:, -16:].mean() < 60
+        and abs(cv2.imread(str(tmp_path / "same.jpg"))[:, -16:].mean() - 127.5) < 6
+    )
 
 
 def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_for(tmp_path):
@@ -136,7 +172,11 @@ def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_
 
 def test_the_report_says_which_effects_the_studys_scenes_call_for():
     def cell(name, said):
-        record = {"views": [], "pictures": [], "effects": said_by(load_scene(said))} if said else {"views": []}
+        record = (
+            {"views": [], "pictures": [], "effects": said_by(load_scene(said))}
+            if said
+            else {"views": []}
+        )
         return {
             "id": name,
             "title": name,

@@ -13,7 +13,8 @@ from attnwarp_eval.scene.file import load_scene
 
 
 def test_the_brute_force_finds_hits_known_in_closed_form():
-    # A unit right triangle at z = 2 before one at z = 3: rays through the lower left half hit the nearer.
+    # A unit right triangle at z = 2 before one at z = 3: rays through the lower left half hit the
+    # nearer.
     near = np.array([[0.0, 0, 2], [1, 0, 2], [0, 1, 2]])
     far = np.array([[-9.0, -9, 3], [9, -9, 3], [0, 18, 3]])
     origins = np.array([[0.2, 0.2, 0], [0.8, 0.8, 0], [0.2, 0.2, 0], [0.2, 0.2, 2.5], [50, 50, 0]])
@@ -21,8 +22,16 @@ def test_the_brute_force_finds_hits_known_in_closed_form():
     endless = np.full(5, np.inf)
     t = accuracy.every_triangle(origins, directions, np.stack([far, near]), endless)
     assert t.tolist() == [2.0, 3.0, 4.0, 0.5, np.inf]
-    t = accuracy.every_triangle(origins, directions, np.stack([far, near]), np.array([2.0, 3.5, 9, 0.1, 1]))
-    assert t.tolist() == [3.0, 3.0, 4.0, np.inf, np.inf] or t.tolist() == [np.inf, 3.0, 4.0, np.inf, np.inf]
+    t = accuracy.every_triangle(
+        origins, directions, np.stack([far, near]), np.array([2.0, 3.5, 9, 0.1, 1])
+    )
+    assert t.tolist() == [3.0, 3.0, 4.0, np.inf, np.inf] or t.tolist() == [
+        np.inf,
+        3.0,
+        4.0,
+        np.inf,
+        np.inf,
+    ]
 
 
 def test_all_works_run_in_every_round_and_the_first_one_twice():
@@ -33,18 +42,24 @@ def test_all_works_run_in_every_round_and_the_first_one_twice():
     assert [len(r) for r in results] == [len(s) for s in seconds] == [4] * 4
     assert results == [[0] * 4, [1] * 4, [2] * 4, [0] * 4]
     # A first round is not kept, and the first work's second run has other noise.
-    assert sorted(calls) == sorted([(k, t) for k in range(3) for t in range(5)] + [(0, t + 10_000) for t in range(5)])
+    assert sorted(calls) == sorted(
+        [(k, t) for k in range(3) for t in range(5)] + [(0, t + 10_000) for t in range(5)]
+    )
     assert before == [k for k, _ in calls]
     orders = {tuple(k for k, _ in calls[i : i + 4]) for i in range(0, 20, 4)}
     assert len(orders) > 1
 
 
 def test_the_error_of_a_picture_falls_with_the_square_root_of_its_samples():
-    # Light paths through fog are independent, so four times the samples halve the error; "everything on" sees the same.
+    # Light paths through fog are independent, so four times the samples halve the error;
+    # "everything on" sees the same.
     scene = make([FLOOR, ball()], [SUN, SKY], 4, medium={"sigma_t": 0.2, "albedo": 0.9, "g": 0.0})
     panel = accuracy.pictures(scene, size=16, samples=(4, 16), rounds=5, reference=(12, 256))
     error = {c.name: c.error for c in panel.contestants}
-    assert panel.contestants[0].name == "plan, 4 spp" and set(error) >= {"plan, 16 spp", "everything on, 16 spp"}
+    assert panel.contestants[0].name == "plan, 4 spp" and set(error) >= {
+        "plan, 16 spp",
+        "everything on, 16 spp",
+    }
     assert error["plan, 4 spp"][0] / error["plan, 16 spp"][0] == pytest.approx(2, rel=0.2)
     for name, (value, low, high) in error.items():
         assert 0 < low <= value <= high, name
@@ -68,7 +83,9 @@ def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent()
     panel = accuracy.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
     rays, nearest, bilinear = panel.contestants
     # Clopper & Pearson: none of 150 excludes a share above 1 - 0.025^(1 / 150).
-    assert rays.error == pytest.approx((0, 0, 1 - 0.025 ** (1 / 150))) and rays.more["unanswered"] == 0
+    assert (
+        rays.error == pytest.approx((0, 0, 1 - 0.025 ** (1 / 150))) and rays.more["unanswered"] == 0
+    )
     assert nearest.error[0] == nearest.more["wrong"] > 0.02 and nearest.more["unanswered"] == 0
     assert bilinear.more["unanswered"] > 0.2
     assert bilinear.error[0] == pytest.approx(bilinear.more["wrong"] + bilinear.more["unanswered"])
@@ -89,29 +106,51 @@ def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
 
 def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio(tmp_path):
     def panel(scene):
-        slow = accuracy.Contestant("slow", (0.5, 0.4, 0.6), (2.0, 2.2, 2.4), {"median": 0.1, "p99": 0.2, "wrong": 0.0})
-        fast = accuracy.Contestant("fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": 0.25})
-        return accuracy.Panel("depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4))
+        slow = accuracy.Contestant(
+            "slow", (0.5, 0.4, 0.6), (2.0, 2.2, 2.4), {"median": 0.1, "p99": 0.2, "wrong": 0.0}
+        )
+        fast = accuracy.Contestant(
+            "fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": 0.25}
+        )
+        return accuracy.Panel(
+            "depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4)
+        )
 
     accuracy.write([panel("one")], tmp_path)
     accuracy.write([panel("two")], tmp_path)
     text = (tmp_path / "accuracy.md").read_text()
-    assert "**one**" in text and "**two**" in text and "0.500 [0.500, 0.500]" in text and "25.00 %" in text
+    assert (
+        "**one**" in text
+        and "**two**" in text
+        and "0.500 [0.500, 0.500]" in text
+        and "25.00 %" in text
+    )
     assert "| again |" in text and (tmp_path / "depth.svg").is_file()
-    assert [p["scene"] for p in json.loads((tmp_path / "accuracy.json").read_text())["panels"]] == ["one", "two"]
+    assert [p["scene"] for p in json.loads((tmp_path / "accuracy.json").read_text())["panels"]] == [
+        "one",
+        "two",
+    ]
     (tmp_path / "accuracy.json").write_text("[]")
     result = CliRunner().invoke(app, ["scenes", "accuracy", "nowhere", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "nowhere" in result.output
 
 
-def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(monkeypatch, tmp_path):
+def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
+    monkeypatch, tmp_path
+):
     import os
 
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "mine"))
     told = []
-    (first,) = suite.measure(["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=told.append)
+    (first,) = suite.measure(
+        ["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=told.append
+    )
     assert os.environ["ATTNWARP_CACHE"] == str(tmp_path / "mine")
-    assert first.views == 2 and set(first.wall) == set(suite.STAGES) and all(v > 0 for v in first.wall.values())
+    assert (
+        first.views == 2
+        and set(first.wall) == set(suite.STAGES)
+        and all(v > 0 for v in first.wall.values())
+    )
     assert told == [
         "spheres: meshes",
         "spheres: geometry of 2 views",

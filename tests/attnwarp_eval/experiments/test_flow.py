@@ -24,41 +24,66 @@ def test_a_turned_camera_keeps_the_point_it_looks_at_and_its_distance():
 
 
 def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path, capsys):
-    arguments = ["--scenes", "bear", "--yaws", "5", "--size", "48", "--spp", "4", "--out", str(tmp_path)]
+    arguments = [
+        "--scenes",
+        "bear",
+        "--yaws",
+        "5",
+        "--size",
+        "48",
+        "--spp",
+        "4",
+        "--out",
+        str(tmp_path),
+    ]
     flow.main(arguments)
     (row,) = json.loads((tmp_path / "flow.json").read_text())
     assert (row["scene"], row["yaw"], row["method"]) == ("bear", 5, "dis")
     exact = {kind: row["figures"][kind]["consistency.delta_e"] for kind in flow.PAIRS}
     # Red against violet is 28 to 30 at any size; the floor of 4 samples a pixel is 3 or so.
-    assert exact["two_answers"] > 20 > 2 * exact["one_answer"] and exact["slip"] > exact["one_answer"]
+    assert (
+        exact["two_answers"] > 20 > 2 * exact["one_answer"] and exact["slip"] > exact["one_answer"]
+    )
     names = {name for kind in row["figures"].values() for name in kind} | set(row["flow"])
     assert all(metric(name).name == name for name in names)
-    assert sorted(path.name for path in tmp_path.glob("*.png")) == sorted(f"bear-5-{kind}.png" for kind in flow.PAIRS)
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == sorted(
+        f"bear-5-{kind}.png" for kind in flow.PAIRS
+    )
     printed = capsys.readouterr().out.splitlines()
     assert printed[2].startswith("| bear | 5 | ") and printed[3:] == [str(tmp_path / "report.md")]
     said = (tmp_path / "report.md").read_text()
-    assert printed[2] in said.splitlines() and "48 x 48 px, 4 samples a pixel; flow by OpenCV's dis" in said
+    assert (
+        printed[2] in said.splitlines()
+        and "48 x 48 px, 4 samples a pixel; flow by OpenCV's dis" in said
+    )
     by_flow = {kind: row["figures"][kind]["consistency.flow_delta_e"] for kind in flow.PAIRS}
     one = by_flow["one_answer"] / exact["one_answer"]
     (summary,) = (line for line in said.splitlines() if line.startswith("| 5 | "))
     assert summary.split(" | ")[2] == f"{one:.1f} to {one:.1f}"
     for name in ("consistency", "flow"):
-        assert f"(figures/{name}.svg)" in said and (tmp_path / "figures" / f"{name}.svg").stat().st_size > 2000
+        assert (
+            f"(figures/{name}.svg)" in said
+            and (tmp_path / "figures" / f"{name}.svg").stat().st_size > 2000
+        )
 
 
 def test_an_edit_with_one_result_is_refused():
-    with pytest.raises(ValueError, match="edit 'polar' of 'bear': got one result, expected at least two answers"):
+    with pytest.raises(
+        ValueError, match="edit 'polar' of 'bear': got one result, expected at least two answers"
+    ):
         next(flow.study("bear", "polar", size=16, spp=1, yaws=[5]))
 
 
 def row(scene, yaw, *, exact, flow):
     figures = {
         kind: {
-            "consistency.delta_e": exact * k, "consistency.flow_delta_e": flow * k, "consistency.flow_same_delta_e": flow,
+            "consistency.delta_e": exact * k,
+            "consistency.flow_delta_e": flow * k,
+            "consistency.flow_same_delta_e": flow,
             "consistency.pixels": 7,
         }
         for k, kind in enumerate(flow.PAIRS, 1)
-    }  # fmt: skip
+    }
     names = ("flow_epe_median", "flow_epe_p95", "flow_recall", "flow_false")
     return flow.Row(scene, yaw, "dis", figures, {f"consistency.{name}": 0.5 for name in names})
 
@@ -68,11 +93,13 @@ def test_the_report_gives_the_least_and_the_largest_ratio_over_the_scenes(tmp_pa
     rows += [row("bear", 60.0, exact=1.0, flow=float("nan"))]
     flow.write_report(rows, tmp_path, size=64, spp=2)
     said = (tmp_path / "report.md").read_text().splitlines()
-    # truth 3/2 to 2; one answer alike; at the exact figure's pixels flow over twice the exact; slip 3/2 of one answer.
+    # truth 3/2 to 2; one answer alike; at the exact figure's pixels flow over twice the exact; slip
+    # 3/2 of one answer.
     assert "| 5 | 1.5 to 2.0 | 1.5 to 2.0 | 0.8 to 1.0 | 1.5 to 1.5 | 1.5 to 1.5 |" in said
     assert "| 60 | undefined | undefined | undefined | 1.5 to 1.5 | undefined |" in said
     assert (
-        said[2].endswith("the second turned around the scene by yaw degrees.") and "bear, person; 64 x 64 px" in said[2]
+        said[2].endswith("the second turned around the scene by yaw degrees.")
+        and "bear, person; 64 x 64 px" in said[2]
     )
     again = {path.name: path.read_bytes() for path in (tmp_path / "figures").iterdir()}
     flow.write_report(rows, tmp_path, size=64, spp=2)

@@ -1,4 +1,6 @@
-"""Cross-view consistency on scenes whose colours are known at every point, and flow where its answer is known."""
+"""Cross-view consistency on scenes whose colours are known at every point, and flow where its
+answer is known.
+"""
 
 import math
 
@@ -28,10 +30,14 @@ def pair_of(geometry, yaw, size):
 
 
 def painted(geometry, camera, cycles=2.0):
-    """(H, W, 3) linear colours of a smooth function of the surface point, at the pixels' centres exactly."""
+    """(H, W, 3) linear colours of a smooth function of the surface point, at the pixels' centres
+    exactly.
+    """
     points = geometry.trace(camera).point
     field = SolidField((0, 0, 0.6), 4.0, channels=3, cycles=cycles, seed=5)
-    return np.clip(0.4 + 0.08 * np.nan_to_num(np.moveaxis(field.on_grid(points, background=0.0), 0, -1)), 0, 1)
+    return np.clip(
+        0.4 + 0.08 * np.nan_to_num(np.moveaxis(field.on_grid(points, background=0.0), 0, -1)), 0, 1
+    )
 
 
 @pytest.mark.parametrize("yaw", [10, 60])
@@ -43,17 +49,23 @@ def test_a_painted_scene_disagrees_by_no_more_than_bilinear_sampling_errs(sphere
         found = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
         assert found.counted.sum() > 400 * (size / 64) ** 2
         errors[size] = np.abs(found.linear[found.counted])
-        # The error of linear interpolation is at most (|f_xx| + |f_yy|) / 8, in units of the largest second difference
-        # near the taps; half as much again for what differences over a pixel miss of a derivative.
+        # The error of linear interpolation is at most (|f_xx| + |f_yy|) / 8, in units of the
+        # largest second difference near the taps; half as much again for what differences over a
+        # pixel miss of a derivative.
         row, column = np.floor(pair.xy[found.counted][:, ::-1]).astype(int).T
         bound = sum(
             np.max([np.abs(np.roll(second, shift, (0, 1))) for shift in np.ndindex(3, 3)], axis=0)
-            for second in (np.roll(np.gradient(np.gradient(source, axis=a), axis=a), (-1, -1), (0, 1)) for a in (0, 1))
+            for second in (
+                np.roll(np.gradient(np.gradient(source, axis=a), axis=a), (-1, -1), (0, 1))
+                for a in (0, 1)
+            )
         )[row, column]
         share_within = (errors[size] <= 1.5 / 8 * bound + 1e-6).mean()
-        assert share_within > 0.98  # the rest: gradients taken across an edge are no bound, either way
-    # Half the pixel, a quarter of the error: the order of linear interpolation. A little less, since a band of 2 px
-    # leaves more of the spheres' steep limbs at 128 (measured 3.2 and 3.5).
+        assert (
+            share_within > 0.98
+        )  # the rest: gradients taken across an edge are no bound, either way
+    # Half the pixel, a quarter of the error: the order of linear interpolation. A little less,
+    # since a band of 2 px leaves more of the spheres' steep limbs at 128 (measured 3.2 and 3.5).
     assert 3 < np.median(errors[64]) / np.median(errors[128]) < 4.2
     assert errors[128].mean() < 1e-3
 
@@ -61,9 +73,12 @@ def test_a_painted_scene_disagrees_by_no_more_than_bilinear_sampling_errs(sphere
 def test_a_rendered_scene_is_consistent_and_a_planted_slip_of_its_target_is_not(spheres):
     scene = load_scene("spheres").with_size(128, 128)
     pair = pair_of(spheres, 20, 128)
-    source, target = (to_srgb(appearance(scene, c, spp=32)).astype(np.float64) for c in (pair.source, pair.target))
+    source, target = (
+        to_srgb(appearance(scene, c, spp=32)).astype(np.float64) for c in (pair.source, pair.target)
+    )
     floor = metrics.cross_view(source, target, pair).figures()
-    # What is left is sampling, noise, and pixels of unlike area: measured 1.3, where an unlike colour is 10 and more.
+    # What is left is sampling, noise, and pixels of unlike area: measured 1.3, where an unlike
+    # colour is 10 and more.
     assert floor["consistency.delta_e"] < 2
     assert floor["consistency.pixels"] > 5000
     matt = metrics.view_dependent(source, target, pair)
@@ -81,12 +96,15 @@ def test_a_planted_shift_of_colour_comes_back_exactly(spheres, yaw):
     random = np.random.default_rng(yaw)
     source = random.uniform(0.1, 0.6, (64, 64, 3))
     shift = np.array([0.05, -0.1, 0.2])
-    # The warp's own sampler makes the target: another implementation, with rounding to a tap (1e-7 px) of its own.
+    # The warp's own sampler makes the target: another implementation, with rounding to a tap (1e-7
+    # px) of its own.
     xy = torch.from_numpy(pair.xy)
     sampled = sample_at(torch.from_numpy(source.transpose(2, 0, 1)), xy).numpy().transpose(1, 2, 0)
     target = np.clip(sampled + shift, 0, 1)
     found = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
-    np.testing.assert_allclose(found.linear[found.counted], np.broadcast_to(shift, (found.counted.sum(), 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        found.linear[found.counted], np.broadcast_to(shift, (found.counted.sum(), 3)), atol=1e-6
+    )
     figures = found.figures()
     assert figures["consistency.mae_linear"] == pytest.approx(np.abs(shift).mean(), abs=1e-6)
     assert figures["consistency.rmse_linear"] == pytest.approx(np.sqrt((shift**2).mean()), abs=1e-6)
@@ -102,7 +120,8 @@ def test_a_slip_of_a_ramp_is_its_slope_times_the_slip(spheres):
 
 
 def test_delta_e_of_greys_has_its_closed_form(spheres):
-    # CIEDE2000 without chroma: |dL| / S_L, S_L = 1 + 0.015 (L - 50)^2 / sqrt(20 + (L - 50)^2) at the mean L.
+    # CIEDE2000 without chroma: |dL| / S_L, S_L = 1 + 0.015 (L - 50)^2 / sqrt(20 + (L - 50)^2) at
+    # the mean L.
     camera = pair_of(spheres, 10, 32).source
     pair = two_view(spheres, camera, camera)
     Y = np.array([0.2, 0.5])
@@ -116,7 +135,9 @@ def test_delta_e_of_greys_has_its_closed_form(spheres):
     assert figures["consistency.delta_e_p95"] == pytest.approx(expected, abs=0.02)
     assert figures["consistency.mae_linear"] == pytest.approx(0.3, abs=1e-12)
     assert figures["consistency.rmse_linear"] == pytest.approx(0.3, abs=1e-12)
-    assert figures["consistency.rmse_srgb"] == pytest.approx(float(to_srgb(Y[1]) - to_srgb(Y[0])), abs=1e-12)
+    assert figures["consistency.rmse_srgb"] == pytest.approx(
+        float(to_srgb(Y[1]) - to_srgb(Y[0])), abs=1e-12
+    )
 
 
 def test_what_is_counted_is_what_is_said(spheres):
@@ -133,16 +154,24 @@ def test_what_is_counted_is_what_is_said(spheres):
     half[:, 32:] = True
     left_out = metrics.cross_view(flat, flat, pair, exclude=half)
     asked = metrics.cross_view(flat, flat, pair, mask=~half)
-    assert np.array_equal(left_out.counted, found.counted & ~half) and np.array_equal(asked.counted, left_out.counted)
-    # Pixels excluded are candidates that were not counted; pixels not asked about are no candidates.
-    assert left_out.candidates == pair.visible.sum() and asked.candidates == (pair.visible & ~half).sum()
+    assert np.array_equal(left_out.counted, found.counted & ~half) and np.array_equal(
+        asked.counted, left_out.counted
+    )
+    # Pixels excluded are candidates that were not counted; pixels not asked about are no
+    # candidates.
+    assert (
+        left_out.candidates == pair.visible.sum()
+        and asked.candidates == (pair.visible & ~half).sum()
+    )
     assert asked.figures()["consistency.share"] == asked.counted.sum() / asked.candidates
 
 
 def test_nothing_co_visible_is_undefined_and_counted():
     # Hard case 8: two cameras back to back.
     wall = Rectangle(np.array([3.0, 0, 0]), np.array([0, 9.0, 0]), np.array([0, 0, 9.0]))
-    other = Rectangle(np.array([-3.0, 0, 0]), np.array([0, 9.0, 0]), np.array([0, 0, 9.0]), object_id=1)
+    other = Rectangle(
+        np.array([-3.0, 0, 0]), np.array([0, 9.0, 0]), np.array([0, 0, 9.0]), object_id=1
+    )
     views = [Camera.look_at((0, 0, 0), (x, 0, 0), width=16, height=16, fov_y=40) for x in (1, -1)]
     pair = two_view(Geometry([wall, other]), *views)
     flat = np.full((16, 16, 3), 0.5)
@@ -157,14 +186,20 @@ def test_nothing_co_visible_is_undefined_and_counted():
 
 def test_a_highlight_of_the_truth_is_found_and_texture_is_not(spheres):
     pair = pair_of(spheres, 20, 128)
-    source, target = (painted(spheres, camera, cycles=12.0) for camera in (pair.source, pair.target))
+    source, target = (
+        painted(spheres, camera, cycles=12.0) for camera in (pair.source, pair.target)
+    )
     y, x = np.mgrid[:128, :128]
     shine = 0.5 * np.exp(-((x - 60) ** 2 + (y - 60) ** 2) / (2 * 6.0**2))[..., None]
     shiny = np.clip(target + shine, 0, 1)
     candidates = metrics.cross_view(to_srgb(source), to_srgb(target), pair).counted
-    assert metrics.view_dependent(to_srgb(source), to_srgb(target), pair).sum() <= 0.001 * candidates.sum()
+    assert (
+        metrics.view_dependent(to_srgb(source), to_srgb(target), pair).sum()
+        <= 0.001 * candidates.sum()
+    )
     found = metrics.view_dependent(to_srgb(source), to_srgb(shiny), pair)
-    # Above the tolerance by more than the texture's own range is found; below the tolerance nothing is.
+    # Above the tolerance by more than the texture's own range is found; below the tolerance nothing
+    # is.
     assert found[candidates & (shine[..., 0] > 0.25)].all()
     assert found[candidates & (shine[..., 0] < 0.03)].mean() < 0.001
     # An edit that is consistent on the matt surface is judged so in spite of the highlight.
@@ -176,7 +211,9 @@ def test_a_highlight_of_the_truth_is_found_and_texture_is_not(spheres):
 def test_wrong_input_is_refused_by_name(spheres):
     pair = pair_of(spheres, 30, 32)
     flat = np.full((32, 32, 3), 0.5)
-    with pytest.raises(ValueError, match=r"source_srgb: got 31 x 32 pixels \(H x W\), expected 32 x 32"):
+    with pytest.raises(
+        ValueError, match=r"source_srgb: got 31 x 32 pixels \(H x W\), expected 32 x 32"
+    ):
         metrics.cross_view(flat[1:], flat, pair)
     with pytest.raises(ValueError, match="target_srgb: 2 at row 0"):
         metrics.cross_view(flat, flat * 4, pair)
@@ -191,12 +228,16 @@ def test_wrong_input_is_refused_by_name(spheres):
 
 
 def sideways(shift, size=128):
-    """A textured wall seen by two cameras that look straight at it, ``shift`` px apart: exact pair and pictures."""
+    """A textured wall seen by two cameras that look straight at it, ``shift`` px apart: exact pair
+    and pictures.
+    """
     wall = Rectangle(np.array([2.0, 0, 0]), np.array([0, 9.0, 0]), np.array([0, 0, 9.0]))
     geometry = Geometry([wall])
     first = Camera.look_at((0, 0, 0), (2, 0, 0), width=size, height=size, fov_y=60, name="first")
     step = shift * 2.0 / first.K[0, 0]
-    second = Camera.look_at((0, step, 0), (2, step, 0), width=size, height=size, fov_y=60, name="second")
+    second = Camera.look_at(
+        (0, step, 0), (2, step, 0), width=size, height=size, fov_y=60, name="second"
+    )
     pair = two_view(geometry, first, second)
     field = SolidField((2, 0, 0), 2.0, channels=3, cycles=9.0, terms=12, seed=1)
 
@@ -257,7 +298,9 @@ def test_pictures_too_small_for_flow_have_none(shape):
     flow = metrics.optical_flow(flat, flat)
     assert np.isnan(flow.xy).all() and not flow.accepted.any()
     figures = metrics.flow_consistency(flat, flat, flow).figures("flow_")
-    assert figures.pop("consistency.flow_pixels") == 0 and figures.pop("consistency.flow_share") == 0
+    assert (
+        figures.pop("consistency.flow_pixels") == 0 and figures.pop("consistency.flow_share") == 0
+    )
     assert all(math.isnan(value) for value in figures.values())
 
 

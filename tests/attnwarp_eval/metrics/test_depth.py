@@ -46,7 +46,9 @@ def test_undefined_depth_is_left_out_and_counted():
 def test_nothing_to_measure_is_nan():
     # Hard case 35.
     nan = np.full((2, 2), np.nan)
-    got = metrics.depth_error(nan, nan, normal=np.full((2, 2, 3), np.nan), true_normal=np.full((2, 2, 3), np.nan))
+    got = metrics.depth_error(
+        nan, nan, normal=np.full((2, 2, 3), np.nan), true_normal=np.full((2, 2, 3), np.nan)
+    )
     assert got["depth.pixels"] == got["depth.phantom"] == 0
     assert all(math.isnan(v) for k, v in got.items() if k not in ("depth.pixels", "depth.phantom"))
     unseen = metrics.depth_error(nan, np.ones((2, 2)))
@@ -73,7 +75,9 @@ def test_normal_angles_are_those_the_normals_were_turned_by():
     got = metrics.depth_error(depth, depth, normal=0.3 * turned, true_normal=true_normal)
     assert got["depth.normal_mean"] == pytest.approx(angles.mean(), rel=1e-9)
     assert got["depth.normal_median"] == pytest.approx(10.0, rel=1e-9)
-    small = metrics.depth_error(depth[:, :2], depth[:, :2], normal=turned[:, :2], true_normal=true_normal[:, :2])
+    small = metrics.depth_error(
+        depth[:, :2], depth[:, :2], normal=turned[:, :2], true_normal=true_normal[:, :2]
+    )
     # An arccosine reads 0 for a millionth of a degree.
     assert small["depth.normal_mean"] == pytest.approx(5e-7, rel=1e-5)
 

@@ -31,7 +31,9 @@ def test_inside_and_outside_are_told_apart():
     found = metrics.fidelity(image, truth, mask)
     assert found["fidelity.psnr.inside"] == pytest.approx(20, abs=1e-9)
     assert found["fidelity.psnr.outside"] == pytest.approx(40, abs=1e-9)
-    assert found["fidelity.mse"] == pytest.approx((mask.mean() * 1e-2 + (~mask).mean() * 1e-4), rel=1e-9)
+    assert found["fidelity.mse"] == pytest.approx(
+        (mask.mean() * 1e-2 + (~mask).mean() * 1e-4), rel=1e-9
+    )
     assert found["fidelity.ssim.outside"] > found["fidelity.ssim.inside"]
     assert "fidelity.preserved_psnr" not in found and "fidelity.distance" not in found
 
@@ -44,7 +46,12 @@ def test_the_pixels_on_the_outline_count_in_neither():
             rim[1:-1, 1:-1] |= mask[1:-1, 1:-1] != np.roll(mask, (dy, dx), (0, 1))[1:-1, 1:-1]
     spoiled = np.where(rim[..., None], 1.0, image)
     expected, found = metrics.fidelity(image, truth, mask), metrics.fidelity(spoiled, truth, mask)
-    for name in ("fidelity.psnr.inside", "fidelity.psnr.outside", "fidelity.ssim.inside", "fidelity.ssim.outside"):
+    for name in (
+        "fidelity.psnr.inside",
+        "fidelity.psnr.outside",
+        "fidelity.ssim.inside",
+        "fidelity.ssim.outside",
+    ):
         assert found[name] == expected[name]
     assert found["fidelity.pixels.inside"] + found["fidelity.pixels.outside"] + rim.sum() == SIZE**2
     assert found["fidelity.psnr"] < expected["fidelity.psnr"]
@@ -54,12 +61,17 @@ def test_preservation_is_against_the_original_and_outside():
     original = np.random.default_rng(1).uniform(0.2, 0.7, (SIZE, SIZE, 3))
     mask = disc()
     truth = np.where(mask[..., None], 1 - original, original)
-    spilled = np.where(mask[..., None], truth, original + 0.1)  # the right object in a picture that was painted over
+    spilled = np.where(
+        mask[..., None], truth, original + 0.1
+    )  # the right object in a picture that was painted over
     found = metrics.fidelity(spilled, truth, mask, original_srgb=original)
     assert found["fidelity.psnr.inside"] == math.inf
     assert found["fidelity.preserved_psnr"] == pytest.approx(20, abs=1e-9)
     untouched = metrics.fidelity(original, truth, mask, original_srgb=original)
-    assert untouched["fidelity.preserved_psnr"] == math.inf and untouched["fidelity.preserved_mse"] == 0
+    assert (
+        untouched["fidelity.preserved_psnr"] == math.inf
+        and untouched["fidelity.preserved_mse"] == 0
+    )
     assert untouched["fidelity.preserved_ssim"] == pytest.approx(1, abs=1e-12)
     assert untouched["fidelity.psnr.inside"] < 15
 
@@ -107,14 +119,17 @@ def test_the_nearest_answer_is_one_for_all_views():
     assert metrics.nearest_answer({"a": flat(0.3), "b": flat(0.25)}, answers)[0] == "dark"
     # One view each way: neither is met, and the nearer of the two overall is said.
     name, found = metrics.nearest_answer({"a": flat(0.3), "b": flat(0.75)}, answers)
-    assert name == "light" and found["light"] == pytest.approx(-10 * math.log10((0.25 + 0.0025) / 2))
+    assert name == "light" and found["light"] == pytest.approx(
+        -10 * math.log10((0.25 + 0.0025) / 2)
+    )
     assert metrics.nearest_answer({"a": flat(0.8), "b": flat(0.8)}, answers) == (
         "light", {"dark": pytest.approx(-10 * math.log10(0.36)), "light": math.inf},
     )  # fmt: skip
     nothing = {view: np.zeros((4, 4), bool) for view in "ab"}
     assert metrics.nearest_answer({"a": flat(0.2), "b": flat(0.2)}, answers, nothing)[0] is None
     with pytest.raises(
-        ValueError, match=r"answers\['dark'\]: got views \['a', 'b'\], expected those of images, \['a'\]"
+        ValueError,
+        match=r"answers\['dark'\]: got views \['a', 'b'\], expected those of images, \['a'\]",
     ):
         metrics.nearest_answer({"a": flat(0.2)}, answers)
     with pytest.raises(ValueError, match="answers: got none"):
@@ -140,10 +155,18 @@ def test_every_figure_is_registered():
 def test_the_truth_of_an_edit_is_faithful_and_preserves_the_rest_and_the_unedited_view_is_not():
     scene = load_scene("bear").with_size(64, 64)
     hits = Geometry(scene).trace(scene.source)
-    original, truth = (to_srgb(appearance(world, scene.source, spp=4)) for world in (scene, scene.edited("polar")))
+    original, truth = (
+        to_srgb(appearance(world, scene.source, spp=4)) for world in (scene, scene.edited("polar"))
+    )
     mask = edit_mask(scene, "polar", hits)
     best = metrics.fidelity(truth, truth, mask, original_srgb=original)
-    # The bear's surroundings are lit alike, so off its outline the truth leaves them as they were, bit for bit.
-    assert best["fidelity.psnr"] == best["fidelity.psnr.inside"] == best["fidelity.preserved_psnr"] == math.inf
+    # The bear's surroundings are lit alike, so off its outline the truth leaves them as they were,
+    # bit for bit.
+    assert (
+        best["fidelity.psnr"]
+        == best["fidelity.psnr.inside"]
+        == best["fidelity.preserved_psnr"]
+        == math.inf
+    )
     nothing = metrics.fidelity(original, truth, mask, original_srgb=original)
     assert nothing["fidelity.psnr.inside"] < 15 and nothing["fidelity.preserved_psnr"] == math.inf

@@ -1,4 +1,6 @@
-"""PSNR, SSIM and MS-SSIM against scikit-image, torchmetrics, brute force and closed forms; hard cases 14, 31, 34 to 36, 40."""
+"""PSNR, SSIM and MS-SSIM against scikit-image, torchmetrics, brute force and closed forms; hard
+cases 14, 31, 34 to 36, 40.
+"""
 
 import json
 import math
@@ -24,7 +26,9 @@ def pictures(height=40, width=52, seed=0, noise=0.15):
     """A smooth picture and the same with noise, as edited views are: not two pictures of noise."""
     random = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width] / 17.0
-    image = np.stack([0.5 + 0.4 * np.sin(x * (k + 1) + y + random.uniform(0, 6)) for k in range(3)], axis=-1)
+    image = np.stack(
+        [0.5 + 0.4 * np.sin(x * (k + 1) + y + random.uniform(0, 6)) for k in range(3)], axis=-1
+    )
     return image, np.clip(image + noise * random.standard_normal(image.shape), 0, 1)
 
 
@@ -38,7 +42,9 @@ SIZES = [(11, 11), (12, 31), (40, 52), (64, 64), (177, 200)]
 @pytest.mark.parametrize("size", SIZES)
 def test_mse_and_psnr_are_those_of_scikit_image_and_torchmetrics(size):
     image, target = pictures(*size)
-    assert metrics.mse(image, target) == pytest.approx(skimage.mean_squared_error(image, target), rel=1e-12)
+    assert metrics.mse(image, target) == pytest.approx(
+        skimage.mean_squared_error(image, target), rel=1e-12
+    )
     expected = skimage.peak_signal_noise_ratio(target, image, data_range=1.0)
     assert metrics.psnr(image, target) == pytest.approx(expected, abs=1e-10)
     other = peak_signal_noise_ratio(tensor(image), tensor(target), data_range=1.0)
@@ -50,43 +56,62 @@ def test_mse_and_psnr_are_those_of_scikit_image_and_torchmetrics(size):
 def test_ssim_is_that_of_scikit_image_and_torchmetrics(size):
     image, target = pictures(*size)
     expected, full = skimage.structural_similarity(
-        image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1.0,
+        image,
+        target,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        channel_axis=-1,
+        data_range=1.0,
         full=True,
-    )  # fmt: skip
+    )
     assert metrics.ssim(image, target) == pytest.approx(expected, abs=1e-12)
-    np.testing.assert_allclose(metrics.ssim_map(image, target), full[5:-5, 5:-5].mean(-1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        metrics.ssim_map(image, target), full[5:-5, 5:-5].mean(-1), rtol=0, atol=1e-12
+    )
     _, other = structural_similarity_index_measure(
         tensor(image), tensor(target), data_range=1.0, return_full_image=True
     )
-    # torchmetrics' own mean counts windows over a reflected border too; its map without them is ours.
+    # torchmetrics' own mean counts windows over a reflected border too; its map without them is
+    # ours.
     windows = other[0].numpy()[:, 5:-5, 5:-5]
     # Its kernel is normalised in another order; 1e-10 is rounding.
     assert metrics.ssim(image, target) == pytest.approx(windows.mean(), abs=1e-10)
 
 
 def oracle_ms_ssim(image, target):
-    """From torchmetrics' SSIM and contrast-structure at each scale, without its reflected border at the coarsest."""
+    """From torchmetrics' SSIM and contrast-structure at each scale, without its reflected border at
+    the coarsest.
+    """
     a, b = tensor(image), tensor(target)
     product = 1.0
     for scale, weight in enumerate((0.0448, 0.2856, 0.3001, 0.2363, 0.1333)):
         if scale:
             a, b = (torch.nn.functional.avg_pool2d(x, 2) for x in (a, b))
-        _, structure = structural_similarity_index_measure(a, b, data_range=1.0, return_contrast_sensitivity=True)
+        _, structure = structural_similarity_index_measure(
+            a, b, data_range=1.0, return_contrast_sensitivity=True
+        )
         _, full = structural_similarity_index_measure(a, b, data_range=1.0, return_full_image=True)
         term = float(full[..., 5:-5, 5:-5].mean()) if scale == 4 else float(structure)
         product *= max(term, 0.0) ** weight
     return product, float(full.mean()), float(full[..., 5:-5, 5:-5].mean())
 
 
-@pytest.mark.parametrize(("size", "noise"), [((176, 176), 0.05), ((177, 191), 0.4), ((224, 180), 0.15)])
+@pytest.mark.parametrize(
+    ("size", "noise"), [((176, 176), 0.05), ((177, 191), 0.4), ((224, 180), 0.15)]
+)
 def test_ms_ssim_is_that_of_torchmetrics(size, noise):
     image, target = pictures(*size, noise=noise)
     expected, bordered, valid = oracle_ms_ssim(image, target)
     got = metrics.ms_ssim(image, target)
     assert got == pytest.approx(expected, abs=1e-10)
-    whole = float(multiscale_structural_similarity_index_measure(tensor(image), tensor(target), data_range=1.0))
-    # All that separates us from its public figure is the border of the coarsest scale, which the paper's code leaves out.
-    # Its exponents are float32.
+    whole = float(
+        multiscale_structural_similarity_index_measure(
+            tensor(image), tensor(target), data_range=1.0
+        )
+    )
+    # All that separates us from its public figure is the border of the coarsest scale, which the
+    # paper's code leaves out. Its exponents are float32.
     assert got * (bordered / valid) ** 0.1333 == pytest.approx(whole, abs=1e-8)
 
 
@@ -137,7 +162,8 @@ def test_a_constant_offset_has_its_closed_form_whatever_the_mask():
 
 
 def test_masked_psnr_gains_nothing_from_what_is_left_out():
-    # Hard case 40: over all pixels, with the rest set to 0, a quarter's coverage gains 10 log10(4) = 6.02 dB.
+    # Hard case 40: over all pixels, with the rest set to 0, a quarter's coverage gains 10 log10(4)
+    # = 6.02 dB.
     image, target = pictures(64, 64)
     mask = np.zeros((64, 64), bool)
     mask[:32, :32] = True
@@ -163,7 +189,11 @@ def brute_ssim(image, target, mask):
                 mx, my = (weights * x).sum(), (weights * y).sum()
                 vx, vy = (weights * (x - mx) ** 2).sum(), (weights * (y - my) ** 2).sum()
                 cov = (weights * (x - mx) * (y - my)).sum()
-                channels.append((2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
+                channels.append(
+                    (2 * mx * my + 1e-4)
+                    * (2 * cov + 9e-4)
+                    / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+                )
             found[i, j] = np.mean(channels)
     return found
 
@@ -215,12 +245,17 @@ def test_values_that_are_no_picture_are_refused_with_their_place():
     image, target = pictures()
     spoiled = target.copy()
     spoiled[3, 4, 1] = np.nan
-    with pytest.raises(ValueError, match="target: nan at row 3, column 4, channel 1; 1 values are NaN or outside"):
+    with pytest.raises(
+        ValueError, match="target: nan at row 3, column 4, channel 1; 1 values are NaN or outside"
+    ):
         metrics.mse(image, spoiled)
     spoiled[3, 4, 1] = 1.01
     with pytest.raises(ValueError, match="image: 1.01 at row 3"):
         metrics.ssim(spoiled, target)
-    with pytest.raises(ValueError, match=r"image: got uint8, expected float32 or float64 in \[0, 1\]; divide by 255"):
+    with pytest.raises(
+        ValueError,
+        match=r"image: got uint8, expected float32 or float64 in \[0, 1\]; divide by 255",
+    ):
         metrics.psnr(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="target: got float16"):
         metrics.psnr(np.zeros((4, 4, 3)), np.zeros((4, 4, 3), np.float16))
@@ -245,11 +280,14 @@ def test_linear_figures_are_those_of_the_linear_pictures():
 
 
 def test_single_precision_is_measured_in_double():
-    # Hard case 31's kin: an error of 1e-6 is squared to 1e-12, below float32's resolution of a mean.
+    # Hard case 31's kin: an error of 1e-6 is squared to 1e-12, below float32's resolution of a
+    # mean.
     image = np.full((200, 200, 3), 0.5, np.float32)
     target = image + np.float32(2**-20)
     assert metrics.mse(image, target) == pytest.approx(2.0**-40, rel=1e-12)
-    assert metrics.psnr(torch.from_numpy(image), torch.from_numpy(target)) == pytest.approx(120.4, abs=0.05)
+    assert metrics.psnr(torch.from_numpy(image), torch.from_numpy(target)) == pytest.approx(
+        120.4, abs=0.05
+    )
 
 
 SYMMETRIES = {
@@ -270,7 +308,9 @@ def test_no_direction_no_channel_and_neither_picture_is_special(how, seed):
     expected = metrics.image_error(image, target)
     assert metrics.image_error(target, image) == pytest.approx(expected, rel=1e-12)
     assert metrics.image_error(turn(image), turn(target)) == pytest.approx(expected, rel=1e-10)
-    assert metrics.image_error(image[..., ::-1], target[..., ::-1]) == pytest.approx(expected, rel=1e-10)
+    assert metrics.image_error(image[..., ::-1], target[..., ::-1]) == pytest.approx(
+        expected, rel=1e-10
+    )
     masked = metrics.mse(image, target, mask), metrics.ssim(image, target, mask)
     turned = turn(image), turn(target), np.ascontiguousarray(turn(mask))
     assert (metrics.mse(*turned), metrics.ssim(*turned)) == pytest.approx(masked, rel=1e-10)
@@ -281,7 +321,10 @@ def test_more_noise_is_never_better():
     image, _ = pictures(192, 192)
     grain = random.standard_normal(image.shape)
     image = 0.3 + 0.4 * image
-    found = [metrics.image_error(image, np.clip(image + s * grain, 0, 1)) for s in (0.003, 0.01, 0.03, 0.1)]
+    found = [
+        metrics.image_error(image, np.clip(image + s * grain, 0, 1))
+        for s in (0.003, 0.01, 0.03, 0.1)
+    ]
     for name in ("image.psnr", "image.psnr_linear", "image.ssim", "image.ms_ssim"):
         values = [each[name] for each in found]
         assert values == sorted(values, reverse=True) and values[0] > values[-1]
@@ -300,13 +343,21 @@ def test_edit_psnr_averages_the_error_and_not_the_decibels():
     assert got.mean_finite == pytest.approx(30, abs=1e-9)
     assert (got.identical, got.undefined) == (1, 1)
     figures = got.figures()
-    assert figures["edit.psnr.b"] == pytest.approx(20) and figures["edit.mse.b"] == pytest.approx(0.01)
-    assert (figures["edit.views"], figures["edit.views_identical"], figures["edit.views_undefined"]) == (4, 1, 1)
+    assert figures["edit.psnr.b"] == pytest.approx(20) and figures["edit.mse.b"] == pytest.approx(
+        0.01
+    )
+    assert (
+        figures["edit.views"],
+        figures["edit.views_identical"],
+        figures["edit.views_undefined"],
+    ) == (4, 1, 1)
 
 
 def test_edit_psnr_of_whole_views_of_one_size_is_that_of_one_stack():
     views = {str(k): pictures(seed=k, noise=0.05 * (k + 1)) for k in range(4)}
-    got = metrics.edit_psnr({k: v[0] for k, v in views.items()}, {k: v[1] for k, v in views.items()})
+    got = metrics.edit_psnr(
+        {k: v[0] for k, v in views.items()}, {k: v[1] for k, v in views.items()}
+    )
     stacked = [np.concatenate([v[side] for v in views.values()]) for side in (0, 1)]
     expected = skimage.peak_signal_noise_ratio(*stacked, data_range=1.0)
     assert got.pooled == pytest.approx(expected, abs=1e-10)
@@ -315,7 +366,8 @@ def test_edit_psnr_of_whole_views_of_one_size_is_that_of_one_stack():
 
 
 @pytest.mark.parametrize(
-    ("psnr", "pooled"), [((math.inf, math.inf), math.inf), ((math.nan, math.nan), math.nan), ((), math.nan)]
+    ("psnr", "pooled"),
+    [((math.inf, math.inf), math.inf), ((math.nan, math.nan), math.nan), ((), math.nan)],
 )
 def test_edit_psnr_where_no_view_has_a_finite_one(psnr, pooled):
     mse = tuple(0.0 if value == math.inf else value for value in psnr)
@@ -327,17 +379,24 @@ def test_edit_psnr_where_no_view_has_a_finite_one(psnr, pooled):
 
 def test_edit_psnr_refuses_views_that_do_not_match():
     flat = np.full((2, 2, 3), 0.5)
-    with pytest.raises(ValueError, match="rendered: got no view 'b', expected the 2 views of edited"):
+    with pytest.raises(
+        ValueError, match="rendered: got no view 'b', expected the 2 views of edited"
+    ):
         metrics.edit_psnr({"a": flat, "b": flat}, {"a": flat})
     with pytest.raises(ValueError, match="masks: got a view 'c' that is not among the edited ones"):
-        metrics.edit_psnr({"a": flat}, {"a": flat}, {"a": np.ones((2, 2), bool), "c": np.ones((2, 2), bool)})
+        metrics.edit_psnr(
+            {"a": flat}, {"a": flat}, {"a": np.ones((2, 2), bool), "c": np.ones((2, 2), bool)}
+        )
     with pytest.raises(ValueError, match=r"rendered\['a'\]: 1.5 at row 0"):
         metrics.edit_psnr({"a": flat}, {"a": flat * 3})
 
 
 def test_every_figure_is_registered():
     image, target = pictures(12, 12)
-    names = {*metrics.image_error(image, target), *metrics.edit_psnr({"yaw.010": image}, {"yaw.010": target}).figures()}
+    names = {
+        *metrics.image_error(image, target),
+        *metrics.edit_psnr({"yaw.010": image}, {"yaw.010": target}).figures(),
+    }
     for name in names:
         assert metric(name).unit
     assert METRICS["image.psnr"].direction == "higher" and METRICS["image.mse"].direction == "lower"
@@ -359,7 +418,9 @@ def blurring(image, target):
     """One that sees 7 x 7 px around each place, as a network does."""
     from scipy.ndimage import uniform_filter
 
-    return float(np.abs(uniform_filter(image, (7, 7, 1)) - uniform_filter(target, (7, 7, 1))).mean())
+    return float(
+        np.abs(uniform_filter(image, (7, 7, 1)) - uniform_filter(target, (7, 7, 1))).mean()
+    )
 
 
 @pytest.mark.parametrize("distance", [local, blurring])
@@ -382,7 +443,10 @@ def test_what_is_equal_inside_the_mask_is_at_distance_0_whatever_is_outside(dist
     image, _ = pictures()
     known = metrics.perceptual(image, target, distance, mask)
     assert known > 0
-    assert metrics.perceptual(np.where(mask[..., None], image, garbage), target, distance, mask) == known
+    assert (
+        metrics.perceptual(np.where(mask[..., None], image, garbage), target, distance, mask)
+        == known
+    )
 
 
 def test_a_masked_distance_is_the_mean_over_the_mask_apart_from_the_border():
@@ -399,7 +463,9 @@ def test_a_masked_distance_is_the_mean_over_the_mask_apart_from_the_border():
 
 def test_an_empty_mask_has_no_distance_and_asks_for_none():
     image, target = pictures()
-    assert math.isnan(metrics.perceptual(image, target, lambda a, b: 1 / 0, np.zeros(image.shape[:2], bool)))
+    assert math.isnan(
+        metrics.perceptual(image, target, lambda a, b: 1 / 0, np.zeros(image.shape[:2], bool))
+    )
 
 
 def test_a_perceptual_distance_refuses_what_the_others_do():

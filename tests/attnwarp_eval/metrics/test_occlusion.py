@@ -37,7 +37,9 @@ def test_counts_agree_with_a_loop_over_pixels():
 
 
 def test_scores_of_a_case_by_hand():
-    label = np.array([[VISIBLE, VISIBLE, VISIBLE, VISIBLE, HIDDEN, HIDDEN, NONE, NONE, NONE, AMBIGUOUS]])
+    label = np.array(
+        [[VISIBLE, VISIBLE, VISIBLE, VISIBLE, HIDDEN, HIDDEN, NONE, NONE, NONE, AMBIGUOUS]]
+    )
     surface = np.array([[True] * 8 + [False, True]])
     behind = np.array([[False] * 7 + [True, False, False]])
     accepted = np.array([[True, True, True, False, True, False, False, True, True, True]])
@@ -60,7 +62,11 @@ def test_the_exact_mask_against_itself_is_perfect():
     for suffix in ("", ".interior", ".edge"):
         assert got[f"occlusion.f1{suffix}"] == got[f"occlusion.precision{suffix}"] == 1
         assert got[f"occlusion.recall{suffix}"] == 1
-        assert got[f"occlusion.false_positive_rate{suffix}"] == got[f"occlusion.false_negative_rate{suffix}"] == 0
+        assert (
+            got[f"occlusion.false_positive_rate{suffix}"]
+            == got[f"occlusion.false_negative_rate{suffix}"]
+            == 0
+        )
 
 
 def test_interior_and_edge_add_up_to_the_whole():
@@ -80,12 +86,18 @@ def test_a_view_that_shows_nothing_of_the_source_has_no_score():
         assert math.isnan(empty[f"occlusion.{name}"])
     assert empty["occlusion.false_positive_rate"] == 0
     wrong = metrics.mask_error(np.ones((4, 4), bool), label, surface)
-    assert wrong["occlusion.precision"] == 0  # what was accepted can be judged, and all of it is wrong
+    assert (
+        wrong["occlusion.precision"] == 0
+    )  # what was accepted can be judged, and all of it is wrong
     assert wrong["occlusion.false_positive_rate"] == 1
     assert math.isnan(wrong["occlusion.f1"])
     assert math.isnan(wrong["occlusion.recall"])
     background = metrics.mask_error(np.zeros((4, 4), bool), np.zeros((4, 4), int), ~surface)
-    assert all(math.isnan(v) for k, v in background.items() if k in metrics.METRICS and not isinstance(v, int))
+    assert all(
+        math.isnan(v)
+        for k, v in background.items()
+        if k in metrics.METRICS and not isinstance(v, int)
+    )
 
 
 def test_background_does_not_dilute_the_false_positive_rate():
@@ -100,7 +112,9 @@ def test_background_does_not_dilute_the_false_positive_rate():
 def test_yaw_bins_sum_counts_before_they_score():
     few = dict.fromkeys(COUNTS, 0) | {"visible_accepted": 1, "visible_rejected": 1}
     many = dict.fromkeys(COUNTS, 0) | {"visible_accepted": 98, "hidden_accepted": 49}
-    got = metrics.by_yaw([(-10, few), (350, many), (15, many), (180, few), (-180, few)], edges=(0, 15, 90, 180))
+    got = metrics.by_yaw(
+        [(-10, few), (350, many), (15, many), (180, few), (-180, few)], edges=(0, 15, 90, 180)
+    )
     assert [(b.low, b.high, b.views) for b in got] == [(0, 15, 2), (15, 90, 1), (90, 180, 2)]
     assert got[0].counts["visible_accepted"] == 99
     assert got[0].scores["occlusion.recall"] == 99 / 100  # and not the mean of 1/2 and 1

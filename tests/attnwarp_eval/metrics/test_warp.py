@@ -83,15 +83,20 @@ def test_feature_error_of_a_case_by_hand():
     visible = np.array([[True, True, False, False]])
     got = metrics.feature_error(warped, exact, accepted, visible)
     assert got["warp.feature_accepted"] == pytest.approx(math.sqrt((0.25 + 1) / (25 + 1)))
-    assert got["warp.feature_all_accepted"] == pytest.approx(math.sqrt((0.25 + 1 + 49) / (25 + 1 + 4)))
-    rejected = metrics.feature_error(warped, exact, np.array([[True, False, False, False]]), visible)
+    assert got["warp.feature_all_accepted"] == pytest.approx(
+        math.sqrt((0.25 + 1 + 49) / (25 + 1 + 4))
+    )
+    rejected = metrics.feature_error(
+        warped, exact, np.array([[True, False, False, False]]), visible
+    )
     assert rejected["warp.feature_accepted"] == pytest.approx(math.sqrt(0.25 / 25))
     assert rejected["warp.feature_visible"] == got["warp.feature_accepted"]
     assert rejected["warp.feature_pixels"] == 1
 
 
 def test_the_field_is_band_limited_and_of_unit_variance():
-    # Sampled along a line over many extents, its spectrum ends at the bandwidth (a Hann window's leakage aside).
+    # Sampled along a line over many extents, its spectrum ends at the bandwidth (a Hann window's
+    # leakage aside).
     field = SolidField((1.0, 2.0, 3.0), extent=2.0, channels=16, cycles=4.0, seed=3)
     n, length = 8192, 64.0
     t = np.arange(n) / n * length
@@ -102,7 +107,9 @@ def test_the_field_is_band_limited_and_of_unit_variance():
     assert power[frequency > 4.0 / 2.0 + 3 / length].sum() < 1e-6 * power.sum()
     assert np.linalg.norm(field.frequencies, axis=-1).max() <= 2.0
     cloud = np.random.default_rng(0).uniform(-50, 50, (100_000, 3))
-    assert np.abs(field(cloud).var(axis=0) - 1).max() < 0.03  # far above the sampling error of 1e5 points
+    assert (
+        np.abs(field(cloud).var(axis=0) - 1).max() < 0.03
+    )  # far above the sampling error of 1e5 points
     assert np.abs(field(cloud).mean(axis=0)).max() < 0.03
 
 
@@ -113,7 +120,11 @@ def test_the_field_belongs_to_the_point():
     for i in (0, 17):
         for c in (0, 7):
             value = sum(
-                math.sin(2 * math.pi * (float(np.dot(field.frequencies[c, k], points[i])) + field.phases[c, k]))
+                math.sin(
+                    2
+                    * math.pi
+                    * (float(np.dot(field.frequencies[c, k], points[i])) + field.phases[c, k])
+                )
                 for k in range(4)
             )
             assert field(points)[i, c] == pytest.approx(value / math.sqrt(2), abs=1e-12)
@@ -142,10 +153,13 @@ def floor(camera):
 
 @pytest.mark.parametrize(("size", "bound"), [(256, 2e-3), (64, 0.03), (32, 0.1)])
 def test_an_exact_warp_of_the_field_errs_by_bilinear_interpolation_alone(size, bound):
-    # Scene seen from above, its extent the image's width: wavelengths of at least size / 4 px. Half way between taps a
-    # sinusoid of f cycles a pixel loses 1 - cos(pi f) of its amplitude, on average over positions less.
+    # Scene seen from above, its extent the image's width: wavelengths of at least size / 4 px. Half
+    # way between taps a sinusoid of f cycles a pixel loses 1 - cos(pi f) of its amplitude, on
+    # average over positions less.
     source = Camera.look_at((0.4, 0, 3), (0, 0, -1), width=256, height=256, fov_y=50, up=(0, 1, 0))
-    target = Camera.look_at((-0.5, 0.6, 2.9), (0, 0, -1), width=256, height=256, fov_y=50, up=(0, 1, 0))
+    target = Camera.look_at(
+        (-0.5, 0.6, 2.9), (0, 0, -1), width=256, height=256, fov_y=50, up=(0, 1, 0)
+    )
     field = SolidField((0, 0, -1), extent=2 * 4 * math.tan(math.radians(25)), channels=4)
     depth, _ = floor(target)
     small = [camera.resize(size, size) for camera in (source, target)]
@@ -156,16 +170,23 @@ def test_an_exact_warp_of_the_field_errs_by_bilinear_interpolation_alone(size, b
     got = metrics.feature_error(warped, exact, mask, mask)
     assert got["warp.feature_accepted"] < bound
     # The half-pixel slip at the same size: the field notices it.
-    slipped, kept = sample(features, correspond_at(source, target, depth, (size, size), pixel_centers="integer"))
+    slipped, kept = sample(
+        features, correspond_at(source, target, depth, (size, size), pixel_centers="integer")
+    )
     worse = metrics.feature_error(slipped, exact, mask & kept, mask & kept)
     assert worse["warp.feature_accepted"] > 1.5 * got["warp.feature_accepted"]
-    # OpenCV's warp of the same map along the exact positions errs as much: the figure is the interpolation's.
+    # OpenCV's warp of the same map along the exact positions errs as much: the figure is the
+    # interpolation's.
     xy, _ = small[0].project(floor(small[1])[1])
     index = (xy - 0.5).astype(np.float32)
     channels = np.ascontiguousarray(np.moveaxis(features.numpy(), 0, -1), dtype=np.float32)
-    theirs = cv2.remap(channels, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    theirs = cv2.remap(
+        channels, index[..., 0], index[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     ours = metrics.feature_error(warped, exact, mask, mask)["warp.feature_accepted"]
-    cv = metrics.feature_error(np.moveaxis(theirs, -1, 0), exact, mask, mask)["warp.feature_accepted"]
+    cv = metrics.feature_error(np.moveaxis(theirs, -1, 0), exact, mask, mask)[
+        "warp.feature_accepted"
+    ]
     # It rounds positions to 1/32 px.
     assert ours <= cv * 1.05
     assert cv - ours < 2 * math.pi * 4 / size / 64 + 0.05 * ours
@@ -173,7 +194,9 @@ def test_an_exact_warp_of_the_field_errs_by_bilinear_interpolation_alone(size, b
 
 def test_an_exact_correspondence_has_no_endpoint_error():
     source = Camera.look_at((0.4, 0, 3), (0, 0, -1), width=128, height=128, fov_y=50, up=(0, 1, 0))
-    target = Camera.look_at((-0.5, 0.6, 2.9), (0, 0, -1), width=128, height=128, fov_y=50, up=(0, 1, 0))
+    target = Camera.look_at(
+        (-0.5, 0.6, 2.9), (0, 0, -1), width=128, height=128, fov_y=50, up=(0, 1, 0)
+    )
     depth, points = floor(target)
     xy, _ = source.project(points)
     visible = (xy >= 0).all(-1) & (xy <= 128).all(-1)
@@ -190,7 +213,10 @@ def test_every_figure_is_registered_and_named_whatever_stands_behind_it():
         | metrics.feature_error(np.ones((1, 2, 2)), np.ones((1, 2, 2)), mask, mask, mask)
         | metrics.mask_error(mask, np.ones((2, 2), int), mask, ~mask, mask)
         | metrics.depth_error(
-            np.ones((2, 2)), np.ones((2, 2)), normal=np.ones((2, 2, 3)), true_normal=np.ones((2, 2, 3))
+            np.ones((2, 2)),
+            np.ones((2, 2)),
+            normal=np.ones((2, 2, 3)),
+            true_normal=np.ones((2, 2, 3)),
         )
     )
     # Calibration and fits have figures of their own, which no check gives.

@@ -1,4 +1,5 @@
-"""Hand-made records with known numbers; the expected tables, verdicts and warnings follow by hand."""
+"""Hand-made records with known numbers; the expected tables, verdicts and warnings follow by
+hand."""
 
 import copy
 
@@ -43,7 +44,9 @@ ENVIRONMENT = {
 def record(values, counters=None, **cost):
     """A warp cell whose views show ``values`` of the slip's metric (None: undefined)."""
     return {
-        "views": [{"view": f"v{i}", "yaw": 30.0 * i, "metrics": {SLIP: v}} for i, v in enumerate(values)],
+        "views": [
+            {"view": f"v{i}", "yaw": 30.0 * i, "metrics": {SLIP: v}} for i, v in enumerate(values)
+        ],
         "pictures": [],
         "cost": {
             "seconds": {"steady": 0.1},
@@ -56,7 +59,9 @@ def record(values, counters=None, **cost):
 
 
 def results(table, **changes):
-    """``table``: variant -> one list of view values a scene, or None where the cell was not measured."""
+    """``table``: variant -> one list of view values a scene, or None where the cell was not
+    measured.
+    """
     cells = [
         {
             "id": f"{variant}-{scene}",
@@ -76,7 +81,13 @@ def results(table, **changes):
 CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]]}
 
 SLIP_CLAIM = Claim(
-    "slip", "It slips", "warp", "warp.epe_median_layer.{layer}", {}, "higher", {"set": {"pixel_centers": "integer"}}
+    "slip",
+    "It slips",
+    "warp",
+    "warp.epe_median_layer.{layer}",
+    {},
+    "higher",
+    {"set": {"pixel_centers": "integer"}},
 )
 
 
@@ -108,7 +119,10 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     main, _, contrasts = section.tables
     column = main.columns.index("EPE on 64, layer px")
     assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0"]
-    assert [row[main.columns.index("M splat-pixel pairs a view")] for row in main.rows] == ["1.00", "1.00"]
+    assert [row[main.columns.index("M splat-pixel pairs a view")] for row in main.rows] == [
+        "1.00",
+        "1.00",
+    ]
     row = next(row for row in contrasts.rows if row[1] == SLIP)
     assert row[0] == "slipped"
     assert row[2] == "0.500 ± 0"
@@ -125,7 +139,9 @@ def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
 
 
 def test_a_variant_measured_on_fewer_scenes_says_so():
-    (section,) = ablations(results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]}))
+    (section,) = ablations(
+        results({"good": CLEAR["good"], "slipped": [[0.6, 0.6], None, [0.6, 0.6]]})
+    )
     column = section.tables[0].columns.index("EPE on 64, layer px")
     assert section.tables[0].rows[1][column] == "0.600 ± 0 (2 of 3 scenes)"
 
@@ -144,14 +160,21 @@ def test_a_claim_is_seen_here_and_holds_in_general_when_every_scene_agrees():
 
 
 def test_a_claim_finds_its_sides_by_content_and_not_by_name():
-    renamed = results(CLEAR, variants={"good": {"set": {"pixel_centers": "integer"}}, "slipped": {}})
+    renamed = results(
+        CLEAR, variants={"good": {"set": {"pixel_centers": "integer"}}, "slipped": {}}
+    )
     (finding,) = judge(renamed, [SLIP_CLAIM])
     # The variant called "good" is the slipped one here, so the difference turns round.
     assert finding.contrast.mean == pytest.approx(-0.5)
     assert finding.verdict == "does not hold"
     assert (
         judge(
-            results({"good": CLEAR["good"]}, variants={"good": {}}, probes={"warp": ["good"]}, ablations=[]),
+            results(
+                {"good": CLEAR["good"]},
+                variants={"good": {}},
+                probes={"warp": ["good"]},
+                ablations=[],
+            ),
             [SLIP_CLAIM],
         )
         == []
@@ -159,12 +182,16 @@ def test_a_claim_finds_its_sides_by_content_and_not_by_name():
 
 
 def test_a_claim_that_only_some_scenes_show_is_mixed_and_cannot_be_told():
-    (finding,) = judge(results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]}), [SLIP_CLAIM])
+    (finding,) = judge(
+        results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]}), [SLIP_CLAIM]
+    )
     assert (finding.here, finding.verdict, finding.agreement) == ("mixed", "can't tell", (2, 3))
 
 
 def test_an_undefined_scene_neither_agrees_nor_disagrees():
-    (finding,) = judge(results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM])
+    (finding,) = judge(
+        results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM]
+    )
     assert (finding.here, finding.agreement, finding.contrast.scenes) == ("seen", (2, 2), 2)
     assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
 
@@ -182,10 +209,29 @@ def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
 
 
 def calibrated(**changes):
-    figures = {"warp.epe_median": 1e-13, "occlusion.f1.exact": 1.0, "calibration.mitsuba_agrees": 0.999, **changes}
-    cell = {"id": "c", "title": "c", "scene": "one", "variants": ["calibration"], "probe": "calibration", "seed": 0}
+    figures = {
+        "warp.epe_median": 1e-13,
+        "occlusion.f1.exact": 1.0,
+        "calibration.mitsuba_agrees": 0.999,
+        **changes,
+    }
+    cell = {
+        "id": "c",
+        "title": "c",
+        "scene": "one",
+        "variants": ["calibration"],
+        "probe": "calibration",
+        "seed": 0,
+    }
     return Results(
-        study(), [{**cell, "record": {**record([]), "views": [{"view": "v", "yaw": 0.0, "metrics": figures}]}}], []
+        study(),
+        [
+            {
+                **cell,
+                "record": {**record([]), "views": [{"view": "v", "yaw": 0.0, "metrics": figures}]},
+            }
+        ],
+        [],
     )
 
 
@@ -235,6 +281,8 @@ def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
 
 
 def test_text_of_a_page_is_escaped_before_it_is_set():
-    assert inline("a < b `c<d` **e** `#ff0000`") == (
-        'a &lt; b <code>c&lt;d</code> <strong>e</strong> <span class="swatch" style="background:#ff0000"></span>'
+    assert (
+        inline("a < b `c<d` **e** `#ff0000`")
+        == 'a &lt; b <code>c&lt;d</code> <strong>e</strong> <span class="swatch"'
+        ' style="background:#ff0000"></span>'
     )

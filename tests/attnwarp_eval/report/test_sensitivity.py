@@ -1,4 +1,6 @@
-"""Hand-made records: which shares, correlations and sections follow from their numbers is worked out by hand."""
+"""Hand-made records: which shares, correlations and sections follow from their numbers is worked
+out by hand.
+"""
 
 import json
 import math
@@ -21,28 +23,51 @@ MSE, CLIP = "fidelity.mse", "embedding.clip_similarity"
 
 
 def record(views, key=MSE, rounds=None):
-    """A cell whose views have ``key`` in each condition: a dict of condition -> value, 1 where none is given."""
+    """A cell whose views have ``key`` in each condition: a dict of condition -> value, 1 where none
+    is given.
+    """
     return {
         "spec": {"size": 32, "rounds": 3, "encoders": {"clip": {"weights_sha256": "c" * 64}}},
         "views": [
-            {"view": f"e/v{i}", "yaw": 0.0, "metrics": {f"{key}.{c.name}": v.get(c.name, 1.0) for c in CONDITIONS}}
+            {
+                "view": f"e/v{i}",
+                "yaw": 0.0,
+                "metrics": {f"{key}.{c.name}": v.get(c.name, 1.0) for c in CONDITIONS},
+            }
             for i, v in enumerate(views)
         ],
         "pictures": [],
-        "cost": {"seconds": {}, "counters": {}, "peak_memory_mb": 1.0, "rounds": rounds or {key: [0.2, 0.1, 0.3]}},
+        "cost": {
+            "seconds": {},
+            "counters": {},
+            "peak_memory_mb": 1.0,
+            "rounds": rounds or {key: [0.2, 0.1, 0.3]},
+        },
         "environment": ENVIRONMENT,
     }
 
 
 def results(records):
     study = Study.model_validate(
-        {"name": "by-hand", "scenes": list(records), "encoders": {"clip": "clip-small"}, "probes": {"sensitivity": []}}
+        {
+            "name": "by-hand",
+            "scenes": list(records),
+            "encoders": {"clip": "clip-small"},
+            "probes": {"sensitivity": []},
+        }
     )
     cells = [
-        {"id": scene, "title": scene, "scene": scene, "variants": ["metrics"], "probe": "sensitivity", "seed": 0,
-         "record": one}
+        {
+            "id": scene,
+            "title": scene,
+            "scene": scene,
+            "variants": ["metrics"],
+            "probe": "sensitivity",
+            "seed": 0,
+            "record": one,
+        }
         for scene, one in records.items()
-    ]  # fmt: skip
+    ]
     return Results(study.model_dump(mode="json"), cells, [])
 
 
@@ -66,7 +91,9 @@ def test_the_right_result_wins_loses_or_cannot_be_told(key, right, flawed, expec
 
 
 def test_a_share_is_the_mean_over_scenes_of_the_mean_over_views_with_ties_as_half_and_undefined_counted():
-    one = record([{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.2, "blurred": 0.1}, {RIGHT: 0.1, "blurred": None}])
+    one = record(
+        [{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.2, "blurred": 0.1}, {RIGHT: 0.1, "blurred": None}]
+    )
     two = record([{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.1, "blurred": 0.1}])
     found = share([("one", one), ("two", two)], MSE, "blurred")
     assert found == interval({"one": [1.0, 0.0, float("nan")], "two": [1.0, 0.5]})
@@ -113,8 +140,10 @@ def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wro
     made = results({"one": record(views), "two": record(views)})
     sections = sensitivity(made, tmp_path)
     assert [s.title for s in sections] == [
-        "Which metric can see what", "Metrics against the strength of an edit", "What a metric costs and what it can see",
-    ]  # fmt: skip
+        "Which metric can see what",
+        "Metrics against the strength of an edit",
+        "What a metric costs and what it can see",
+    ]
     (table,) = sections[0].tables
     shown = dict(zip(table.columns, table.rows[0], strict=True))
     assert shown["metric"] == "truth, PSNR"
@@ -124,7 +153,9 @@ def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wro
     assert "#67001f" in drawing  # the far red end of RdBu: below 0.5
     assert "#053061" in drawing  # and its blue one
     (costs,) = sections[2].tables
-    assert dict(zip(costs.columns, costs.rows[0], strict=True))["ms a picture"] == "200"  # the median of three rounds
+    assert (
+        dict(zip(costs.columns, costs.rows[0], strict=True))["ms a picture"] == "200"
+    )  # the median of three rounds
 
 
 def test_without_timings_two_reports_of_other_seconds_are_the_same_bytes(tmp_path):

@@ -75,7 +75,9 @@ def test_a_camera_stands_on_its_orbit_and_looks_at_the_middle(tmp_path):
     assert [c.name for c in scene.cameras] == ["source", "yaw030"]
     smaller = scene.with_size(64, 32)
     assert (smaller.source.width, smaller.source.height) == (64, 32)
-    assert smaller.source.K[1, 1] * 16 == pytest.approx(scene.source.K[1, 1])  # the vertical field of view stays
+    assert smaller.source.K[1, 1] * 16 == pytest.approx(
+        scene.source.K[1, 1]
+    )  # the vertical field of view stays
     assert scene.camera("yaw030").name == "yaw030"
     with pytest.raises(SceneError, match="no camera 'yaw30'; did you mean 'yaw030'"):
         scene.camera("yaw30")
@@ -83,35 +85,106 @@ def test_a_camera_stands_on_its_orbit_and_looks_at_the_middle(tmp_path):
 
 # (what is changed, into what, line of the message, what the message says)
 MISTAKES = [
-    ("radius: 0.5", "raduis: 0.5", 11, r"objects\[1\].shape.raduis: unknown key 'raduis'; did you mean 'radius'\?"),
-    ("radius: 0.5", "radius: -1", 11, r"objects\[1\].shape.radius: got -1, but input should be greater than 0"),
+    (
+        "radius: 0.5",
+        "raduis: 0.5",
+        11,
+        r"objects\[1\].shape.raduis: unknown key 'raduis'; did you mean 'radius'\?",
+    ),
+    (
+        "radius: 0.5",
+        "radius: -1",
+        11,
+        r"objects\[1\].shape.radius: got -1, but input should be greater than 0",
+    ),
     ("radius: 0.5", "radius: .nan", 11, r"objects\[1\].shape.radius: got nan, but .*finite"),
     ("radius: 0.5", "radius: big", 11, r"objects\[1\].shape.radius: got 'big', but .*valid number"),
     ("      radius: 0.5\n", "", 8, r"objects\[1\].shape.radius: is missing"),
-    ("type: sphere", "type: spere", 9, r"objects\[1\].shape.type: got 'spere'; did you mean 'sphere'\?"),
+    (
+        "type: sphere",
+        "type: spere",
+        9,
+        r"objects\[1\].shape.type: got 'spere'; did you mean 'sphere'\?",
+    ),
     ("type: sphere", "kind: sphere", 8, r"objects\[1\].shape: says no type"),
     ("color: '#c04020'", "color: #c04020", None, "not valid YAML"),
-    ("color: '#c04020'", "color:", 12, r"objects\[1\].texture.color: got nothing; an unquoted # starts a YAML comment"),
-    ("color: '#c04020'", "color: red", 12, r"texture.color: got 'red', expected an sRGB colour in quotes"),
-    ("name: ball", "name: floor", 7, r"objects\[1\].name: 'floor' is also the name of objects\[0\]; rename one"),
+    (
+        "color: '#c04020'",
+        "color:",
+        12,
+        r"objects\[1\].texture.color: got nothing; an unquoted # starts a YAML comment",
+    ),
+    (
+        "color: '#c04020'",
+        "color: red",
+        12,
+        r"texture.color: got 'red', expected an sRGB colour in quotes",
+    ),
+    (
+        "name: ball",
+        "name: floor",
+        7,
+        r"objects\[1\].name: 'floor' is also the name of objects\[0\]; rename one",
+    ),
     ("title: A", "titel: A", 2, "titel: unknown key 'titel'; did you mean 'title'"),
     ("    - {yaw: 30, height: 1}\n", "    []\n", 19, "cameras.targets: got .* at least 1 item"),
-    ("{yaw: 30, height: 1}", "{yaw: 0, height: 1, name: source}", 20,
-     r"cameras.targets\[0\]: the camera name 'source' is also that of cameras.source"),
-    ("{yaw: 30, height: 1}", "{yaw: 30, height: 0.6, radius: 0.2}", 20,
-     r"cameras.targets.0: the camera 'yaw030' at \(0.1732, 0.1, 0.6\) is inside the object 'ball'; change its yaw"),
-    ("{yaw: 30, height: 1}", "{yaw: 30, height: 1, look_at: [2.598076211353316, 1.5, 0]}", 20,
-     r"cameras.targets\[0\]: no such camera: .*parallel"),
-    ("  radius: 3\n", "  radius: 3\n  radius: 4\n", 18, r"the key 'radius' stands here and on line 17; keep one"),
-    ("  radius: 3\n", "  radius: 3\n  size: [0, 512]\n", 18, r"cameras.size: got \[0, 512\], expected at least"),
-    ("  - {type: sun", "  - {type: sky, horizon: '#fff0ff', zenith: '#0000ff'}\n  - {type: sky, horizon: '#ffffff', "
-     "zenith: '#0000ff'}\n  - {type: sun", 15, r"lights\[1\]: a second sky"),
+    (
+        "{yaw: 30, height: 1}",
+        "{yaw: 0, height: 1, name: source}",
+        20,
+        r"cameras.targets\[0\]: the camera name 'source' is also that of cameras.source",
+    ),
+    (
+        "{yaw: 30, height: 1}",
+        "{yaw: 30, height: 0.6, radius: 0.2}",
+        20,
+        (
+            r"cameras.targets.0: the camera 'yaw030' at \(0.1732, 0.1, 0.6\) is inside the object"
+            r" 'ball'; change its yaw"
+        ),
+    ),
+    (
+        "{yaw: 30, height: 1}",
+        "{yaw: 30, height: 1, look_at: [2.598076211353316, 1.5, 0]}",
+        20,
+        r"cameras.targets\[0\]: no such camera: .*parallel",
+    ),
+    (
+        "  radius: 3\n",
+        "  radius: 3\n  radius: 4\n",
+        18,
+        r"the key 'radius' stands here and on line 17; keep one",
+    ),
+    (
+        "  radius: 3\n",
+        "  radius: 3\n  size: [0, 512]\n",
+        18,
+        r"cameras.size: got \[0, 512\], expected at least",
+    ),
+    (
+        "  - {type: sun",
+        (
+            "  - {type: sky, horizon: '#fff0ff', zenith: '#0000ff'}\n  - {type: sky, horizon:"
+            " '#ffffff', zenith: '#0000ff'}\n  - {type: sun"
+        ),
+        15,
+        r"lights\[1\]: a second sky",
+    ),
     ("  radius: 3\n", "\tradius: 3\n", 17, "not valid YAML: .*check indentation and quotes"),
-    ("checker, colors: ['#ffffff', '#202020']", "stripes, direction: [0, 0, 0], colors: ['#ffffff', '#202020']", 6,
-     r"objects\[0\].texture.direction: got \[0, 0, 0\], expected a direction"),
+    (
+        "checker, colors: ['#ffffff', '#202020']",
+        "stripes, direction: [0, 0, 0], colors: ['#ffffff', '#202020']",
+        6,
+        r"objects\[0\].texture.direction: got \[0, 0, 0\], expected a direction",
+    ),
     (SMALL, "- just\n- a list\n", 1, r"the file: got \['just', 'a list'\], but .*dictionary"),
-    ("size: [8, 8]", "size: [8, 8], facing: [0, 0, 0]", 5, r"objects\[0\].shape.facing: got \[0, 0, 0\]"),
-]  # fmt: skip
+    (
+        "size: [8, 8]",
+        "size: [8, 8], facing: [0, 0, 0]",
+        5,
+        r"objects\[0\].shape.facing: got \[0, 0, 0\]",
+    ),
+]
 
 
 @pytest.mark.parametrize(("old", "new", "line", "says"), MISTAKES)
@@ -128,10 +201,14 @@ def test_a_mistake_is_told_with_file_line_value_and_remedy(tmp_path, old, new, l
 
 
 def test_a_scene_that_is_not_there_is_told_with_what_is(tmp_path):
-    with pytest.raises(SceneError, match=r"no scene named 'beer'; did you mean 'bear'\?; known scenes: .*fence"):
+    with pytest.raises(
+        SceneError, match=r"no scene named 'beer'; did you mean 'bear'\?; known scenes: .*fence"
+    ):
         load_scene("beer")
     write(tmp_path, SMALL)
-    with pytest.raises(SceneError, match=r"smal.yaml: no such scene file; did you mean 'small.yaml'\?"):
+    with pytest.raises(
+        SceneError, match=r"smal.yaml: no such scene file; did you mean 'small.yaml'\?"
+    ):
         load_scene(tmp_path / "smal.yaml")
     with pytest.raises(SceneError, match="the file is empty"):
         load_scene(write(tmp_path, "# nothing\n", "empty.yaml"))
@@ -146,7 +223,11 @@ OWN = SMALL.replace(
 def octahedron(extra=""):
     corners = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
     faces = ["1 3 5", "3 2 5", "2 4 5", "4 1 5", "3 1 6", "2 3 6", "4 2 6", "1 4 6"]
-    return "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "".join(f"f {face}\n" for face in faces) + extra
+    return (
+        "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+        + "".join(f"f {face}\n" for face in faces)
+        + extra
+    )
 
 
 def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_content(tmp_path):
@@ -167,7 +248,9 @@ def test_an_own_mesh_is_read_relative_to_the_file_and_its_bytes_are_part_of_the_
 def test_an_own_mesh_with_a_hole_doubled_faces_and_a_degenerate_triangle_works(tmp_path):
     (tmp_path / "scans").mkdir()
     lines = octahedron("f 2 3 5\nf 1 3 5\nf 2 2 5\n").splitlines()
-    (tmp_path / "scans" / "ball.obj").write_text("\n".join(line for line in lines if line != "f 1 4 6") + "\n")
+    (tmp_path / "scans" / "ball.obj").write_text(
+        "\n".join(line for line in lines if line != "f 1 4 6") + "\n"
+    )
     with pytest.warns(MeshNotice, match="ball.obj: dropped 1 of 10 triangles without area"):
         scene = load_scene(write(tmp_path, OWN))
     with pytest.warns(MeshNotice):
@@ -182,8 +265,16 @@ def test_an_own_mesh_with_a_hole_doubled_faces_and_a_degenerate_triangle_works(t
             "scans/bal.obj",
             r"there is no file .*scans/bal.obj; did you mean 'ball.obj'\?; the path counts",
         ),
-        ("ball.obj", "ball.fbx", r"'scans/ball.fbx' is not of a known mesh format; one of .ply, .obj"),
-        ("position: [0, 0, 0.5]", "position: [3, 0, 1.5]", r"the camera 'source' at .* is inside the object 'ball'"),
+        (
+            "ball.obj",
+            "ball.fbx",
+            r"'scans/ball.fbx' is not of a known mesh format; one of .ply, .obj",
+        ),
+        (
+            "position: [0, 0, 0.5]",
+            "position: [3, 0, 1.5]",
+            r"the camera 'source' at .* is inside the object 'ball'",
+        ),
     ],
 )
 def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new, says):
@@ -196,8 +287,14 @@ def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new
 
 def test_a_camera_inside_a_body_or_a_box_is_refused(tmp_path):
     for shape in (
-        "{type: body, parts: [{type: ellipsoid, center: [0, 0, 0], radii: [1, 1, 1]}], position: [3, 0, 1.5]}",
-        "{type: box, center: [3, 0, 1.0], size: [0.1, 0.1, 0.2], repeat: {count: 3, step: [0, 0, 0.25]}}",
+        (
+            "{type: body, parts: [{type: ellipsoid, center: [0, 0, 0], radii: [1, 1, 1]}],"
+            " position: [3, 0, 1.5]}"
+        ),
+        (
+            "{type: box, center: [3, 0, 1.0], size: [0.1, 0.1, 0.2], repeat: {count: 3, step: [0,"
+            " 0, 0.25]}}"
+        ),
     ):
         text = re.sub(r"shape:\n      type: sphere\n.*\n.*\n", f"shape: {shape}\n", SMALL)
         with pytest.raises(SceneError, match=r"the camera 'source' .* is inside the object 'ball'"):
@@ -206,14 +303,22 @@ def test_a_camera_inside_a_body_or_a_box_is_refused(tmp_path):
 
 def test_the_content_hash_tells_scenes_apart_and_nothing_else(tmp_path):
     scene = load_scene(write(tmp_path, SMALL))
-    again = load_scene(write(tmp_path, "# a comment\n" + SMALL.replace("radius: 0.5", "radius: 0.50"), "b.yaml"))
+    again = load_scene(
+        write(tmp_path, "# a comment\n" + SMALL.replace("radius: 0.5", "radius: 0.50"), "b.yaml")
+    )
     assert scene.content_hash == again.content_hash
     bigger = load_scene(write(tmp_path, SMALL.replace("radius: 0.5", "radius: 0.51"), "c.yaml"))
     assert bigger.content_hash != scene.content_hash and bigger.world_hash != scene.world_hash
     another_camera = load_scene(write(tmp_path, SMALL.replace("yaw: 30", "yaw: 31"), "d.yaml"))
-    assert another_camera.content_hash != scene.content_hash and another_camera.world_hash == scene.world_hash
+    assert (
+        another_camera.content_hash != scene.content_hash
+        and another_camera.world_hash == scene.world_hash
+    )
     # Another process agrees: no hash of Python's, whose seed changes, is in it.
-    code = f"from attnwarp_eval.scene.file import load_scene; print(load_scene({str(tmp_path / 'small.yaml')!r}).content_hash)"
+    code = (
+        "from attnwarp_eval.scene.file import load_scene;"
+        f" print(load_scene({str(tmp_path / 'small.yaml')!r}).content_hash)"
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == scene.content_hash
 

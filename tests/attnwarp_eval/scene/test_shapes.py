@@ -35,7 +35,9 @@ def test_a_meshed_ball_is_a_sphere():
     assert np.abs(mesh.normals - outward / 0.5).max() < 1e-5
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     # Divergence theorem: the volume comes out positive only if the faces look outward.
-    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.01)
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(
+        4 / 3 * np.pi * 0.125, rel=0.01
+    )
 
 
 def test_a_blended_body_is_closed_and_carries_its_parts_colours():
@@ -46,8 +48,9 @@ def test_a_blended_body_is_closed_and_carries_its_parts_colours():
     ]
     mesh = mesh_body(parts, 0.1, 48)
     _, count = edges_of(mesh)
-    # Every edge belongs to two triangles, but for the few beside slivers without area that were dropped;
-    # they leave no hole, so that the areas of the triangles, as vectors, still sum to nothing.
+    # Every edge belongs to two triangles, but for the few beside slivers without area that were
+    # dropped; they leave no hole, so that the areas of the triangles, as vectors, still sum to
+    # nothing.
     assert (count == 2).mean() > 0.995
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     area = np.cross(b - a, c - a)
@@ -72,25 +75,37 @@ def test_the_distance_of_a_capsule_is_exact_and_the_smooth_union_lies_below_the_
 
 def test_mirrored_copies_and_positions_are_inside_what_contains_them():
     box = Box(
-        np.array([1.0, 2, 3]), np.array([0.5, 1, 0.25]), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+        np.array([1.0, 2, 3]),
+        np.array([0.5, 1, 0.25]),
+        np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0],
     )
     for shape in (box, box.mesh(), Sphere(box.center, 0.2)):
         assert shape.contains(box.center) and not shape.contains(box.center + np.array([0, 0, 2.0]))
-    assert box.contains(box.center + 0.99 * box.axes[:, 1]) and not box.contains(box.center + 1.01 * box.axes[:, 1])
+    assert box.contains(box.center + 0.99 * box.axes[:, 1]) and not box.contains(
+        box.center + 1.01 * box.axes[:, 1]
+    )
     low, high = box.bounds()
-    assert np.allclose(box.mesh().vertices.min(0), low) and np.allclose(box.mesh().vertices.max(0), high)
+    assert np.allclose(box.mesh().vertices.min(0), low) and np.allclose(
+        box.mesh().vertices.max(0), high
+    )
 
 
 def test_a_mesh_with_a_hole_and_doubled_faces_still_knows_its_inside():
     mesh = mesh_body(BALL, 0.0, 24)
-    holed = Mesh(mesh.vertices, np.concatenate([mesh.faces[: -len(mesh.faces) // 8], mesh.faces[:40]]))
-    assert holed.contains(np.array([0.3, -0.2, 1.0])) and not holed.contains(np.array([0.3, -0.2, 1.6]))
+    holed = Mesh(
+        mesh.vertices, np.concatenate([mesh.faces[: -len(mesh.faces) // 8], mesh.faces[:40]])
+    )
+    assert holed.contains(np.array([0.3, -0.2, 1.0])) and not holed.contains(
+        np.array([0.3, -0.2, 1.6])
+    )
 
 
 def test_degenerate_triangles_are_dropped_with_a_notice_that_counts_them():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0.0]])
     faces = np.array([[0, 1, 2], [0, 1, 3], [1, 1, 2]])
-    with pytest.warns(MeshNotice, match=r"scan: dropped 2 of 3 triangles without area \(first: face 1\)"):
+    with pytest.warns(
+        MeshNotice, match=r"scan: dropped 2 of 3 triangles without area \(first: face 1\)"
+    ):
         assert Mesh(vertices, faces).cleaned("scan").faces.tolist() == [[0, 1, 2]]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -104,11 +119,15 @@ def test_degenerate_triangles_are_dropped_with_a_notice_that_counts_them():
 
 
 def glb(vertices, faces, **node):
-    """The bytes of a minimal glTF 2.0 binary file; the one that Open3D writes lacks its BIN chunk."""
+    """The bytes of a minimal glTF 2.0 binary file; the one that Open3D writes lacks its BIN
+    chunk."""
     points, index = vertices.astype("<f4"), faces.astype("<u2")
     blob = points.tobytes() + index.tobytes()
     document = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, **node}],
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **node}],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
         "buffers": [{"byteLength": len(blob)}],
         "bufferViews": [
@@ -116,28 +135,46 @@ def glb(vertices, faces, **node):
             {"buffer": 0, "byteOffset": points.nbytes, "byteLength": index.nbytes},
         ],
         "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3",
-             "min": points.min(0).tolist(), "max": points.max(0).tolist()},
+            {
+                "bufferView": 0,
+                "componentType": 5126,
+                "count": len(points),
+                "type": "VEC3",
+                "min": points.min(0).tolist(),
+                "max": points.max(0).tolist(),
+            },
             {"bufferView": 1, "componentType": 5123, "count": index.size, "type": "SCALAR"},
         ],
-    }  # fmt: skip
+    }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     blob += b"\0" * (-len(blob) % 4)
     head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob))
-    return head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    return (
+        head
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(blob), b"BIN\0")
+        + blob
+    )
 
 
 def write_mesh(path, vertices, faces):
     if path.suffix == ".glb":
         path.write_bytes(glb(vertices, faces))
     elif path.suffix == ".obj":
-        lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+        lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [
+            f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces
+        ]
         path.write_text("\n".join(lines) + "\n")
     else:
         head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
         head += [f"property double {axis}" for axis in "xyz"]
-        head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+        head += [
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header",
+        ]
         lines = [f"{x} {y} {z}" for x, y, z in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
         path.write_text("\n".join(head + lines) + "\n")
 
@@ -148,13 +185,16 @@ def test_a_mesh_file_comes_back_as_it_was_written(tmp_path, suffix):
     path = tmp_path / f"cube{suffix}"
     write_mesh(path, cube.vertices, cube.faces)
     back = read_mesh(path)
-    # Readers may split or merge vertices, so corners are compared triangle by triangle; glb stores float32.
+    # Readers may split or merge vertices, so corners are compared triangle by triangle; glb stores
+    # float32.
     assert np.allclose(back.vertices[back.faces], cube.vertices[cube.faces], rtol=0, atol=1e-6)
 
 
 def test_the_placement_of_a_node_in_a_glb_file_is_applied(tmp_path):
     cube = Box(np.zeros(3), np.ones(3)).mesh()
-    (tmp_path / "cube.glb").write_bytes(glb(cube.vertices, cube.faces, translation=[10, 0, 0], scale=[2, 2, 2]))
+    (tmp_path / "cube.glb").write_bytes(
+        glb(cube.vertices, cube.faces, translation=[10, 0, 0], scale=[2, 2, 2])
+    )
     assert np.allclose(read_mesh(tmp_path / "cube.glb").bounds(), [[8, -2, -2], [12, 2, 2]])
 
 
@@ -172,7 +212,9 @@ def test_a_body_is_meshed_once_and_read_back_bit_for_bit(monkeypatch, tmp_path):
     assert len(list((tmp_path / "meshes").iterdir())) == 1
     monkeypatch.setattr("attnwarp_eval.scene.shapes._march", lambda *_: pytest.fail("meshed again"))
     second = mesh_body(BALL, 0.0, 16)
-    assert np.array_equal(first.vertices, second.vertices) and np.array_equal(first.faces, second.faces)
+    assert np.array_equal(first.vertices, second.vertices) and np.array_equal(
+        first.faces, second.faces
+    )
 
 
 def test_a_damaged_or_unwritable_cache_costs_time_and_nothing_else(monkeypatch, tmp_path):
@@ -197,7 +239,9 @@ def write_again_and_again(folder, value):
 def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=write_again_and_again, args=(tmp_path, float(k))) for k in (1, 2)]
+    writers = [
+        context.Process(target=write_again_and_again, args=(tmp_path, float(k))) for k in (1, 2)
+    ]
     for writer in writers:
         writer.start()
     seen = 0

@@ -1,4 +1,5 @@
-"""The scenes that come with the package: that each one holds what it claims, and stays what it was."""
+"""The scenes that come with the package: that each one holds what it claims, and stays what it
+was."""
 
 import functools
 
@@ -11,9 +12,23 @@ from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, VISIBLE, Geometry, two_view
 
 SIX = ["bear", "dinosaur", "face", "garden", "person", "stump"]
-HARD = ["caustic", "coplanar", "far", "fog", "glass", "grazing", "lens", "mirror", "opposed", "slats", "stack", "tiny"]
+HARD = [
+    "caustic",
+    "coplanar",
+    "far",
+    "fog",
+    "glass",
+    "grazing",
+    "lens",
+    "mirror",
+    "opposed",
+    "slats",
+    "stack",
+    "tiny",
+]
 
-# Reference results name these scenes by their content, so a change of the format must leave it alone.
+# Reference results name these scenes by their content, so a change of the format must leave it
+# alone.
 CONTENT = {
     "bear": "2a212860d0ae6abab2c330fc3c6e347c977316867887cb80ca1416d90b3424a8",
     "fence": "27d870bed7391a4fedef54712586295bd5c0d4ef2ae7bd1d221e71f336cc7ca2",
@@ -63,7 +78,11 @@ def test_every_scene_loads_and_its_truth_is_finite_in_every_view(name):
     assert len(shown) >= 0.7 * len(scene.spec.objects)
     pair = two_view(geometry, scene.source, scene.targets[0])
     inside = pair.label != 0
-    assert inside.mean() > 0.2 and np.isfinite(pair.xy[inside]).all() and (pair.z_source[inside] > 0).all()
+    assert (
+        inside.mean() > 0.2
+        and np.isfinite(pair.xy[inside]).all()
+        and (pair.z_source[inside] > 0).all()
+    )
 
 
 @pytest.mark.parametrize("name", SIX)
@@ -78,7 +97,12 @@ def test_the_six_hide_parts_of_themselves_and_look_back_at_the_source(name):
 
 @pytest.mark.parametrize("name", [name for name in HARD if name not in ("far", "opposed", "tiny")])
 def test_a_hard_scene_names_what_it_is_about(name):
-    effects = {"glass": "refraction", "mirror": "specular", "fog": "medium", "lens": "depth_of_field"}
+    effects = {
+        "glass": "refraction",
+        "mirror": "specular",
+        "fog": "medium",
+        "lens": "depth_of_field",
+    }
     effects["caustic"] = "caustics"
     assert load_scene(name).spec.effects.pin == ((effects[name],) if name in effects else ())
 
@@ -92,7 +116,11 @@ def test_grazing_reaches_the_horizon_and_stays_on_its_plane():
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     hits = geometry.trace_rays(eye.position, rays)
     names = np.array([*scene.object_names, "nothing"])[hits.object_id]
-    ground = np.char.startswith(names, "near") | np.char.startswith(names, "middle") | np.char.startswith(names, "far")
+    ground = (
+        np.char.startswith(names, "near")
+        | np.char.startswith(names, "middle")
+        | np.char.startswith(names, "far")
+    )
     assert ground.sum() > 300 and "far_west" in names
     expected = eye.position[2] / -rays[:, 2]
     cosine = -rays[:, 2]
@@ -100,7 +128,9 @@ def test_grazing_reaches_the_horizon_and_stays_on_its_plane():
     assert (np.abs(hits.t / expected - 1) < 1e-6 / cosine)[ground].all()
     assert np.abs(hits.t / expected - 1)[ground].max() < 1e-6
     # A telescope onto the horizon: what is met under a cosine of 1e-3 is called ambiguous.
-    look = Camera.look_at(eye.position, (eye.position[0] - 100, 15, 0.03), width=16, height=16, fov_y=0.1)
+    look = Camera.look_at(
+        eye.position, (eye.position[0] - 100, 15, 0.03), width=16, height=16, fov_y=0.1
+    )
     pair = two_view(geometry, scene.source, look)
     flat = pair.hits.valid & (pair.hits.cosine < 1e-3)
     assert flat.sum() > 50 and (pair.label[flat & pair.in_source_image] == AMBIGUOUS).all()
@@ -109,8 +139,14 @@ def test_grazing_reaches_the_horizon_and_stays_on_its_plane():
 def test_slats_are_finer_than_a_pixel_and_cover_half_of_their_field():
     scene, geometry = world("slats")
     full = load_scene("slats")
-    pixel = full.spec.cameras.radius / full.source.K[1, 1]  # metres a pixel covers there at full size
-    widths = {n: int(n.removeprefix("slats_").removesuffix("mm")) / 1000 for n in full.object_names if "mm" in n}
+    pixel = (
+        full.spec.cameras.radius / full.source.K[1, 1]
+    )  # metres a pixel covers there at full size
+    widths = {
+        n: int(n.removeprefix("slats_").removesuffix("mm")) / 1000
+        for n in full.object_names
+        if "mm" in n
+    }
     assert sorted(widths.values()) == [0.002, 0.004, 0.008, 0.016, 0.032]
     assert widths["slats_2mm"] < 0.35 * pixel and widths["slats_32mm"] > 4 * pixel
     dice = np.random.default_rng(0)
@@ -119,9 +155,13 @@ def test_slats_are_finer_than_a_pixel_and_cover_half_of_their_field():
         low = box.center[1] - width / 2
         y = low + dice.random(4000) * 2 * width * box.repeat.count
         z = 0.935 + 0.5 * (2 * dice.random(4000) - 1)
-        hits = geometry.trace_rays(np.stack([0 * y + 1, y, z], -1), np.tile([-1.0, 0, 0], (4000, 1)))
+        hits = geometry.trace_rays(
+            np.stack([0 * y + 1, y, z], -1), np.tile([-1.0, 0, 0], (4000, 1))
+        )
         covered = (hits.object_id == scene.object_names.index(name)).mean()
-        assert abs(covered - 0.5) < 3 * 0.5 / np.sqrt(4000)  # hard case 25: three sigma of a share of one half
+        assert abs(covered - 0.5) < 3 * 0.5 / np.sqrt(
+            4000
+        )  # hard case 25: three sigma of a share of one half
 
 
 GAPS = [0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1]
@@ -161,7 +201,8 @@ def test_what_the_cards_hide_is_hidden_by_float64_brute_force_down_to_1_mm(targe
 
 
 def test_coplanar_surfaces_have_one_depth_and_are_reported_as_ties():
-    # Hard case 3: depth alone is defined; the lowest object id does not depend on the order of tracing.
+    # Hard case 3: depth alone is defined; the lowest object id does not depend on the order of
+    # tracing.
     scene, geometry = world("coplanar")
     backward = Geometry(list(reversed(scene.shapes())))
     floor, decal = scene.object_names.index("floor"), scene.object_names.index("decal")
@@ -175,7 +216,9 @@ def test_coplanar_surfaces_have_one_depth_and_are_reported_as_ties():
         x, y = here.point[..., 0], here.point[..., 1]
         inside = (np.abs(x - 1.0) < 0.6) & (np.abs(y - 0.1) < 0.8)
         assert np.array_equal(tied[on_floor], inside[on_floor])  # the decal's closed form
-        assert (lowest[on_floor] == floor).all() and (here.object_id[here.object_id != lowest] >= 0).all()
+        assert (lowest[on_floor] == floor).all() and (
+            here.object_id[here.object_id != lowest] >= 0
+        ).all()
         assert np.array_equal(lowest[~tied], here.object_id[~tied])
 
 
@@ -191,7 +234,8 @@ def test_the_two_sides_of_the_opposed_wall_share_nothing():
 
 
 @pytest.mark.parametrize(
-    ("name", "scale", "offset"), [("far", 1.0, np.array([-1e6, -2e6, -500.0])), ("tiny", 1000.0, np.zeros(3))]
+    ("name", "scale", "offset"),
+    [("far", 1.0, np.array([-1e6, -2e6, -500.0])), ("tiny", 1000.0, np.zeros(3))],
 )
 def test_far_and_tiny_scenes_give_the_labels_of_the_same_scene_at_home(name, scale, offset):
     # Hard cases 9 and 10. Coordinates of 2e6 hold 2e-10, which is 1e-8 px here.

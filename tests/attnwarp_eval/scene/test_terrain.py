@@ -60,7 +60,9 @@ def test_what_is_carved_is_gone():
     shell = body(ball, hole, resolution=64).mesh()
     # Inscribed triangles lose 1 - O(h^2): 0.2 % at this resolution.
     assert volume(shell) == pytest.approx(4 / 3 * np.pi * (1 - 0.125), rel=3e-3)
-    assert body(ball, hole).contains(np.array([0.75, 0, 0])) and not body(ball, hole).contains(np.zeros(3))
+    assert body(ball, hole).contains(np.array([0.75, 0, 0])) and not body(ball, hole).contains(
+        np.zeros(3)
+    )
     with pytest.raises(ValueError, match="first part carves"):
         body(hole)
 
@@ -70,7 +72,9 @@ def test_a_cut_shows_what_was_cut_unless_it_has_a_colour():
     cut = {"type": "block", "center": [0, 0, 1], "size": [3, 3, 1.4], "carve": True}
     for color, expected in (("#ffffff", [1, 0, 0]), ("#0000ff", [0, 0, 1])):
         mesh = body(ball, cut | {"color": color}, resolution=48).mesh()
-        flat = (np.abs(mesh.vertices[:, 2] - 0.3) < 1e-9) & (np.linalg.norm(mesh.vertices[:, :2], axis=-1) < 0.8)
+        flat = (np.abs(mesh.vertices[:, 2] - 0.3) < 1e-9) & (
+            np.linalg.norm(mesh.vertices[:, :2], axis=-1) < 0.8
+        )
         assert flat.sum() > 100 and np.allclose(mesh.tint[flat], expected)
 
 
@@ -89,10 +93,20 @@ def test_a_ring_repeats_its_part_about_the_upright():
 
 def test_a_tube_is_its_rods_and_a_mirrored_turned_part_mirrors_its_turn():
     tube = {"type": "tube", "points": [[0, 0, 0], [1, 0, 0], [1, 0, 1]], "radii": [0.3, 0.2, 0.1]}
-    assert body(tube).solid() == [Capsule((0, 0, 0), (1, 0, 0), (0.3, 0.2)), Capsule((1, 0, 0), (1, 0, 1), (0.2, 0.1))]
+    assert body(tube).solid() == [
+        Capsule((0, 0, 0), (1, 0, 0), (0.3, 0.2)),
+        Capsule((1, 0, 0), (1, 0, 1), (0.2, 0.1)),
+    ]
     with pytest.raises(ValueError, match="got 3 radii for 2 points"):
         body(tube | {"points": [[0, 0, 0], [1, 0, 0]]})
-    wing = {"type": "ellipsoid", "center": [0, 1, 0], "radii": [0.6, 0.2, 0.1], "yaw": 30, "roll": 20, "pitch": 10}
+    wing = {
+        "type": "ellipsoid",
+        "center": [0, 1, 0],
+        "radii": [0.6, 0.2, 0.1],
+        "yaw": 30,
+        "roll": 20,
+        "pitch": 10,
+    }
     two = body(wing | {"mirror": True}).solid()
     points = np.random.default_rng(1).normal(size=(100, 3))
     mirrored = body_distance(two[1:], 0, points * [1, -1, 1])
@@ -115,7 +129,15 @@ def test_sampling_near_the_surface_alone_gives_the_mesh_of_sampling_everywhere(m
         assert np.array_equal(sparse[name], values), name
 
 
-GROUND = TerrainSpec(type="terrain", center=(1, -2, 0.5), size=(8, 6), height=0.4, feature=1.5, level=(0.5, 2), seed=3)
+GROUND = TerrainSpec(
+    type="terrain",
+    center=(1, -2, 0.5),
+    size=(8, 6),
+    height=0.4,
+    feature=1.5,
+    level=(0.5, 2),
+    seed=3,
+)
 
 
 def test_a_terrain_is_level_in_the_middle_and_within_its_height_everywhere():
@@ -128,7 +150,9 @@ def test_a_terrain_is_level_in_the_middle_and_within_its_height_everywhere():
     assert np.array_equal(mesh.vertices[:, 2], GROUND.height_at(mesh.vertices[:, :2]))
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     flat = np.cross(b - a, c - a)
-    assert (flat[:, 2] > 0).all() and flat[:, 2].sum() / 2 == pytest.approx(48)  # it faces up and covers its size
+    assert (flat[:, 2] > 0).all() and flat[:, 2].sum() / 2 == pytest.approx(
+        48
+    )  # it faces up and covers its size
     flat /= np.linalg.norm(flat, axis=-1, keepdims=True)
     assert np.percentile(np.einsum("ij,ij->i", flat, mesh.normals[mesh.faces[:, 0]]), 1) > 0.99
     assert GROUND.below(np.array([1, -2, 0.49])) and not GROUND.below(np.array([1, -2, 0.51]))
@@ -138,17 +162,27 @@ def test_a_terrain_is_level_in_the_middle_and_within_its_height_everywhere():
 @pytest.mark.parametrize("kind", ["stones", "grass", "flowers", "leaves"])
 def test_strewn_things_lie_in_their_ring_on_the_ground_and_where_they_lay_before(kind):
     spec = ScatterSpec(
-        type="scatter", kind=kind, count=300, size=(0.05, 0.1), radius=(0.5, 2.0), center=(1, -2, 0),
-        avoid=((2.0, -2, 0.5),), seed=9,
-    )  # fmt: skip
+        type="scatter",
+        kind=kind,
+        count=300,
+        size=(0.05, 0.1),
+        radius=(0.5, 2.0),
+        center=(1, -2, 0),
+        avoid=((2.0, -2, 0.5),),
+        seed=9,
+    )
     places = spec.places()
     away = np.linalg.norm(places - [1, -2], axis=-1)
     assert away.min() >= 0.5 and away.max() <= 2.0
     assert np.linalg.norm(places - [2, -2], axis=-1).min() > 0.5 and 200 < len(places) < 300
     mesh = spec.mesh(GROUND.height_at)
-    assert np.isfinite(mesh.vertices).all() and mesh.cleaned(kind) is mesh  # no triangle without area
+    assert (
+        np.isfinite(mesh.vertices).all() and mesh.cleaned(kind) is mesh
+    )  # no triangle without area
     ground = GROUND.height_at(mesh.vertices[:, :2])
-    assert (mesh.vertices[:, 2] - ground).max() < 0.3 and (mesh.vertices[:, 2] - ground).min() > -0.15
+    assert (mesh.vertices[:, 2] - ground).max() < 0.3 and (
+        mesh.vertices[:, 2] - ground
+    ).min() > -0.15
     assert np.array_equal(mesh.vertices, spec.mesh(GROUND.height_at).vertices)
     other = spec.model_copy(update={"seed": 10})
     assert not np.array_equal(other.places()[:10], places[:10])
@@ -173,11 +207,23 @@ cameras: {look_at: [0, 0, 0], radius: 3, source: {yaw: 0, height: 1}, targets: [
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("'on': floor", "'on': flor", r"small.yaml:8: objects\[1\].shape.on: got 'flor'; did you mean 'floor'"),
-        ("radius: [0, 2]", "radius: [2, 1]", r"got radius \[2.0, 1.0\], expected \[smallest, largest\]"),
+        (
+            "'on': floor",
+            "'on': flor",
+            r"small.yaml:8: objects\[1\].shape.on: got 'flor'; did you mean 'floor'",
+        ),
+        (
+            "radius: [0, 2]",
+            "radius: [2, 1]",
+            r"got radius \[2.0, 1.0\], expected \[smallest, largest\]",
+        ),
         ("radius: [0, 2]", "radius: [0, 2], avoid: [[0, 0, 3]]", "leaves no room for any of the 5"),
         ("feature: 1,", "feature: 1, level: [2, 1],", r"got level \[2.0, 1.0\], expected"),
-        ("source: {yaw: 0, height: 1}", "source: {yaw: 0, height: -1}", "is inside the object 'floor'"),
+        (
+            "source: {yaw: 0, height: 1}",
+            "source: {yaw: 0, height: -1}",
+            "is inside the object 'floor'",
+        ),
     ],
 )
 def test_a_mistake_in_ground_or_clutter_is_told_with_its_remedy(tmp_path, old, new, says):

@@ -3,12 +3,22 @@ import pytest
 from skimage import color as skimage_color
 
 from attnwarp_eval.colors import to_linear, to_srgb
-from attnwarp_eval.scene.textures import Bricks, Checker, Noise, Plain, Stripes, albedo, fractal_noise, linear_rgb
+from attnwarp_eval.scene.textures import (
+    Bricks,
+    Checker,
+    Noise,
+    Plain,
+    Stripes,
+    albedo,
+    fractal_noise,
+    linear_rgb,
+)
 
 
 def test_the_srgb_curve_is_the_one_of_the_standard():
     values = np.linspace(0, 1, 1001)
-    # skimage's rgb2xyz linearises with the curve of IEC 61966-2-1; grey of linear value v has Y = v.
+    # skimage's rgb2xyz linearises with the curve of IEC 61966-2-1; grey of linear value v has Y =
+    # v.
     grey = np.repeat(values[:, None], 3, axis=1)
     assert np.abs(skimage_color.rgb2xyz(grey)[:, 1] - to_linear(values)).max() < 1e-6
     assert np.abs(to_srgb(to_linear(values)) - values).max() < 1e-7
@@ -49,19 +59,28 @@ def test_an_albedo_is_a_function_of_the_point_alone_and_physical(texture):
 def test_noise_is_smooth_spread_about_a_half_and_the_same_everywhere():
     points = np.random.default_rng(3).normal(size=(50_000, 3)) * 30
     value = fractal_noise(points, 4, 3)
-    assert value.min() >= 0 and value.max() <= 1 and abs(value.mean() - 0.5) < 0.01 and value.std() > 0.1
+    assert (
+        value.min() >= 0
+        and value.max() <= 1
+        and abs(value.mean() - 0.5) < 0.01
+        and value.std() > 0.1
+    )
     nudged = fractal_noise(points + 1e-6, 4, 3)
     # Slope of an octave at most 15/8 per cell, doubled in frequency and halved in weight each time.
     assert np.abs(nudged - value).max() < 3 * 4 * 15 / 8 * 1e-6
     # A pinned value: the textures are part of a scene's content, so another machine must agree.
-    assert fractal_noise(np.array([[0.25, -3.5, 7.125]]), 3, 7)[0] == pytest.approx(PINNED, abs=1e-15)
+    assert fractal_noise(np.array([[0.25, -3.5, 7.125]]), 3, 7)[0] == pytest.approx(
+        PINNED, abs=1e-15
+    )
 
 
 PINNED = 0.607609580499665
 
 
 def test_colours_are_srgb_in_quotes():
-    assert np.allclose(linear_rgb("#ffffff"), 1) and np.allclose(linear_rgb("#808080"), 0.21586, atol=1e-5)
+    assert np.allclose(linear_rgb("#ffffff"), 1) and np.allclose(
+        linear_rgb("#808080"), 0.21586, atol=1e-5
+    )
     with pytest.raises(ValueError, match="unquoted # starts a YAML comment"):
         Plain(color=None)
     with pytest.raises(ValueError, match="expected an sRGB colour in quotes such as"):

@@ -52,7 +52,9 @@ def test_the_orbit_goes_all_around_and_looks_at_the_scenes_centre(spheres):
 def test_views_held_out_are_spread_over_yaws_and_heights(spheres):
     out = [c for c, o in zip(fitted.orbit(spheres, 64), fitted.held_out(64), strict=True) if o]
     assert [c.name for c in out] == fitted.held_out_names(64)
-    yaws = np.sort([np.degrees(np.arctan2(*(c.position - spheres.center)[1::-1])) % 360 for c in out])
+    yaws = np.sort(
+        [np.degrees(np.arctan2(*(c.position - spheres.center)[1::-1])) % 360 for c in out]
+    )
     np.testing.assert_allclose(np.diff(yaws), 45, atol=1e-6)
     assert len({round(c.position[2], 6) for c in out}) == fitted.RINGS
 
@@ -63,7 +65,8 @@ def test_first_points_lie_on_surfaces_and_the_sky_around_them(spheres):
     distance = np.linalg.norm(cloud.points - spheres.center, axis=1)
     sky = distance > 0.99 * fitted.SKY_DISTANCE * spheres.spec.cameras.radius
     assert sky.sum() == 40
-    # A point of a surface is where a ray from inside the room that passes through it meets something.
+    # A point of a surface is where a ray from inside the room that passes through it meets
+    # something.
     eye = np.array(spheres.cameras[0].position)
     way = cloud.points[~sky] - eye
     hits = geometry.trace_rays(eye, way)
@@ -101,9 +104,17 @@ def test_errors_of_a_picture_are_those_of_scikit_image():
     truth = random.integers(0, 256, (20, 30, 3), dtype=np.uint8)
     image = np.clip(truth / 255 + random.normal(0, 0.1, truth.shape), 0, 1)
     found = fitted.picture_error(image, truth)
-    assert found["fit.psnr"] == pytest.approx(peak_signal_noise_ratio(truth / 255, image, data_range=1), abs=1e-9)
+    assert found["fit.psnr"] == pytest.approx(
+        peak_signal_noise_ratio(truth / 255, image, data_range=1), abs=1e-9
+    )
     expected = structural_similarity(
-        truth / 255, image, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, channel_axis=-1, data_range=1
+        truth / 255,
+        image,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        channel_axis=-1,
+        data_range=1,
     )
     assert found["fit.ssim"] == pytest.approx(expected, abs=1e-9)
 
@@ -130,14 +141,20 @@ def test_variants_that_read_a_fit_in_other_ways_share_it(finished):
     assert records["flat"]["curve"] == records["flat, expected"]["curve"]
     assert records["flat"]["curve"] != records["solid"]["curve"]
     flat, expected = (records[n]["views"][0]["metrics"] for n in ("flat", "flat, expected"))
-    assert flat["fit.psnr"] == expected["fit.psnr"] and flat["depth.abs_rel"] != expected["depth.abs_rel"]
+    assert (
+        flat["fit.psnr"] == expected["fit.psnr"]
+        and flat["depth.abs_rel"] != expected["depth.abs_rel"]
+    )
 
 
 def test_a_record_has_the_held_out_views_and_the_curve(finished):
     planned, store = finished
     record = store.read(planned.cells[1].id)
     assert [view["view"] for view in record["views"]] == ["orbit_000_of_16", "orbit_008_of_16"]
-    assert [view["yaw"] for view in record["views"]] == [pytest.approx(0, abs=1e-5), pytest.approx(180, abs=1e-5)]
+    assert [view["yaw"] for view in record["views"]] == [
+        pytest.approx(0, abs=1e-5),
+        pytest.approx(180, abs=1e-5),
+    ]
     assert [point["iteration"] for point in record["curve"]] == [0, 10, 20]
     last = record["curve"][-1]
     assert last["measures"]["depth.abs_rel"] == pytest.approx(

@@ -83,20 +83,33 @@ def test_nothing_is_put_where_two_things_touch_or_one_is_inside_the_other():
 
 def test_quaternions_turn_z_into_the_normal_straight_down_too():
     random = np.random.default_rng(0).normal(size=(1000, 3))
-    hard = [[0, 0, 1], [0, 0, -1], [1e-9, 0, -1], [0, -1e-12, -1], [1, 0, 0], [0, 1, 0], [1, 0, -1e-17]]
+    hard = [
+        [0, 0, 1],
+        [0, 0, -1],
+        [1e-9, 0, -1],
+        [0, -1e-12, -1],
+        [1, 0, 0],
+        [0, 1, 0],
+        [1, 0, -1e-17],
+    ]
     n = np.concatenate([random, np.array(hard, dtype=float)])
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     w, x, y, z = quaternions_from_normals(n).T
     third = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     assert np.abs(third - n).max() < 1e-15 * 4
     t, b = frames(n)
-    assert np.abs(np.cross(t, b) - n).max() < 1e-14 and np.abs(np.einsum("ij,ij->i", t, n)).max() < 1e-14
+    assert (
+        np.abs(np.cross(t, b) - n).max() < 1e-14
+        and np.abs(np.einsum("ij,ij->i", t, n)).max() < 1e-14
+    )
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 def test_splats_are_flat_on_the_surface_and_sized_by_the_spacing(scene, geometry, kind):
     g = surface_splats(scene, kind, 3000, geometry=geometry, size=0.7, thickness=0.2)
-    s = sample_surface(geometry, 3000, center=scene.center, focus=scene.spec.cameras.radius / 3, seed=0)
+    s = sample_surface(
+        geometry, 3000, center=scene.center, focus=scene.spec.cameras.radius / 3, seed=0
+    )
     assert g.kind == kind and len(g) == 3000 and g.means.dtype == torch.float32
     assert np.array_equal(g.origin, scene.center)
     assert np.abs(g.world_means() - s.point).max() < 1e-6
@@ -108,18 +121,25 @@ def test_splats_are_flat_on_the_surface_and_sized_by_the_spacing(scene, geometry
 
 def test_noise_has_the_asked_size_and_leaves_sampling_and_colours_alone(scene, geometry):
     clean = surface_splats(scene, "2d", 4000, geometry=geometry)
-    noisy = surface_splats(scene, "2d", 4000, geometry=geometry, position_noise=0.5, normal_noise=10.0)
+    noisy = surface_splats(
+        scene, "2d", 4000, geometry=geometry, position_noise=0.5, normal_noise=10.0
+    )
     spacing = clean.scales[:, :1].numpy() / 0.6
     moved = (noisy.means - clean.means).numpy() / spacing
     assert np.abs(moved.std(0) - 0.5).max() < 0.03 and np.abs(moved.mean(0)).max() < 0.03
-    angle = np.degrees(np.arccos(np.clip((noisy.normals() * clean.normals()).sum(-1).numpy(), -1, 1)))
+    angle = np.degrees(
+        np.arccos(np.clip((noisy.normals() * clean.normals()).sum(-1).numpy(), -1, 1))
+    )
     # Two tangents with 10 degrees each: a Rayleigh distribution, whose median is 10 sqrt(2 ln 2).
     assert np.median(angle) == pytest.approx(11.8, abs=0.6)
     assert torch.equal(clean.sh, noisy.sh) and torch.equal(clean.scales, noisy.scales)
 
 
 def test_the_same_seed_gives_the_same_splats_and_another_seed_others(scene, geometry):
-    a, b = (surface_splats(scene, "2d", 500, geometry=geometry, position_noise=0.1, seed=3) for _ in range(2))
+    a, b = (
+        surface_splats(scene, "2d", 500, geometry=geometry, position_noise=0.1, seed=3)
+        for _ in range(2)
+    )
     c = surface_splats(scene, "2d", 500, geometry=geometry, position_noise=0.1, seed=4)
     for name in ("means", "quats", "scales", "sh"):
         assert torch.equal(getattr(a, name), getattr(b, name))
@@ -133,10 +153,14 @@ def test_colours_are_those_of_rendered_views_that_see_the_splats(name):
     g = surface_splats(scene, "2d", 6000, geometry=geometry)
     camera = scene.source
     image = to_srgb(appearance(scene, camera, spp=36))
-    s = sample_surface(geometry, 6000, center=scene.center, focus=scene.spec.cameras.radius / 3, seed=0)
+    s = sample_surface(
+        geometry, 6000, center=scene.center, focus=scene.spec.cameras.radius / 3, seed=0
+    )
     xy, z = camera.project(s.point)
     inside = (z > 0) & (xy > 1).all(1) & (xy < 127).all(1)
-    inside[inside] = geometry.visible_from(s.point[inside], s.normal[inside], s.primitive_id[inside], camera)
+    inside[inside] = geometry.visible_from(
+        s.point[inside], s.normal[inside], s.primitive_id[inside], camera
+    )
     # Beside an outline a pixel shows two surfaces.
     column, row = np.floor(xy[inside]).astype(int).T
     inside[inside] = ~edge_band(geometry, camera)[row, column]
@@ -144,7 +168,8 @@ def test_colours_are_those_of_rendered_views_that_see_the_splats(name):
     seen = image[row, column]
     own = (g.sh[:, 0].numpy() * 0.28209479177387814 + 0.5)[inside]
     assert inside.sum() > 400
-    # A pixel averages over its area and has noise, a splat is a point: most agree closely, the mean very closely.
+    # A pixel averages over its area and has noise, a splat is a point: most agree closely, the mean
+    # very closely.
     assert np.abs((seen - own).mean(0)).max() < 0.01
     assert np.percentile(np.abs(seen - own).max(1), 60) < 0.08
 

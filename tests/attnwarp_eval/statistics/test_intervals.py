@@ -1,4 +1,5 @@
-"""Oracles: Student's t in closed form, simulation with a known truth, brute force over all subsets."""
+"""Oracles: Student's t in closed form, simulation with a known truth, brute force over all
+subsets."""
 
 import itertools
 
@@ -47,11 +48,13 @@ def test_intervals_cover_the_true_mean_at_their_stated_rate(scenes, between, wit
 def test_the_detectable_difference_is_found_at_its_stated_power():
     rng = np.random.default_rng(11)
     scenes, trials, sigma = 6, 2000, 1.0
-    # The power of the two-sided t test at the difference that its true standard error makes detectable.
+    # The power of the two-sided t test at the difference that its true standard error makes
+    # detectable.
     factor = stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1)
     truth = factor * sigma / np.sqrt(scenes)
     found = sum(
-        interval({i: [v] for i, v in enumerate(rng.normal(truth, sigma, scenes))}).p < 0.05 for _ in range(trials)
+        interval({i: [v] for i, v in enumerate(rng.normal(truth, sigma, scenes))}).p < 0.05
+        for _ in range(trials)
     )
     assert found / trials == pytest.approx(0.8, abs=0.06)
 
@@ -88,7 +91,9 @@ def test_a_paired_difference_cancels_what_the_views_share():
 
 
 def test_a_view_that_only_one_side_has_counts_as_undefined():
-    difference = paired({"s": {"v": 1.0, "w": 2.0}, "t": {"v": 0.0}}, {"s": {"v": 2.0}, "t": {"v": 1.0}})
+    difference = paired(
+        {"s": {"v": 1.0, "w": 2.0}, "t": {"v": 0.0}}, {"s": {"v": 2.0}, "t": {"v": 1.0}}
+    )
     assert difference.mean == pytest.approx(1.0)
     assert difference.undefined == 1
 

@@ -1,4 +1,5 @@
-"""The run as a user meets it: the command line in processes of its own, on a small study of real cells.
+"""The run as a user meets it: the command line in processes of its own, on a small study of real
+cells.
 
 Oracles: the file system (which cells were there before), byte equality of reports, exit codes.
 """
@@ -29,7 +30,12 @@ SMALL = {
     "variants": {
         "corrected": {"preset": "corrected"},
         "bounds only": {
-            "set": {"in_front": False, "opaque": None, "depth_agreement": False, "normal_test": "none"},
+            "set": {
+                "in_front": False,
+                "opaque": None,
+                "depth_agreement": False,
+                "normal_test": "none",
+            },
         },
         "released": {"preset": "released"},
     },
@@ -39,9 +45,13 @@ SMALL = {
         "timing": ["corrected", "released"],
     },
     "timing_rounds": 3,
-    "ablations": [{"title": "Presets", "baseline": "corrected", "variants": ["bounds only", "released"]}],
+    "ablations": [
+        {"title": "Presets", "baseline": "corrected", "variants": ["bounds only", "released"]}
+    ],
     "yaw": {"variants": ["corrected", "bounds only"]},
-    "fronts": [{"title": "Cost", "metric": "warp.epe_median.16", "variants": ["corrected", "released"]}],
+    "fronts": [
+        {"title": "Cost", "metric": "warp.epe_median.16", "variants": ["corrected", "released"]}
+    ],
     "pictures": {"variants": ["corrected"], "views": ["yaw030"]},
 }
 CELLS = 7
@@ -62,13 +72,22 @@ def command(*arguments):
 
 
 def call(folder, *arguments):
-    return subprocess.run(command(*arguments), cwd=folder, env=WITHOUT_GIT, capture_output=True, text=True, timeout=600)
+    return subprocess.run(
+        command(*arguments),
+        cwd=folder,
+        env=WITHOUT_GIT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
 
 
 def without_timings(run, folder):
     done = call(folder, "report", run, "--no-timings")
     assert done.returncode == 0, done.stderr
-    return {name: (run / name).read_bytes() for name in ("report.md", "report.html", "results.jsonl")}
+    return {
+        name: (run / name).read_bytes() for name in ("report.md", "report.html", "results.jsonl")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +133,12 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
         # A background job of a shell ignores the signal, and so would what it starts.
         listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         process = subprocess.Popen(
-            arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.PIPE, text=True, preexec_fn=listening
+            arguments,
+            cwd=folder,
+            env=WITHOUT_GIT,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=listening,
         )
         deadline = time.monotonic() + 300
         while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
@@ -143,7 +167,9 @@ def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, fo
 
 def test_the_instrument_is_calibrated_in_every_run(finished):
     (cell,) = (
-        json.loads(p.read_text()) for p in (finished / "cells").iterdir() if '"probe": "calibration"' in p.read_text()
+        json.loads(p.read_text())
+        for p in (finished / "cells").iterdir()
+        if '"probe": "calibration"' in p.read_text()
     )
     for view in cell["views"]:
         median, own = view["metrics"]["warp.epe_median"], view["metrics"]["occlusion.f1.exact"]
@@ -156,7 +182,10 @@ def test_the_instrument_is_calibrated_in_every_run(finished):
 def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder):
     run = folder / "killed"
     process = subprocess.Popen(
-        command("run", "study.yaml", "--out", run), cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL
+        command("run", "study.yaml", "--out", run),
+        cwd=folder,
+        env=WITHOUT_GIT,
+        stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + 300
     while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
@@ -185,7 +214,8 @@ def test_two_workers_give_the_same_numbers_as_one_process(finished, folder):
 def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
     run = folder / "failing"
     run.mkdir()
-    # A file where the pictures' folder should be: the three cells that keep pictures fail, as on a full disk.
+    # A file where the pictures' folder should be: the three cells that keep pictures fail, as on a
+    # full disk.
     (run / "pictures").write_text("in the way")
     done = call(folder, "run", "study.yaml", "--out", run)
     assert done.returncode == 3
@@ -211,7 +241,11 @@ def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, fo
     deadline = time.monotonic() + 300
     while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
-    workers = [pid for pid in children(process.pid) if "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()]
+    workers = [
+        pid
+        for pid in children(process.pid)
+        if "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()
+    ]
     assert workers
     os.kill(workers[0], signal.SIGKILL)
     assert process.wait(300) == 0
@@ -220,7 +254,11 @@ def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, fo
 
 def children(pid):
     """Processes below ``pid``, nearest first."""
-    found = [int(c) for t in pathlib.Path(f"/proc/{pid}/task").iterdir() for c in (t / "children").read_text().split()]
+    found = [
+        int(c)
+        for t in pathlib.Path(f"/proc/{pid}/task").iterdir()
+        for c in (t / "children").read_text().split()
+    ]
     return found + [grandchild for child in found for grandchild in children(child)]
 
 
@@ -245,12 +283,28 @@ def test_bad_input_gets_a_clear_line_and_exit_code_2(folder, arguments, message)
 
 def test_help_imports_nothing_heavy():
     listed = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "attnwarp_eval.cli.main", "--help"], capture_output=True, text=True
+        [sys.executable, "-X", "importtime", "-m", "attnwarp_eval.cli.main", "--help"],
+        capture_output=True,
+        text=True,
     )
     assert listed.returncode == 0
-    loaded = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in listed.stderr.splitlines() if "|" in line}
+    loaded = {
+        line.rsplit("|", 1)[-1].strip().split(".")[0]
+        for line in listed.stderr.splitlines()
+        if "|" in line
+    }
     assert "typer" in loaded
-    assert not loaded & {"torch", "numpy", "open3d", "mitsuba", "numba", "scipy", "matplotlib", "pyvista", "cv2"}
+    assert not loaded & {
+        "torch",
+        "numpy",
+        "open3d",
+        "mitsuba",
+        "numba",
+        "scipy",
+        "matplotlib",
+        "pyvista",
+        "cv2",
+    }
 
 
 def test_one_broken_scene_does_not_hide_the_others(tmp_path):
@@ -264,7 +318,9 @@ def test_one_broken_scene_does_not_hide_the_others(tmp_path):
 
 def test_a_view_whose_name_would_leave_the_folder_is_refused(tmp_path):
     shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
-    text = shipped.read_text().replace("{yaw: 10, height: 1.9}", "{name: ../../evil, yaw: 10, height: 1.9}")
+    text = shipped.read_text().replace(
+        "{yaw: 10, height: 1.9}", "{name: ../../evil, yaw: 10, height: 1.9}"
+    )
     (tmp_path / "evil.yaml").write_text(text)
     done = call(tmp_path, "scenes", "render", "evil.yaml", "--out", "out")
     assert done.returncode == 2

@@ -83,7 +83,9 @@ def test_verify_names_missing_failed_damaged_and_unexpected_cells(tmp_path):
     store = Store(tmp_path)
     picture = tmp_path / "pictures" / "a.png"
     write_atomic(picture, b"png")
-    good = record(pictures=[{"path": "pictures/a.png", "sha256": hashlib.sha256(b"png").hexdigest()}])
+    good = record(
+        pictures=[{"path": "pictures/a.png", "sha256": hashlib.sha256(b"png").hexdigest()}]
+    )
     store.write(good)
     other = Cell({**SPEC, "seed": 9}, "s", "v", "depth", 9)
     store.write({"id": other.id, "spec": other.spec})
@@ -112,7 +114,11 @@ def test_a_folder_that_is_not_a_run_says_how_to_make_one(tmp_path):
 
 
 def test_a_second_run_on_the_same_folder_is_refused(tmp_path):
-    with Store(tmp_path).lock(), pytest.raises(StoreError, match="another run"), Store(tmp_path).lock():
+    with (
+        Store(tmp_path).lock(),
+        pytest.raises(StoreError, match="another run"),
+        Store(tmp_path).lock(),
+    ):
         pass
 
 

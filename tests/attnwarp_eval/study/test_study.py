@@ -21,7 +21,10 @@ SMALL = {
         "again": {"preset": "corrected", "set": {"in_front": True}},
         "slipped": {"preset": "corrected", "set": {"pixel_centers": "integer"}},
     },
-    "probes": {"depth": ["corrected", "again", "slipped"], "warp": ["corrected", "again", "slipped"]},
+    "probes": {
+        "depth": ["corrected", "again", "slipped"],
+        "warp": ["corrected", "again", "slipped"],
+    },
 }
 
 
@@ -37,7 +40,8 @@ def cells(study):
 
 @pytest.mark.parametrize("name", list(shipped_studies()))
 def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch):
-    # Which weights an encoder has is part of a cell's id; that they are there is tested where they are.
+    # Which weights an encoder has is part of a cell's id; that they are there is tested where they
+    # are.
     monkeypatch.setattr(sensitivity, "identity", lambda name, kind: {"weights_sha256": name})
     study = load_study(name)
     assert study.title
@@ -46,7 +50,8 @@ def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch
 
 def test_variants_of_the_same_content_share_a_cell_and_keep_both_names(tmp_path):
     found = cells(load_study(write(tmp_path)))
-    # Pixel centres play no part in a depth map, so all three variants are one cell there and two in the warp.
+    # Pixel centres play no part in a depth map, so all three variants are one cell there and two in
+    # the warp.
     assert [(c.probe, c.labels) for c in found] == [
         ("calibration", ("calibration",)),
         ("depth", ("corrected", "again", "slipped")),
@@ -72,22 +77,40 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ({"scenes": []}, "scenes: .*at least 1"),
         ({"probes": {"warp": ["corected"]}}, "no variant 'corected'; did you mean 'corrected'"),
         ({"variants": {"corrected": {"preset": "correct"}}}, "did you mean 'corrected'"),
-        ({"variants": {"corrected": {"set": {"pixel_centres": "half"}}}}, "did you mean 'pixel_centers'"),
+        (
+            {"variants": {"corrected": {"set": {"pixel_centres": "half"}}}},
+            "did you mean 'pixel_centers'",
+        ),
         ({"variants": {"corrected": {"splats": {"number": 3}}}}, "number"),
         ({"seeds": [0, 0]}, "named twice"),
         ({"name": "../escape"}, "name: .*pattern"),
         ({"feature_sizes": [128]}, "expected 1 to 64, the image size"),
-        ({"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": []}]}, "add it to probes.fit"),
-        ({"fronts": [{"title": "t", "metric": "depth.foo", "variants": ["again"]}]}, "no metric 'depth.foo'"),
-        ({"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]}, "less is better"),
+        (
+            {"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": []}]},
+            "add it to probes.fit",
+        ),
+        (
+            {"fronts": [{"title": "t", "metric": "depth.foo", "variants": ["again"]}]},
+            "no metric 'depth.foo'",
+        ),
+        (
+            {"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]},
+            "less is better",
+        ),
         (
             {"encoders": {"clip": "clip-smal"}},
             r"encoders.clip: encoder 'clip-smal': unknown; did you mean 'clip-small'",
         ),
         ({"encoders": {"clip": "dino-small"}}, "encoders.clip: 'dino-small' is of kind 'dino'"),
         ({"encoders": {"vlm": "clip-small"}}, "encoders.vlm"),
-        ({"probes": {"sensitivity": ["again"]}}, r"probes.sensitivity: got variants, expected \[\]"),
-        ({"variants": {}, "probes": {"warp": []}}, "variants: got none, expected at least one for probes.warp"),
+        (
+            {"probes": {"sensitivity": ["again"]}},
+            r"probes.sensitivity: got variants, expected \[\]",
+        ),
+        (
+            {"variants": {}, "probes": {"warp": []}},
+            "variants: got none, expected at least one for probes.warp",
+        ),
     ],
 )
 def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):

@@ -32,7 +32,9 @@ def results(scene):
 def test_each_of_the_six_names_edits_of_surface_light_and_free_choice(name):
     scene = shipped(name)
     assert len(scene.edits) >= 6
-    assert any(edit.lights for edit in scene.edits) or any(c.object == "ground" for e in scene.edits for c in e.changes)
+    assert any(edit.lights for edit in scene.edits) or any(
+        c.object == "ground" for e in scene.edits for c in e.changes
+    )
     assert any(change.material for edit in scene.edits for change in edit.changes)
     ambiguous = [edit for edit in scene.edits if edit.ambiguous]
     assert ambiguous and all(len(edit.answers) >= 3 for edit in ambiguous)
@@ -60,15 +62,23 @@ def test_an_edit_leaves_shapes_and_every_other_object_as_they_were(name):
         light = (edits.pick(edit, answer) or edit).lights
         assert bool(touched) != (light is not None)
         assert (edited.spec.lights == scene.spec.lights) == (light is None)
-        for k, (before, after) in enumerate(zip(scene.spec.objects, edited.spec.objects, strict=True)):
-            # What the other objects say is equal, so their albedo is, which is a function of it and of the place.
+        for k, (before, after) in enumerate(
+            zip(scene.spec.objects, edited.spec.objects, strict=True)
+        ):
+            # What the other objects say is equal, so their albedo is, which is a function of it and
+            # of the place.
             assert (before == after) == (k not in touched)
             assert before.name == after.name and type(before.shape) is type(after.shape)
 
 
 @pytest.mark.parametrize(
     ("name", "edit", "answer"),
-    [("bear", "polar", None), ("bear", "some_colour", "green"), ("bear", "snow", None), ("bear", "sunset", None)],
+    [
+        ("bear", "polar", None),
+        ("bear", "some_colour", "green"),
+        ("bear", "snow", None),
+        ("bear", "sunset", None),
+    ],
 )
 def test_outside_the_edited_object_the_albedo_is_identical_and_inside_it_is_not(name, edit, answer):
     scene = shipped(name).with_size(48, 48)
@@ -76,7 +86,9 @@ def test_outside_the_edited_object_the_albedo_is_identical_and_inside_it_is_not(
     before, after = Geometry(scene), Geometry(edited)
     for camera in (scene.source, scene.camera("yaw120")):
         hits, again = before.trace(camera), after.trace(camera)
-        assert np.array_equal(hits.depth, again.depth, equal_nan=True)  # bit for bit: an edit moves nothing
+        assert np.array_equal(
+            hits.depth, again.depth, equal_nan=True
+        )  # bit for bit: an edit moves nothing
         assert np.array_equal(hits.primitive_id, again.primitive_id)
         seen = hits.valid
         a, b = (
@@ -99,7 +111,11 @@ def test_paint_keeps_lightness_and_what_it_is_told_to_keep():
     old = scene.spec.objects[scene.object_names.index("bear")].texture
     red = np.array(linear_rgb("#c8372d"))
     for before, after in zip(old.colors, bear.texture.colors, strict=True):
-        share = edits.LUMINANCE @ linear_rgb(before) / max(edits.LUMINANCE @ linear_rgb(c) for c in old.colors)
+        share = (
+            edits.LUMINANCE
+            @ linear_rgb(before)
+            / max(edits.LUMINANCE @ linear_rgb(c) for c in old.colors)
+        )
         # Eight bits of sRGB are up to 0.5 / 255, at a slope of at most 2.3 there.
         assert np.abs(np.array(linear_rgb(after)) - share * red).max() < 0.005
     assert to_linear(np.array([1.0]))[0] == 1.0
@@ -117,7 +133,9 @@ def test_a_painted_body_is_the_mesh_it_was(monkeypatch):
 
     monkeypatch.setattr(shapes, "_march", refuse)
     after = scene.edited("polar").spec.objects[index].shape.mesh()
-    assert np.array_equal(before.vertices, after.vertices) and np.array_equal(before.faces, after.faces)
+    assert np.array_equal(before.vertices, after.vertices) and np.array_equal(
+        before.faces, after.faces
+    )
     assert not np.array_equal(before.tint, after.tint)
 
 
@@ -156,7 +174,9 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
             after = appearance(scene.edited(name), scene.cameras[k], spp=16)
             assert np.isfinite(after).all() and np.abs(after - before)[6:10, 6:10].mean() > 0.05
             sky = np.abs(after - before)[0, 0].max()
-            assert sky > 0.1 if name == "dim" else sky == 0  # an edit of the ball leaves the sky alone
+            assert (
+                sky > 0.1 if name == "dim" else sky == 0
+            )  # an edit of the ball leaves the sky alone
         pictures[name] = after[6:10, 6:10].mean((0, 1))
     # Under an even white sky a diffuse ball in the open shows its albedo: blue is what it says.
     assert np.abs(pictures["blue"] - linear_rgb("#2040c0")).max() < 0.03
@@ -166,18 +186,34 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ("object: ball", "object: bal", r"small.yaml:11: edits\[0\]: edit 'blue': there is no object 'bal'.* ball"),
+        (
+            "object: ball",
+            "object: bal",
+            r"small.yaml:11: edits\[0\]: edit 'blue': there is no object 'bal'.* ball",
+        ),
         ("{'#c04020'", "{'#c04021'", r"recolor: 'ball' has no colour '#c04021'; it has #c04020"),
         (
             "recolor: {'#c04020': '#2040c0'}",
             "keep: []",
             r"changes nothing; add a texture, a material, recolor or paint",
         ),
-        ("recolor: {'#c04020': '#2040c0'}", "paint: '#2040c0', texture: {type: plain, color: '#000000'}", "keep one"),
+        (
+            "recolor: {'#c04020': '#2040c0'}",
+            "paint: '#2040c0', texture: {type: plain, color: '#000000'}",
+            "keep one",
+        ),
         ("    changes: [{object: ball, recolor: {'#c04020': '#2040c0'}}]\n", "", "both or neither"),
-        ("{object: ball, recolor", "{objekt: ball, recolor", r"unknown key 'objekt'; did you mean 'object'"),
+        (
+            "{object: ball, recolor",
+            "{objekt: ball, recolor",
+            r"unknown key 'objekt'; did you mean 'object'",
+        ),
         ("{'#c04020': '#2040c0'}", "{'#c04020': 'blue'}", r"expected an sRGB colour in quotes"),
-        ("recolor: {'#c04020': '#2040c0'}", "material: {type: mirror}", r"contradicts itself: appearance.bounces"),
+        (
+            "recolor: {'#c04020': '#2040c0'}",
+            "material: {type: mirror}",
+            r"contradicts itself: appearance.bounces",
+        ),
     ],
 )
 def test_a_mistake_in_an_edit_is_told_with_its_place_and_remedy(tmp_path, old, new, says):
@@ -192,13 +228,21 @@ def test_a_mistake_in_an_edit_is_told_with_its_place_and_remedy(tmp_path, old, n
 
 def test_edits_and_answers_that_are_not_there_are_told_with_what_is():
     scene = shipped("bear")
-    with pytest.raises(SceneError, match=r"no edit 'polr'; did you mean 'polar'\?; bear has polar, panda"):
+    with pytest.raises(
+        SceneError, match=r"no edit 'polr'; did you mean 'polar'\?; bear has polar, panda"
+    ):
         scene.edited("polr")
-    with pytest.raises(SceneError, match=r"edit 'some_colour': no answer 'pink'; it has red, orange"):
+    with pytest.raises(
+        SceneError, match=r"edit 'some_colour': no answer 'pink'; it has red, orange"
+    ):
         scene.edited("some_colour", "pink")
-    with pytest.raises(SceneError, match=r"edit 'polar': no answer 'red'; it has none: its result is the only one"):
+    with pytest.raises(
+        SceneError, match=r"edit 'polar': no answer 'red'; it has none: its result is the only one"
+    ):
         scene.edited("polar", "red")
-    assert scene.edited("some_colour").content_hash == scene.edited("some_colour", "red").content_hash
+    assert (
+        scene.edited("some_colour").content_hash == scene.edited("some_colour", "red").content_hash
+    )
 
 
 def test_the_command_line_lists_edits_for_people_and_for_programs():
@@ -213,12 +257,23 @@ def test_the_command_line_lists_edits_for_people_and_for_programs():
     scene = shipped("bear")
     assert about["content"] == scene.content_hash and len(about["edits"]) == len(scene.edits)
     colour = next(edit for edit in about["edits"] if edit["ambiguous"])
-    assert [r["answer"] for r in colour["results"]] == ["red", "orange", "yellow", "green", "blue", "violet"]
-    assert CliRunner().invoke(app, ["scenes", "edits", "spheres"]).stdout == "spheres names no edits\n"
+    assert [r["answer"] for r in colour["results"]] == [
+        "red",
+        "orange",
+        "yellow",
+        "green",
+        "blue",
+        "violet",
+    ]
+    assert (
+        CliRunner().invoke(app, ["scenes", "edits", "spheres"]).stdout == "spheres names no edits\n"
+    )
 
 
 def test_an_edited_specification_is_one_that_a_file_could_hold():
     scene = shipped("face")
     for edit, answer in results(scene):
         said = scene.edited(edit.name, answer).spec.model_dump(mode="json", exclude_unset=True)
-        assert SceneSpec.model_validate(said).objects == scene.edited(edit.name, answer).spec.objects
+        assert (
+            SceneSpec.model_validate(said).objects == scene.edited(edit.name, answer).spec.objects
+        )

@@ -1,4 +1,6 @@
-"""The six scenes that stand for the field's own have highlights: where optics puts them, and where the metrics look."""
+"""The six scenes that stand for the field's own have highlights: where optics puts them, and where
+the metrics look.
+"""
 
 import functools
 from dataclasses import replace
@@ -40,7 +42,9 @@ def glossy_balls(scene):
 
 def matt(scene):
     """The same scene without any coat."""
-    objects = tuple(item.model_copy(update={"material": DiffuseMaterial()}) for item in scene.spec.objects)
+    objects = tuple(
+        item.model_copy(update={"material": DiffuseMaterial()}) for item in scene.spec.objects
+    )
     return Scene(scene.spec.model_copy(update={"objects": objects}), scene.path)
 
 
@@ -52,7 +56,8 @@ def sunlit(scene, camera):
 
 
 def spot(scene, geometry, ball, camera):
-    """(x, y) where optics puts the sun's highlight on a ball, None where it is in the shade, hidden or outside.
+    """(x, y) where optics puts the sun's highlight on a ball, None where it is in the shade, hidden
+    or outside.
 
     There the normal halves the angle between the ways to the sun and to the camera.
     """
@@ -77,11 +82,15 @@ def test_the_six_call_for_gloss_and_no_edit_takes_it_away(name):
     scene, _ = world(name)
     found = detect.detect(scene)["glossy"]
     assert found.needed and found.simulated and found.source == "detected"
-    assert "is plastic" in found.evidence[0] and any("BSDF flag Glossy" in e for e in found.evidence)
+    assert "is plastic" in found.evidence[0] and any(
+        "BSDF flag Glossy" in e for e in found.evidence
+    )
     shiny = {item.name for item in scene.spec.objects if item.material.type == "plastic"}
     assert 1 <= len(shiny) <= 4
     for edit in scene.edits:
-        changes = list(edit.changes) + [change for answer in edit.answers for change in answer.changes]
+        changes = list(edit.changes) + [
+            change for answer in edit.answers for change in answer.changes
+        ]
         assert not shiny & {change.object for change in changes}
 
 
@@ -90,7 +99,9 @@ def test_a_highlight_is_seen_from_the_source_and_most_targets(name):
     scene, geometry = world(name)
     balls = glossy_balls(scene)
     seen = [any(spot(scene, geometry, k, camera) for k in balls) for camera in scene.cameras]
-    assert seen[0] and sum(seen[1:]) >= 6, [c.name for c, s in zip(scene.cameras, seen, strict=True) if not s]
+    assert seen[0] and sum(seen[1:]) >= 6, [
+        c.name for c, s in zip(scene.cameras, seen, strict=True) if not s
+    ]
 
 
 @pytest.mark.parametrize("name", SIX)
@@ -107,9 +118,19 @@ def test_the_highlight_is_brighter_than_any_paint_and_lies_where_optics_puts_it(
         mine = owner == k
         if at is None or mine.sum() < LARGE:
             continue
-        # A diffuse surface cannot show more than its albedo times what a surface that faces the sun receives, over pi.
-        bound = albedo(scene.spec.objects[k].texture, fine.point[fine.object_id == k]).max(axis=0) * light
-        inner = mine & np.roll(mine, 1, 0) & np.roll(mine, -1, 0) & np.roll(mine, 1, 1) & np.roll(mine, -1, 1)
+        # A diffuse surface cannot show more than its albedo times what a surface that faces the sun
+        # receives, over pi.
+        bound = (
+            albedo(scene.spec.objects[k].texture, fine.point[fine.object_id == k]).max(axis=0)
+            * light
+        )
+        inner = (
+            mine
+            & np.roll(mine, 1, 0)
+            & np.roll(mine, -1, 0)
+            & np.roll(mine, 1, 1)
+            & np.roll(mine, -1, 1)
+        )
         assert (dull[inner] <= 1.05 * bound).all()
         assert (shiny[inner] > 1.2 * bound).all(axis=-1).any()
         y, x = np.unravel_index(np.where(inner, shiny.sum(-1), -1).argmax(), inner.shape)
@@ -128,12 +149,20 @@ def test_the_mask_of_what_depends_on_the_viewer_finds_the_highlight_and_not_the_
     for camera in scene.targets[2:4]:
         pair = two_view(geometry, scene.source, camera)
         owner = geometry.trace(camera).object_id
-        spots = [spot(scene, geometry, k, camera) for k in glossy_balls(scene) if (owner == k).sum() >= LARGE]
+        spots = [
+            spot(scene, geometry, k, camera)
+            for k in glossy_balls(scene)
+            if (owner == k).sum() >= LARGE
+        ]
         pixels = [(int(y), int(x)) for x, y in filter(None, spots)]
         pixels = [at for at in pixels if pair.visible[at] and not pair.edge[at]]
-        found = metrics.view_dependent(*(to_srgb(p.clip(0, 1)) for p in (source, sunlit(scene, camera))), pair)
+        found = metrics.view_dependent(
+            *(to_srgb(p.clip(0, 1)) for p in (source, sunlit(scene, camera))), pair
+        )
         assert all(found[at] for at in pixels)
-        found = metrics.view_dependent(*(to_srgb(p.clip(0, 1)) for p in (matt_source, sunlit(plain, camera))), pair)
+        found = metrics.view_dependent(
+            *(to_srgb(p.clip(0, 1)) for p in (matt_source, sunlit(plain, camera))), pair
+        )
         assert not any(found[at] for at in pixels)
         checked += len(pixels)
     assert checked

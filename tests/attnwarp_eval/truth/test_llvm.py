@@ -27,7 +27,8 @@ def fresh_probe(monkeypatch):
 
 
 def children(patch, answer):
-    """Stand-ins for the child process: ``answer(library)`` gives its exit code and what it prints."""
+    """Stand-ins for the child process: ``answer(library)`` gives its exit code and what it
+    prints."""
     asked = []
 
     def run(command, *, env, **_):
@@ -49,7 +50,9 @@ def children(patch, answer):
         (0, "wrong picture: 0.0\n", "scalar_rgb"),
     ],
 )
-def test_llvm_is_used_only_where_a_child_process_lived_through_it(fresh_probe, code, said, expected):
+def test_llvm_is_used_only_where_a_child_process_lived_through_it(
+    fresh_probe, code, said, expected
+):
     fresh_probe.setattr(llvm, "libraries", lambda: ["/a/libLLVM.so.19.1"])
     asked = children(fresh_probe, lambda _: (code, said))
     assert llvm.variant() == expected and llvm.variant() == expected
@@ -64,7 +67,9 @@ def test_a_probe_that_hangs_means_scalar_and_a_named_variant_needs_no_probe(fres
     assert llvm.variant() == "scalar_rgb"
     llvm.variant.cache_clear()
     fresh_probe.setenv("ATTNWARP_MITSUBA", "scalar_rgb")
-    fresh_probe.setattr(llvm.subprocess, "run", lambda *a, **k: pytest.fail("asked although a variant was named"))
+    fresh_probe.setattr(
+        llvm.subprocess, "run", lambda *a, **k: pytest.fail("asked although a variant was named")
+    )
     assert llvm.variant() == "scalar_rgb"
 
 
@@ -91,7 +96,13 @@ def test_without_a_library_in_the_usual_places_dr_jit_looks_itself(fresh_probe):
 
 
 def test_old_libraries_are_never_tried_and_the_newest_comes_first(fresh_probe, tmp_path):
-    for name in ("libLLVM-14.so.1", "libLLVM-15.0.6.so.1", "libLLVM.so.19.1", "libLLVM-17.so", "libLLVM-20.txt"):
+    for name in (
+        "libLLVM-14.so.1",
+        "libLLVM-15.0.6.so.1",
+        "libLLVM.so.19.1",
+        "libLLVM-17.so",
+        "libLLVM-20.txt",
+    ):
         (tmp_path / name).touch()
     (tmp_path / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
     (tmp_path / "libLLVM-18.so").symlink_to("gone.so")
@@ -115,7 +126,8 @@ def test_a_librarys_version_is_read_from_its_name(path, expected):
     assert llvm.version(path) == expected
 
 
-# The real thing. Where no LLVM works these hold scalar_rgb to being chosen instead. ------------------------------------
+# The real thing. Where no LLVM works these hold scalar_rgb to being chosen instead.
+# --------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -127,12 +139,23 @@ def both(fresh_probe):
     return ["scalar_rgb", "llvm_ad_rgb"] if renders else ["scalar_rgb", "scalar_rgb"]
 
 
-@pytest.mark.parametrize("name", ["spheres", "refraction", "medium", "subsurface", "depth_of_field", "caustics"])
+@pytest.mark.parametrize(
+    "name", ["spheres", "refraction", "medium", "subsurface", "depth_of_field", "caustics"]
+)
 def test_both_variants_make_the_same_picture_within_noise(both, name):
-    scene = load_scene("spheres").with_size(32, 32) if name == "spheres" else SCENES[name]().with_size(32, 32)
+    scene = (
+        load_scene("spheres").with_size(32, 32)
+        if name == "spheres"
+        else SCENES[name]().with_size(32, 32)
+    )
     made = plan(scene, 64)
     a, b = (
-        np.stack([renderer.render_plan(scene, scene.source, made, first + k, made_by=variant) for k in range(12)])
+        np.stack(
+            [
+                renderer.render_plan(scene, scene.source, made, first + k, made_by=variant)
+                for k in range(12)
+            ]
+        )
         for variant, first in zip(both, (0, 500), strict=True)
     )
     assert not any(level.differs for level in proof.levels(a, b, alpha=1e-3))
@@ -143,8 +166,10 @@ def test_both_variants_make_the_same_picture_within_noise(both, name):
 def test_a_seed_gives_the_same_bits_in_either_variant(both):
     scene = load_scene("spheres").with_size(32, 32)
     for variant in both:
-        first, again, other = (renderer.render_plan(scene, scene.source, plan(scene, 4), k, made_by=variant)
-                               for k in (3, 3, 4))  # fmt: skip
+        first, again, other = (
+            renderer.render_plan(scene, scene.source, plan(scene, 4), k, made_by=variant)
+            for k in (3, 3, 4)
+        )
         assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
@@ -165,7 +190,8 @@ def test_pictures_of_the_two_variants_are_kept_apart(monkeypatch, tmp_path):
     assert made == ["scalar_rgb", "llvm_ad_rgb"]
 
 
-# What float32 cannot compute --------------------------------------------------------------------------------------------
+# What float32 cannot compute
+# --------------------------------------------------------------------------------------------------
 
 
 def test_a_pixel_that_comes_out_undefined_is_rendered_again(monkeypatch):
@@ -189,11 +215,15 @@ def test_a_pixel_that_comes_out_undefined_is_rendered_again(monkeypatch):
 
 
 def needles(width=3e-6):
-    """A square of 40 quads, of which every second is ``width`` wide, with colours that differ from vertex to vertex."""
+    """A square of 40 quads, of which every second is ``width`` wide, with colours that differ from
+    vertex to vertex.
+    """
     x = np.cumsum([0.0] + [0.05, width] * 20)
     top, bottom = (np.stack([x, np.full_like(x, y), np.zeros_like(x)], axis=-1) for y in (0.0, 1.0))
     k, n = np.arange(len(x) - 1), len(x)
-    faces = np.concatenate([np.stack([k, k + 1, n + k], -1), np.stack([k + 1, n + k + 1, n + k], -1)])
+    faces = np.concatenate(
+        [np.stack([k, k + 1, n + k], -1), np.stack([k + 1, n + k + 1, n + k], -1)]
+    )
     return np.concatenate([top, bottom]), faces
 
 
@@ -215,7 +245,9 @@ def test_needles_are_closed_and_everything_else_stays():
 def test_colours_of_a_mesh_with_needles_are_those_of_its_texture(monkeypatch):
     # Mitsuba's own barycentric coordinates in these needles are NaN or anything.
     vertices, faces = needles()
-    scene = make([FLOOR], [SKY | {"horizon": "#ffffff", "zenith": "#ffffff", "radiance": 1.0}]).with_size(64, 64)
+    scene = make(
+        [FLOOR], [SKY | {"horizon": "#ffffff", "zenith": "#ffffff", "radiance": 1.0}]
+    ).with_size(64, 64)
     rng = np.random.default_rng(0)
     tint = rng.uniform(0.2, 0.8, (len(vertices), 3))
     lifted = vertices - [0.5, 0.5, 0.0]

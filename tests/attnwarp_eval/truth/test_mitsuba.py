@@ -22,10 +22,19 @@ FLOOR = {
 
 def world(lights, objects=None, **appearance_):
     spec = {
-        "name": "test", "title": "t", "objects": objects or [FLOOR], "lights": lights, "appearance": appearance_,
-        "cameras": {"look_at": [0, 0, 0], "radius": 3, "size": [48, 32], "source": {"yaw": 20, "height": 2},
-                    "targets": [{"yaw": 90, "height": 1}]},
-    }  # fmt: skip
+        "name": "test",
+        "title": "t",
+        "objects": objects or [FLOOR],
+        "lights": lights,
+        "appearance": appearance_,
+        "cameras": {
+            "look_at": [0, 0, 0],
+            "radius": 3,
+            "size": [48, 32],
+            "source": {"yaw": 20, "height": 2},
+            "targets": [{"yaw": 90, "height": 1}],
+        },
+    }
     return Scene(SceneSpec.model_validate(spec))
 
 
@@ -44,7 +53,8 @@ def test_mitsuba_and_the_exact_geometry_hit_the_same_objects_at_the_same_places(
         agree = object_id == hits.object_id
         assert agree.mean() > 0.999
         error = np.linalg.norm(position - hits.point, axis=-1)[agree & hits.valid]
-        # float32 about the middle of a 14 m scene: 1e-6 m, more where a sphere or the floor is met at a slant.
+        # float32 about the middle of a 14 m scene: 1e-6 m, more where a sphere or the floor is met
+        # at a slant.
         assert np.median(error) < 3e-6 and np.percentile(error, 99.5) < 3e-4
 
 
@@ -92,8 +102,8 @@ def test_an_open_floor_under_sun_and_even_sky_has_the_radiance_of_its_equation()
     light = np.sin(np.radians(30)) * 2.0 * np.array(linear_rgb("#ffe0c0"))
     light = light + np.pi * 0.7 * np.array(linear_rgb("#c0d0e0"))
     expected = np.array(linear_rgb("#b08040")) / np.pi * light
-    # Nothing covers the sky and it is even, so no sample differs; bitmaps hold float32 (6e-8), the sky is
-    # interpolated between texels.
+    # Nothing covers the sky and it is even, so no sample differs; bitmaps hold float32 (6e-8), the
+    # sky is interpolated between texels.
     assert floor.all() and np.abs(image / expected - 1).max() < 2e-3
 
 
@@ -106,14 +116,18 @@ def test_a_missed_pixel_shows_the_sky():
 
 @pytest.mark.parametrize("name", ["spheres", "bear", "fence"])
 def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name):
-    # Catches textures that are flipped or turned in one of the two, shadows that fall elsewhere, light counted twice.
+    # Catches textures that are flipped or turned in one of the two, shadows that fall elsewhere,
+    # light counted twice.
     size, fine = 96, 3
     scene = load_scene(name).with_size(size, size)
     geometry, camera = Geometry(scene), scene.camera("yaw030")
     image = appearance(scene, camera, spp=36)
     dense = camera.resize(size * fine, size * fine)
     hits = geometry.trace(dense)
-    flat = [a.reshape(-1, *a.shape[2:])[hits.valid.ravel()] for a in (hits.point, hits.normal, hits.primitive_id)]
+    flat = [
+        a.reshape(-1, *a.shape[2:])[hits.valid.ravel()]
+        for a in (hits.point, hits.normal, hits.primitive_id)
+    ]
     expected = sky_radiance(scene.spec.lights[1], dense.directions() @ dense.rotation)
     light = irradiance(scene, geometry, *flat, rays=32)
     expected[hits.valid] = object_albedo(scene, geometry, flat[0], flat[2]) / np.pi * light
@@ -121,12 +135,17 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
     owner = geometry.trace(camera).object_id
     for k, name_ in enumerate(scene.object_names):
         mine = owner == k
-        if scene.spec.objects[k].material.type != "diffuse":  # its highlights are not in the ray caster's light
+        if (
+            scene.spec.objects[k].material.type != "diffuse"
+        ):  # its highlights are not in the ray caster's light
             continue
-        if mine.sum() < 300:  # on thin objects three samples across a pixel are too few for the expectation
+        if (
+            mine.sum() < 300
+        ):  # on thin objects three samples across a pixel are too few for the expectation
             continue
         got, want = image[mine], expected[mine]
-        # Over an object the noise averages out; smooth shading and texels of finite size leave a little.
+        # Over an object the noise averages out; smooth shading and texels of finite size leave a
+        # little.
         assert np.abs(got.mean(0) / want.mean(0) - 1).max() < 0.025, name_
         # Pixel by pixel the pictures look alike; a flipped or turned texture falls below 0.6.
         assert np.corrcoef(got.mean(-1), want.mean(-1))[0, 1] > 0.9, name_
@@ -158,7 +177,10 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
 
 def test_the_plan_follows_from_the_scene_and_says_why():
     direct = plan(world([SUN, SKY]), 8)
-    assert [(p.integrator, p.lights, p.spp) for p in direct.passes] == [("direct", (0,), 8), ("direct", (1,), 8)]
+    assert [(p.integrator, p.lights, p.spp) for p in direct.passes] == [
+        ("direct", (0,), 8),
+        ("direct", (1,), 8),
+    ]
     assert any("one bounce" in reason for reason in direct.reasons)
     ball = {
         "name": "ball",
@@ -176,7 +198,9 @@ def test_the_plan_of_one_bounce_and_a_path_tracer_of_one_bounce_agree():
     scene = load_scene("fence").with_size(48, 48)
     path = Plan((Pass((0, 1), "path", 2, 1, 1, 64),), ())
     reference = np.stack([renderer.render_plan(scene, scene.source, path, k) for k in range(4)])
-    ours = np.stack([renderer.render_plan(scene, scene.source, plan(scene, 16), k) for k in range(4)])
+    ours = np.stack(
+        [renderer.render_plan(scene, scene.source, plan(scene, 16), k) for k in range(4)]
+    )
     error = np.sqrt(reference.var(0, ddof=1) / 4 + ours.var(0, ddof=1) / 4).mean()
     difference = reference.mean(0) - ours.mean(0)
     # Standard error of the mean over 48 x 48 x 3 values, of which the channels are not independent.

@@ -20,7 +20,8 @@ def moeller_trumbore(mesh, origin, directions):
     """Nearest t of each ray by testing every triangle in float64, without any tolerance.
 
     Returns:
-        t (inf for a miss), the index of the triangle (-1), and the smallest of its three barycentric coordinates there.
+        t (inf for a miss), the index of the triangle (-1), and the smallest of its three
+        barycentric coordinates there.
     """
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     e1, e2 = b - a, c - a
@@ -74,12 +75,15 @@ def test_a_ray_that_almost_misses_a_sphere_still_finds_it_where_it_is(gap, dista
     c = sum(x * x for x in o) - mpmath.mpf(radius) ** 2
     exact = (-b - mpmath.sqrt(b * b - a * c)) / a
     assert index[0] == 0
-    # The half chord is radius * sqrt(2 gap); rounding of the distance (1e-16 each) enters it through a square root.
+    # The half chord is radius * sqrt(2 gap); rounding of the distance (1e-16 each) enters it
+    # through a square root.
     assert abs(float(t[0] - exact)) < 1e-4 * radius * np.sqrt(2 * gap) + 1e-13 * distance
 
 
 def test_a_ray_that_starts_inside_a_sphere_leaves_on_the_other_side():
-    t, _ = nearest_hit(np.zeros((1, 3)), np.array([[0, 0, 2.0]]), np.array([[0, 0, 0.5, 2.0]]), np.zeros((0, 12)))
+    t, _ = nearest_hit(
+        np.zeros((1, 3)), np.array([[0, 0, 2.0]]), np.array([[0, 0, 0.5, 2.0]]), np.zeros((0, 12))
+    )
     assert t[0] == pytest.approx(1.25, abs=1e-15)
 
 
@@ -92,26 +96,33 @@ def test_a_box_of_triangles_and_a_box_of_closed_forms_are_one_box():
     assert (meshed.valid != exact.valid).sum() <= 2
     same = both & (np.abs(np.einsum("hwi,hwi->hw", meshed.normal, exact.normal) - 1) < 1e-9)
     assert same.sum() >= both.sum() - 4
-    # Open3D's own depth is off by up to 1.6e-5; on the triangle's plane in float64 only rounding is left.
+    # Open3D's own depth is off by up to 1.6e-5; on the triangle's plane in float64 only rounding is
+    # left.
     assert np.abs(meshed.depth - exact.depth)[same].max() < 1e-13
     assert np.abs(meshed.depth - exact.depth)[both].max() < 1e-5
     assert (meshed.object_id[both] == 3).all()
 
 
 def test_an_organic_mesh_is_hit_where_brute_force_hits_it():
-    mesh = mesh_body([Ellipsoid((0, 0, 0.5), (0.5, 0.8, 0.4)), Ellipsoid((0.3, 0, 1), (0.3, 0.3, 0.3))], 0.2, 20)
+    mesh = mesh_body(
+        [Ellipsoid((0, 0, 0.5), (0.5, 0.8, 0.4)), Ellipsoid((0.3, 0, 1), (0.3, 0.3, 0.3))], 0.2, 20
+    )
     view = camera(size=40)
     hits = Geometry([mesh]).trace(view)
     brute, which, inside = (
         a.reshape(40, 40)
-        for a in moeller_trumbore(mesh, view.position, (view.directions() @ view.rotation).reshape(-1, 3))
+        for a in moeller_trumbore(
+            mesh, view.position, (view.directions() @ view.rotation).reshape(-1, 3)
+        )
     )
     assert (np.isfinite(brute) == hits.valid).all()
-    # Where float32 picks the neighbouring triangle, the two planes differ by a rounding error times their angle.
+    # Where float32 picks the neighbouring triangle, the two planes differ by a rounding error times
+    # their angle.
     assert np.nanmax(np.abs(hits.depth - brute)[hits.valid]) < 1e-6
     assert np.nanpercentile(np.abs(hits.depth - brute)[hits.valid], 95) < 1e-13
     assert (hits.cosine[hits.valid] > 0).all()
-    # Away from its edges a triangle is the only one that can be hit; 1e-3 of it is far more than float32 is off.
+    # Away from its edges a triangle is the only one that can be hit; 1e-3 of it is far more than
+    # float32 is off.
     clear = hits.valid & (inside > 1e-3)
     assert clear.sum() > 0.9 * hits.valid.sum() and len(np.unique(which[clear])) > 100
     assert np.array_equal(hits.primitive_id[clear], which[clear])
@@ -120,7 +131,10 @@ def test_an_organic_mesh_is_hit_where_brute_force_hits_it():
 
 
 def test_a_ray_through_a_shared_edge_hits_one_of_the_two_triangles():
-    square = Mesh(np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    square = Mesh(
+        np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
     along = np.linspace(-0.9, 0.9, 101)
     origins = np.stack([along, along, np.full(101, 3.0)], axis=-1)
     hits = Geometry([square]).trace_rays(origins, np.tile([0, 0, -1.0], (101, 1)))
@@ -142,13 +156,18 @@ def test_duplicated_faces_and_holes_leave_the_rest_of_a_mesh_exact():
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, 0.0), (1e3, 0.0), (1.0, 1e6), (7.3, -1e4)])
 def test_neither_the_unit_nor_the_place_of_a_scene_changes_what_is_hit(scale, offset):
     shift = offset * np.array([1.0, -1.0, 0.5])
-    shapes = [GROUND, Sphere(np.array([0, 0.8, 0.6]), 0.6), Box(np.array([0, -0.9, 0.4]), np.full(3, 0.4))]
+    shapes = [
+        GROUND,
+        Sphere(np.array([0, 0.8, 0.6]), 0.6),
+        Box(np.array([0, -0.9, 0.4]), np.full(3, 0.4)),
+    ]
     view = camera()
     moved = camera(view.position * scale + shift, np.array([0, 0, 0.4]) * scale + shift)
     here = Geometry(shapes).trace(view)
     there = Geometry([shape.moved(scale, shift) for shape in shapes]).trace(moved)
     assert np.array_equal(here.object_id, there.object_id)
-    # The world coordinates themselves only have 16 digits: at an offset of 1e6 that is 1e-10, times the slant.
+    # The world coordinates themselves only have 16 digits: at an offset of 1e6 that is 1e-10, times
+    # the slant.
     tolerance = 1e-12 + 1e-14 * abs(offset) / scale
     assert np.nanmax(np.abs(there.depth / scale - here.depth) * here.cosine) < 10 * tolerance
 
@@ -160,8 +179,15 @@ def test_a_way_is_free_unless_something_stands_in_it():
     primitive = np.array([2, 1, 1, 0, 0])  # spheres first, then rectangles
     up, away = np.tile([0, 0, 1.0], (5, 1)), np.array([0.5, 0.3, 4.0])
     up[4] = [0, 0, -1]
-    # Under a card 5 mm above it the ground is hidden, beside it is not; the sphere's underside faces away.
-    assert geometry.visible_from(points, up, primitive, away).tolist() == [True, False, True, True, False]
+    # Under a card 5 mm above it the ground is hidden, beside it is not; the sphere's underside
+    # faces away.
+    assert geometry.visible_from(points, up, primitive, away).tolist() == [
+        True,
+        False,
+        True,
+        True,
+        False,
+    ]
 
 
 def test_the_sides_of_a_mesh_face_are_told_apart():

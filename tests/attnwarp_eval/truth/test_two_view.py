@@ -1,4 +1,6 @@
-"""two_view against a brute-force float64 oracle that shares no code with it, and against closed forms."""
+"""two_view against a brute-force float64 oracle that shares no code with it, and against closed
+forms.
+"""
 
 import numpy as np
 import pytest
@@ -14,13 +16,23 @@ GROUND = Rectangle(np.zeros(3), np.array([4.0, 0, 0]), np.array([0, 4.0, 0]), ob
 def camera(yaw, height=2.0, radius=4.0, size=32, target=(0, 0, 0.5)):
     a = np.radians(yaw)
     return Camera.look_at(
-        (radius * np.cos(a), radius * np.sin(a), height), target, width=size, height=size, fov_y=45, name=f"{yaw}"
+        (radius * np.cos(a), radius * np.sin(a), height),
+        target,
+        width=size,
+        height=size,
+        fov_y=45,
+        name=f"{yaw}",
     )
 
 
 def small_world():
     body = mesh_body(
-        [Ellipsoid((0, 0, 0.5), (0.35, 0.4, 0.5)), Capsule((0.2, 0.3, 0.7), (0.6, 0.5, 0.4), (0.12, 0.1))], 0.1, 14
+        [
+            Ellipsoid((0, 0, 0.5), (0.35, 0.4, 0.5)),
+            Capsule((0.2, 0.3, 0.7), (0.6, 0.5, 0.4), (0.12, 0.1)),
+        ],
+        0.1,
+        14,
     )
     body = type(body)(body.vertices, body.faces, object_id=1)
     return [
@@ -35,11 +47,15 @@ class BruteForce:
     """Every ray against every surface, textbook formulas in float64, no acceleration and no ids."""
 
     def __init__(self, shapes):
-        meshes = [s.mesh() if isinstance(s, Box | Rectangle) and isinstance(s, Box) else s for s in shapes]
+        meshes = [
+            s.mesh() if isinstance(s, Box | Rectangle) and isinstance(s, Box) else s for s in shapes
+        ]
         corners = [m.vertices[m.faces] for m in meshes if hasattr(m, "faces")]
         for r in (m for m in meshes if isinstance(m, Rectangle)):
             c, u, v = r.center, r.u, r.v
-            corners.append(np.array([[c - u - v, c + u - v, c + u + v], [c - u - v, c + u + v, c - u + v]]))
+            corners.append(
+                np.array([[c - u - v, c + u - v, c + u + v], [c - u - v, c + u + v, c - u + v]])
+            )
         self.a, b, c = np.moveaxis(np.concatenate(corners), 1, 0)
         self.e1, self.e2 = b - self.a, c - self.a
         self.spheres = [s for s in meshes if isinstance(s, Sphere)]
@@ -55,7 +71,11 @@ class BruteForce:
                 u = (s * p).sum(1) / det
                 q = np.cross(s, self.e1)
                 v = (q @ d) / det
-                t = np.where((det != 0) & (u >= 0) & (v >= 0) & (u + v <= 1), (self.e2 * q).sum(1) / det, np.inf)
+                t = np.where(
+                    (det != 0) & (u >= 0) & (v >= 0) & (u + v <= 1),
+                    (self.e2 * q).sum(1) / det,
+                    np.inf,
+                )
             t[~(t > 0)] = np.inf
             k = t.argmin()
             if t[k] < t_best[i]:
@@ -94,7 +114,9 @@ def test_labels_are_those_of_brute_force_in_float64(yaw):
     rays = target.directions() @ target.rotation
     center = brute.status(target.position, rays.reshape(-1, 3), source).reshape(24, 24)
     grid = np.stack(np.meshgrid(np.arange(25.0), np.arange(25.0)), axis=-1)
-    corner = brute.status(target.position, (target.directions(grid) @ target.rotation).reshape(-1, 3), source)
+    corner = brute.status(
+        target.position, (target.directions(grid) @ target.rotation).reshape(-1, 3), source
+    )
     corner = corner.reshape(25, 25)
     same = np.ones((24, 24), bool)
     for dy in (0, 1):
@@ -120,7 +142,9 @@ def test_labels_do_not_depend_on_the_unit_or_the_place_of_the_scene(name, scale,
 
     shapes, target = scene.shapes(), scene.camera("yaw060")
     here = two_view(Geometry(shapes), scene.source, target)
-    there = two_view(Geometry([s.moved(scale, shift) for s in shapes]), moved(scene.source), moved(target))
+    there = two_view(
+        Geometry([s.moved(scale, shift) for s in shapes]), moved(scene.source), moved(target)
+    )
     assert np.array_equal(here.label, there.label)
     assert np.array_equal(here.edge, there.edge)
     both = ~np.isnan(here.xy[..., 0])
@@ -178,7 +202,8 @@ def test_surfaces_seen_edge_on_are_ambiguous():
 
 
 def test_the_edge_band_is_two_pixels_on_each_side_of_an_edge_and_leaves_floors_alone():
-    # A card 1 above a plane, both facing the camera 5 away: the card's left outline falls on x = 16 exactly.
+    # A card 1 above a plane, both facing the camera 5 away: the card's left outline falls on x = 16
+    # exactly.
     far = Rectangle(np.zeros(3), np.array([9.0, 0, 0]), np.array([0, 9.0, 0]))
     card = Rectangle(np.array([2.0, 0, 1]), np.array([2.0, 0, 0]), np.array([0, 9.0, 0]))
     view = Camera.look_at((0, 0, 5), (0, 0, 0), up=(0, 1, 0), width=32, height=32, fov_y=40)

@@ -1,9 +1,11 @@
-"""Which metric can see what: every metric on true results of an edit and on results with one known flaw.
+"""Which metric can see what: every metric on true results of an edit and on results with one known
+flaw.
 
-A scene's edit has a true result, so the pictures that a method should have made are known, and so are pictures that it
-should not have made: an edit too weak, of a wrong colour, of a wrong thing, another in each view, blurred, noisy or out
-of place. A metric that ranks the right one above the flawed one can see that flaw; one that ranks them as a coin does
-is blind to it; and one that prefers the flaw moves the wrong way.
+A scene's edit has a true result, so the pictures that a method should have made are known, and so
+are pictures that it should not have made: an edit too weak, of a wrong colour, of a wrong thing,
+another in each view, blurred, noisy or out of place. A metric that ranks the right one above the
+flawed one can see that flaw; one that ranks them as a coin does is blind to it; and one that
+prefers the flaw moves the wrong way.
 """
 
 from __future__ import annotations
@@ -29,8 +31,8 @@ if TYPE_CHECKING:
     from attnwarp_eval.world import World
 
 ANSWERS = 3
-"""Of an edit with several right answers, the first that are rendered: one right, one wrong, and a third for views that
-do not agree."""
+"""Of an edit with several right answers, the first that are rendered: one right, one wrong, and a
+third for views that do not agree."""
 
 RIGHT_ANSWERS = 2
 """Of these, how many are the right one in turn: more would only repeat what these show."""
@@ -39,7 +41,9 @@ STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 """Of the edit, as a blend of the pictures before and after in linear light."""
 
 UNEVEN = (0.5, 0.75)
-"""Strengths that the views of an inconsistent result take in turn, where the edit has one answer alone."""
+"""Strengths that the views of an inconsistent result take in turn, where the edit has one answer
+alone.
+"""
 
 SATURATION = 0.75
 """Of a wrong colour (HSV): enough to be one on white marble too."""
@@ -91,7 +95,13 @@ class Task:
     def from_dict(cls, said: Mapping[str, Any]) -> Task:
         """From what :meth:`to_dict` gave."""
         others = tuple((name, content) for name, content in said["others"])
-        return cls(**{**said, "others": others, "elsewhere": said["elsewhere"] and tuple(said["elsewhere"])})
+        return cls(
+            **{
+                **said,
+                "others": others,
+                "elsewhere": said["elsewhere"] and tuple(said["elsewhere"]),
+            }
+        )
 
 
 def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
@@ -99,7 +109,8 @@ def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
 
     Args:
         scene: with its edits.
-        names: of the edits; all of the scene's if empty. Names that the scene lacks are passed over.
+        names: of the edits; all of the scene's if empty. Names that the scene lacks are passed
+            over.
     """
     from attnwarp_eval.truth.edits import touched
 
@@ -127,7 +138,11 @@ def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
                     answer.target if answer else edit.target,
                     _content(scene, edit.name, answer.name if answer else None),
                     tuple((name, _content(scene, edit.name, name)) for name in others),
-                    None if elsewhere is None else (elsewhere, None, _content(scene, elsewhere, None)),
+                    (
+                        None
+                        if elsewhere is None
+                        else (elsewhere, None, _content(scene, elsewhere, None))
+                    ),
                 )
             )
     return found
@@ -153,7 +168,8 @@ class Shot:
         index: 0 for the source view, then the targets by their order.
         before, after: (H, W, 3) linear light in [0, 1].
         mask: (H, W) bool, the edited objects.
-        hue: (3,) RGB of the wrong colour, its largest channel 1 and its smallest 0; the same in all views of a task.
+        hue: (3,) RGB of the wrong colour, its largest channel 1 and its smallest 0; the same in all
+            views of a task.
         others: (H, W, 3) the results of other answers.
         elsewhere: (H, W, 3) the result of an edit of other objects.
     """
@@ -171,7 +187,9 @@ class Shot:
         return (1 - strength) * self.before + strength * self.after
 
     def wrong_colour(self) -> Array:
-        """Another answer, where the edit has several; else the edited object in the opposite hue, as light as it is."""
+        """Another answer, where the edit has several; else the edited object in the opposite hue,
+        as light as it is.
+        """
         if self.others:
             return self.others[0]
         value = self.after.max(axis=-1, keepdims=True)
@@ -192,7 +210,9 @@ class Shot:
 
     def misplaced(self) -> Array:
         """The right result moved to the right; the left border is repeated."""
-        return np.concatenate([np.repeat(self.after[:, :1], SHIFT, axis=1), self.after[:, :-SHIFT]], axis=1)
+        return np.concatenate(
+            [np.repeat(self.after[:, :1], SHIFT, axis=1), self.after[:, :-SHIFT]], axis=1
+        )
 
 
 @dataclass(frozen=True)
@@ -203,8 +223,8 @@ class Condition:
         name: the last part of a figure's key.
         title: for people, short.
         make: the picture in linear light; None where the edit has no such flaw.
-        source: whether the source view has the flaw as well. Where it has, all views have it alike, and a metric that
-            compares views with one another has nothing to find.
+        source: whether the source view has the flaw as well. Where it has, all views have it alike,
+            and a metric that compares views with one another has nothing to find.
         noise: standard deviation of noise that is added to sRGB values, of its own in each view.
     """
 
@@ -224,7 +244,11 @@ class Condition:
 
 
 def _strength(strength: float) -> Condition:
-    return Condition(f"strength_{100 * strength:03.0f}", f"strength {strength:g}", lambda shot: shot.blend(strength))
+    return Condition(
+        f"strength_{100 * strength:03.0f}",
+        f"strength {strength:g}",
+        lambda shot: shot.blend(strength),
+    )
 
 
 CONDITIONS = (
@@ -241,17 +265,24 @@ CONDITIONS = (
 RIGHT = f"strength_{100 * STRENGTHS[-1]:03.0f}"
 
 FIDELITY = (
-    *(f"fidelity.{name}{place}" for place in ("", ".inside") for name in ("mse", "psnr", "ssim", "distance")),
+    *(
+        f"fidelity.{name}{place}"
+        for place in ("", ".inside")
+        for name in ("mse", "psnr", "ssim", "distance")
+    ),
     *(f"fidelity.preserved_{name}" for name in ("mse", "psnr", "ssim", "distance")),
 )
 """What is kept of :func:`attnwarp_eval.metrics.fidelity`."""
 
 CONSISTENCY = ("consistency.delta_e", "consistency.rmse_srgb", "consistency.pixels")
-"""What is kept of :func:`attnwarp_eval.metrics.cross_view`: of the edited object, against the source view."""
+"""What is kept of :func:`attnwarp_eval.metrics.cross_view`: of the edited object, against the
+source view.
+"""
 
 
 def identity(name: str, kind: Kind) -> dict[str, Any]:
-    """What of an encoder decides its figures: its weights and what happens to a picture before, wherever it lies.
+    """What of an encoder decides its figures: its weights and what happens to a picture before,
+    wherever it lies.
 
     Raises:
         InputError: see :func:`attnwarp.encoders.load_encoder`.
@@ -280,13 +311,18 @@ def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) 
         found[kind] = load_encoder(names[kind])
         if identity_of(found[kind]) != wanted:
             raise InputError(
-                f"encoder {names[kind]!r}: its weights have changed since the run was planned; start the run again"
+                f"encoder {names[kind]!r}: its weights have changed since the run was planned;"
+                " start the run again"
             )
     return found
 
 
 def measure(
-    at: World, spec: Mapping[str, Any], encoders: Mapping[str, Any], meter: Meter, seconds: dict[str, list[float]]
+    at: World,
+    spec: Mapping[str, Any],
+    encoders: Mapping[str, Any],
+    meter: Meter,
+    seconds: dict[str, list[float]],
 ) -> Iterator[tuple[str, dict[str, float], dict[str, Any]]]:
     """Every metric on every condition of every task.
 
@@ -295,7 +331,8 @@ def measure(
         spec: of the cell: ``views``, ``tasks``, ``spp``, ``seed``, ``rounds``.
         encoders: loaded, by kind; metrics whose encoder is not there are left out.
         meter: takes the seconds of truth and checks.
-        seconds: filled with the seconds that a picture costs each metric, taken in turn: a list of rounds each.
+        seconds: filled with the seconds that a picture costs each metric, taken in turn: a list of
+            rounds each.
 
     Yields:
         ``task/view``, its figures as ``metric.condition``, and {}.
@@ -325,7 +362,9 @@ def measure(
             meter.count(pictures=len(pictures))
             if number == 0 and name == spec["views"][0]:
                 with meter.stage("rounds"):
-                    seconds |= _rounds(view, prompts, source["noisy"], pictures["noisy"], encoders, spec)
+                    seconds |= _rounds(
+                        view, prompts, source["noisy"], pictures["noisy"], encoders, spec
+                    )
             yield f"{task.name}/{name}", figures, {}
 
 
@@ -343,9 +382,16 @@ def _shots(at: World, task: Task, spec: Mapping[str, Any]) -> dict[str, Shot]:
     seen: dict[str, list[Array]] = {name: [] for name in names}
     for scene in scenes:
         for name in names:
-            seen[name].append(np.clip(appearance(scene, at.camera(name), spp=spec["spp"], seed=0), 0, 1))
-    masks = {name: edit_mask(at.scene, task.edit, at.geometry.trace(at.camera(name)), task.answer) for name in names}
-    total = np.sum([seen[name][1][masks[name]].sum(axis=0, dtype=np.float64) for name in names], axis=0)
+            seen[name].append(
+                np.clip(appearance(scene, at.camera(name), spp=spec["spp"], seed=0), 0, 1)
+            )
+    masks = {
+        name: edit_mask(at.scene, task.edit, at.geometry.trace(at.camera(name)), task.answer)
+        for name in names
+    }
+    total = np.sum(
+        [seen[name][1][masks[name]].sum(axis=0, dtype=np.float64) for name in names], axis=0
+    )
     hue = opposite_hue(total)
     last = 2 + len(task.others)
     return {
@@ -358,7 +404,8 @@ def _shots(at: World, task: Task, spec: Mapping[str, Any]) -> dict[str, Shot]:
 
 
 def opposite_hue(color: Array) -> Array:
-    """(3,) RGB of the hue half a circle from that of a colour, fully saturated (HSV); red for grey."""
+    """(3,) RGB of the hue half a circle from that of a colour, fully saturated (HSV); red for
+    grey."""
     spread = color.max() - color.min()
     return np.array([1.0, 0, 0]) if spread <= 1e-9 * color.max() else (color.max() - color) / spread
 
@@ -372,7 +419,8 @@ class _View:
         self.pair = pair
         self.mask = shot.mask
         self.original, self.truth = to_srgb(shot.before), to_srgb(shot.after)
-        # What rightly differs between two views, before the edit or after it: highlights and reflections.
+        # What rightly differs between two views, before the edit or after it: highlights and
+        # reflections.
         self.exclude = view_dependent(to_srgb(source.before), self.original, pair)
         self.exclude |= view_dependent(to_srgb(source.after), self.truth, pair)
 
@@ -381,7 +429,9 @@ class _View:
         from attnwarp_eval.metrics import fidelity
 
         distance = None if perceptual is None else _distance(perceptual)
-        against = fidelity(picture, self.truth, self.mask, original_srgb=self.original, distance=distance)
+        against = fidelity(
+            picture, self.truth, self.mask, original_srgb=self.original, distance=distance
+        )
         between = self.consistency(source, picture)
         return {
             **{key: against[key] for key in FIDELITY if key in against},
@@ -392,7 +442,9 @@ class _View:
         """Of the edited object in the picture and in the source view of the same result."""
         from attnwarp_eval.metrics import cross_view
 
-        return cross_view(source, picture, self.pair, mask=self.mask, exclude=self.exclude).figures()
+        return cross_view(
+            source, picture, self.pair, mask=self.mask, exclude=self.exclude
+        ).figures()
 
 
 def _distance(perceptual: Any) -> Callable[[Array, Array], float]:
@@ -400,7 +452,9 @@ def _distance(perceptual: Any) -> Callable[[Array, Array], float]:
 
 
 class _Prompts:
-    """A task's prompts and its edited source view as encoders see them: made once, for all pictures."""
+    """A task's prompts and its edited source view as encoders see them: made once, for all
+    pictures.
+    """
 
     def __init__(self, task: Task, source_edit: Array | None, encoders: Mapping[str, Any]) -> None:
         self.clip, self.dino = encoders.get("clip"), encoders.get("dino")
@@ -414,17 +468,23 @@ class _Prompts:
         """``embedding.*.condition`` of all conditions that there are."""
         from attnwarp_eval.metrics import clip_similarity, directional_similarity, image_similarity
 
-        there = {condition: picture for condition, picture in pictures.items() if picture is not None}
+        there = {
+            condition: picture for condition, picture in pictures.items() if picture is not None
+        }
         found: dict[str, Array] = {}
         if self.clip is not None:
             *images, unedited = self.clip.images([*there.values(), original])
             images = np.stack(images)
             found["clip_similarity"] = clip_similarity(images, self.after).values
             befores = np.broadcast_to(unedited, images.shape)
-            found["clip_directional"] = directional_similarity(befores, images, self.before, self.after).values
+            found["clip_directional"] = directional_similarity(
+                befores, images, self.before, self.after
+            ).values
             found["clip_image"] = image_similarity(self.clip_source, images).values
         if self.dino is not None:
-            found["dino_image"] = image_similarity(self.dino_source, self.dino.images(list(there.values()))).values
+            found["dino_image"] = image_similarity(
+                self.dino_source, self.dino.images(list(there.values()))
+            ).values
         return {
             f"embedding.{name}.{condition}": float(value)
             for name, values in found.items()
@@ -440,10 +500,11 @@ def _rounds(
     encoders: Mapping[str, Any],
     spec: Mapping[str, Any],
 ) -> dict[str, list[float]]:
-    """Seconds that one picture costs each metric, in turn in an order drawn anew each round; a first round is not kept.
+    """Seconds that one picture costs each metric, in turn in an order drawn anew each round; a
+    first round is not kept.
 
-    What is made once for all pictures is in none of them: truth, correspondences, and the embeddings of the prompts, of
-    the edited source view and of the view before the edit.
+    What is made once for all pictures is in none of them: truth, correspondences, and the
+    embeddings of the prompts, of the edited source view and of the view before the edit.
     """
     from attnwarp_eval import metrics
 

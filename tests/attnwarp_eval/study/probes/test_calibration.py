@@ -1,4 +1,5 @@
-"""The instrument judged by itself: exact depth through the warp, and the exact mask against itself."""
+"""The instrument judged by itself: exact depth through the warp, and the exact mask against
+itself."""
 
 import math
 
@@ -20,23 +21,34 @@ EXACT = preset("corrected", depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=T
 
 @pytest.fixture(scope="module")
 def pairs():
-    """(yaw, what is exactly known, the source's exact surface) of some views of the spheres scene."""
+    """(yaw, what is exactly known, the source's exact surface) of some views of the spheres
+    scene."""
     scene = load_scene("spheres").with_size(SIZE, SIZE)
     geometry = Geometry(scene)
     seen = geometry.trace(scene.source)
     targets = {camera.name: camera for camera in scene.targets}
-    found = {yaw: two_view(geometry, scene.source, targets[f"yaw{yaw:03d}"]) for yaw in (10, 45, 90, 150)}
+    found = {
+        yaw: two_view(geometry, scene.source, targets[f"yaw{yaw:03d}"]) for yaw in (10, 45, 90, 150)
+    }
     return scene, geometry, Surface(seen.depth, seen.normal), found
 
 
 def warped(pair, source_surface, settings):
-    return warp_surfaces(pair.source, pair.target, Surface(pair.hits.depth, pair.hits.normal), source_surface, settings)
+    return warp_surfaces(
+        pair.source,
+        pair.target,
+        Surface(pair.hits.depth, pair.hits.normal),
+        source_surface,
+        settings,
+    )
 
 
 def test_the_truths_own_depth_has_no_endpoint_error(pairs):
     _, _, seen, found = pairs
     for pair in found.values():
-        got = metrics.endpoint_error(warped(pair, seen, EXACT).correspondence.xy, pair.xy, pair.visible)
+        got = metrics.endpoint_error(
+            warped(pair, seen, EXACT).correspondence.xy, pair.xy, pair.visible
+        )
         assert got["warp.epe_p95"] < 1e-9
         assert got["warp.coverage"] == 1
 
@@ -48,15 +60,17 @@ def test_the_exact_mask_against_itself_is_perfect(pairs):
 
 
 def test_with_exact_depth_the_corrected_rules_accept_nothing_wrong(pairs):
-    # Judged by ray casting, which shares no step with depth agreement. Ground whose depth changes by more than 2 % a
-    # pixel at this size is rejected, 4 % of what is visible.
+    # Judged by ray casting, which shares no step with depth agreement. Ground whose depth changes
+    # by more than 2 % a pixel at this size is rejected, 4 % of what is visible.
     _, _, seen, found = pairs
     total = dict.fromkeys(metrics.COUNTS, 0)
     inner = dict(total)
     for pair in found.values():
         mask = warped(pair, seen, EXACT).mask
         for sums, among in ((total, None), (inner, ~pair.edge)):
-            for name, count in metrics.confusion(mask, pair.label, pair.hits.valid, pair.behind, among).items():
+            for name, count in metrics.confusion(
+                mask, pair.label, pair.hits.valid, pair.behind, among
+            ).items():
                 sums[name] += count
     assert total["visible_accepted"] > 10_000
     assert total["hidden_rejected"] > 3_000
@@ -88,12 +102,15 @@ def test_features_of_the_solid_field_warp_to_their_own_points(pairs, size):
     features = torch.from_numpy(field.on_grid(geometry.trace(small.source).point))
     exact = field.on_grid(small.hits.point, background=math.nan)
     got = metrics.feature_error(layer.warp(features), exact, layer.mask, small.visible, small.edge)
-    slipped = warped(pair, seen, preset("corrected", **{**EXACT.to_dict(), "pixel_centers": "integer"})).at(
-        (size, size)
+    slipped = warped(
+        pair, seen, preset("corrected", **{**EXACT.to_dict(), "pixel_centers": "integer"})
+    ).at((size, size))
+    worse = metrics.feature_error(
+        slipped.warp(features), exact, slipped.mask, small.visible, small.edge
     )
-    worse = metrics.feature_error(slipped.warp(features), exact, slipped.mask, small.visible, small.edge)
     assert got["warp.feature_pixels"] > 0.1 * np.count_nonzero(small.hits.valid)
-    # At 32 the field's shortest waves span 4 px or so on the nearest ground: interpolation itself errs by some percent.
+    # At 32 the field's shortest waves span 4 px or so on the nearest ground: interpolation itself
+    # errs by some percent.
     assert got["warp.feature_accepted.interior"] < {128: 0.02, 32: 0.2}[size]
     assert worse["warp.feature_accepted.interior"] > 1.2 * got["warp.feature_accepted.interior"]
 

@@ -1,4 +1,6 @@
-"""Oracles: pictures of one colour whose blends follow by hand, colorsys, and encoders whose embeddings are means of pixels."""
+"""Oracles: pictures of one colour whose blends follow by hand, colorsys, and encoders whose
+embeddings are means of pixels.
+"""
 
 import colorsys
 import dataclasses
@@ -23,29 +25,81 @@ SCENE = {
     "name": "ball",
     "title": "A ball and a box on the ground",
     "objects": [
-        {"name": "ground", "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [8, 8], "facing": [0, 0, 1]},
-         "texture": {"type": "checker", "colors": ["#808080", "#909090"], "size": 1.0}},
-        {"name": "ball", "shape": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8},
-         "texture": {"type": "checker", "colors": ["#3050c0", "#4060d0"], "size": 0.5}},
-        {"name": "box", "shape": {"type": "box", "center": [0.3, 1.6, 0.3], "size": [0.6, 0.6, 0.6]},
-         "texture": {"type": "checker", "colors": ["#c0c0c0", "#d0d0d0"], "size": 0.3}},
+        {
+            "name": "ground",
+            "shape": {
+                "type": "rectangle",
+                "center": [0, 0, 0],
+                "size": [8, 8],
+                "facing": [0, 0, 1],
+            },
+            "texture": {"type": "checker", "colors": ["#808080", "#909090"], "size": 1.0},
+        },
+        {
+            "name": "ball",
+            "shape": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8},
+            "texture": {"type": "checker", "colors": ["#3050c0", "#4060d0"], "size": 0.5},
+        },
+        {
+            "name": "box",
+            "shape": {"type": "box", "center": [0.3, 1.6, 0.3], "size": [0.6, 0.6, 0.6]},
+            "texture": {"type": "checker", "colors": ["#c0c0c0", "#d0d0d0"], "size": 0.3},
+        },
     ],
     "lights": [{"type": "sky", "horizon": "#ffffff", "zenith": "#ffffff", "radiance": 0.8}],
-    "cameras": {"look_at": [0, 0, 0.7], "radius": 4, "fov": 50, "size": [32, 32], "source": {"yaw": 0, "height": 1.5},
-                "targets": [{"yaw": 15, "height": 1.5}, {"yaw": 30, "height": 1.5}]},
+    "cameras": {
+        "look_at": [0, 0, 0.7],
+        "radius": 4,
+        "fov": 50,
+        "size": [32, 32],
+        "source": {"yaw": 0, "height": 1.5},
+        "targets": [{"yaw": 15, "height": 1.5}, {"yaw": 30, "height": 1.5}],
+    },
     "edits": [
-        {"name": "green", "instruction": "Make the ball green", "source": "a blue ball", "target": "a green ball",
-         "changes": [{"object": "ball", "paint": "#30c050"}]},
-        {"name": "orange_box", "instruction": "Make the box orange", "source": "a grey box", "target": "an orange box",
-         "changes": [{"object": "box", "paint": "#e08020"}]},
-        {"name": "any", "instruction": "Paint the ball", "source": "a blue ball", "target": "a bright ball",
-         "answers": [{"name": n, "target": f"a {n} ball", "changes": [{"object": "ball", "paint": c}]}
-                     for n, c in (("red", "#d02020"), ("yellow", "#e0d020"), ("white", "#f0f0f0"), ("pink", "#f080b0"))]},
-        {"name": "dusk", "instruction": "Make it dusk", "source": "by day", "target": "at dusk",
-         "lights": [{"type": "sky", "horizon": "#f0a060", "zenith": "#604060", "radiance": 0.5}]},
+        {
+            "name": "green",
+            "instruction": "Make the ball green",
+            "source": "a blue ball",
+            "target": "a green ball",
+            "changes": [{"object": "ball", "paint": "#30c050"}],
+        },
+        {
+            "name": "orange_box",
+            "instruction": "Make the box orange",
+            "source": "a grey box",
+            "target": "an orange box",
+            "changes": [{"object": "box", "paint": "#e08020"}],
+        },
+        {
+            "name": "any",
+            "instruction": "Paint the ball",
+            "source": "a blue ball",
+            "target": "a bright ball",
+            "answers": [
+                {"name": n, "target": f"a {n} ball", "changes": [{"object": "ball", "paint": c}]}
+                for n, c in (
+                    ("red", "#d02020"),
+                    ("yellow", "#e0d020"),
+                    ("white", "#f0f0f0"),
+                    ("pink", "#f080b0"),
+                )
+            ],
+        },
+        {
+            "name": "dusk",
+            "instruction": "Make it dusk",
+            "source": "by day",
+            "target": "at dusk",
+            "lights": [{"type": "sky", "horizon": "#f0a060", "zenith": "#604060", "radiance": 0.5}],
+        },
     ],
-}  # fmt: skip
-WORDS = {"a blue ball": (0, 0, 1), "a green ball": (0, 1, 0), "a grey box": (1, 1, 1), "an orange box": (1, 0.5, 0)}
+}
+WORDS = {
+    "a blue ball": (0, 0, 1),
+    "a green ball": (0, 1, 0),
+    "a grey box": (1, 1, 1),
+    "an orange box": (1, 0.5, 0),
+}
 
 
 @dataclasses.dataclass
@@ -66,14 +120,18 @@ class Fake:
 
 def fake(name, weights="w"):
     kind = name.partition("-")[0]
-    return Fake(EncoderInfo(name, kind, f"/somewhere/{name}", f"{kind}-{weights}", "as it is", None, 3))
+    return Fake(
+        EncoderInfo(name, kind, f"/somewhere/{name}", f"{kind}-{weights}", "as it is", None, 3)
+    )
 
 
 @pytest.fixture
 def encoders(monkeypatch):
     """The bundled encoders' names, with fakes behind them; ``weights`` says which."""
     state = SimpleNamespace(weights="w")
-    monkeypatch.setattr(sensitivity, "load_encoder", lambda name, kind=None: fake(name, state.weights))
+    monkeypatch.setattr(
+        sensitivity, "load_encoder", lambda name, kind=None: fake(name, state.weights)
+    )
     return state
 
 
@@ -86,10 +144,17 @@ def scene(tmp_path_factory):
 
 def study(scene, folder, **changes):
     said = {
-        "name": "small", "size": 32, "scenes": [str(scene)], "feature_sizes": [32], "spp": 4, "timing_rounds": 3,
+        "name": "small",
+        "size": 32,
+        "scenes": [str(scene)],
+        "feature_sizes": [32],
+        "spp": 4,
+        "timing_rounds": 3,
         "encoders": {"clip": "clip-small", "dino": "dino-small", "perceptual": "perceptual-small"},
-        "edits": ["green", "orange_box"], "probes": {"sensitivity": []}, **changes,
-    }  # fmt: skip
+        "edits": ["green", "orange_box"],
+        "probes": {"sensitivity": []},
+        **changes,
+    }
     path = folder / "study.yaml"
     path.write_text(yaml.safe_dump(said))
     return load_study(str(path))
@@ -103,11 +168,21 @@ def cell_of(scene, folder, **changes):
 
 
 def shot(**changes):
-    """A picture of 8 x 12 px, dark grey before the edit, light orange after, its left half edited."""
+    """A picture of 8 x 12 px, dark grey before the edit, light orange after, its left half
+    edited."""
     before, after = np.full((8, 12, 3), 0.1), np.broadcast_to([0.8, 0.6, 0.2], (8, 12, 3)).copy()
     mask = np.zeros((8, 12), dtype=bool)
     mask[:, :6] = True
-    return Shot(**{"index": 1, "before": before, "after": after, "mask": mask, "hue": np.array([0, 1.0, 1]), **changes})
+    return Shot(
+        **{
+            "index": 1,
+            "before": before,
+            "after": after,
+            "mask": mask,
+            "hue": np.array([0, 1.0, 1]),
+            **changes,
+        }
+    )
 
 
 def picture(name, of, seed=0):
@@ -130,7 +205,9 @@ def test_a_wrong_colour_keeps_the_value_inside_the_mask_and_everything_outside()
 @pytest.mark.parametrize("color", [(0.8, 0.6, 0.2), (0.1, 0.2, 0.9), (0.5, 0.1, 0.4)])
 def test_the_wrong_hue_is_half_a_circle_away(color):
     hue, _, _ = colorsys.rgb_to_hsv(*color)
-    np.testing.assert_allclose(opposite_hue(np.array(color)), colorsys.hsv_to_rgb((hue + 0.5) % 1, 1, 1), atol=1e-12)
+    np.testing.assert_allclose(
+        opposite_hue(np.array(color)), colorsys.hsv_to_rgb((hue + 0.5) % 1, 1, 1), atol=1e-12
+    )
 
 
 def test_grey_has_no_hue_and_still_gets_a_wrong_colour():
@@ -142,7 +219,9 @@ def test_an_edit_of_several_answers_takes_the_others_for_what_is_wrong():
     of = shot(others=others)
     np.testing.assert_array_equal(picture("wrong_colour", of), to_srgb(others[0]))
     np.testing.assert_array_equal(picture("inconsistent", of), to_srgb(others[1]))
-    np.testing.assert_array_equal(picture("inconsistent", shot(others=others, index=2)), to_srgb(others[0]))
+    np.testing.assert_array_equal(
+        picture("inconsistent", shot(others=others, index=2)), to_srgb(others[0])
+    )
 
 
 def test_views_that_disagree_leave_the_source_right_and_others_carry_their_flaw_there_too():
@@ -163,7 +242,9 @@ def test_blur_keeps_the_light_and_misplacing_moves_two_pixels():
     blurred = of.blurred()
     assert blurred.sum() == pytest.approx(3, rel=1e-9)
     variance = (blurred[..., 0].sum(0) * (np.arange(128) - 64.0) ** 2).sum()
-    assert math.sqrt(variance) == pytest.approx(2 * 128 / 256, rel=0.01)  # a sampled Gaussian, cut at four sigma
+    assert math.sqrt(variance) == pytest.approx(
+        2 * 128 / 256, rel=0.01
+    )  # a sampled Gaussian, cut at four sigma
     assert of.misplaced()[64, 66].tolist() == [1, 1, 1]
     assert of.misplaced().shape == after.shape
 
@@ -177,9 +258,10 @@ def test_noise_has_its_standard_deviation_is_another_in_each_view_and_the_same_a
     np.testing.assert_array_equal(again, noise + to_srgb(grey))
     assert (
         abs(
-            np.corrcoef(noise.ravel(), (picture("noisy", shot(**{**vars(of), "index": 2})) - to_srgb(grey)).ravel())[
-                0, 1
-            ]
+            np.corrcoef(
+                noise.ravel(),
+                (picture("noisy", shot(**{**vars(of), "index": 2})) - to_srgb(grey)).ravel(),
+            )[0, 1]
         )
         < 0.05
     )
@@ -190,7 +272,8 @@ def test_every_edit_is_asked_and_ambiguous_ones_two_answers_at_most(scene):
     assert list(found) == ["green", "orange_box", "any-red", "any-yellow", "dusk"]
     assert [name for name, _ in found["any-red"].others] == ["yellow", "white"]
     assert found["any-red"].target == "a red ball"
-    # The ball's edits are wrong in place of the box's and the other way round; light is nobody's object.
+    # The ball's edits are wrong in place of the box's and the other way round; light is nobody's
+    # object.
     elsewhere = {name: task.elsewhere[0] for name, task in found.items()}
     assert elsewhere["green"] == elsewhere["any-red"] == "orange_box"
     assert elsewhere["orange_box"] == "any"
@@ -209,7 +292,9 @@ def test_where_all_edits_change_one_object_nothing_is_a_wrong_object(tmp_path):
 def test_the_cells_id_follows_the_weights_and_not_where_they_lie(scene, tmp_path, encoders):
     first = cell_of(scene, tmp_path)
     renamed = cell_of(
-        scene, tmp_path, encoders={"clip": "clip:/elsewhere", "dino": "dino-small", "perceptual": "lpips:/l"}
+        scene,
+        tmp_path,
+        encoders={"clip": "clip:/elsewhere", "dino": "dino-small", "perceptual": "lpips:/l"},
     )
     assert first.encoders != renamed.encoders
     assert {k: v["weights_sha256"] for k, v in first.spec["encoders"].items()} == {
@@ -223,7 +308,9 @@ def test_the_cells_id_follows_the_weights_and_not_where_they_lie(scene, tmp_path
 def test_weights_that_change_under_a_run_are_refused(scene, tmp_path, encoders):
     cell = cell_of(scene, tmp_path)
     encoders.weights = "other"
-    with pytest.raises(InputError, match="'clip-small': its weights have changed since the run was planned"):
+    with pytest.raises(
+        InputError, match="'clip-small': its weights have changed since the run was planned"
+    ):
         compute(cell, str(scene), tmp_path, threads=1)
 
 
@@ -232,7 +319,10 @@ def test_weights_that_change_under_a_run_are_refused(scene, tmp_path, encoders):
     [
         ({"edits": ["gren"]}, "edits: no scene has an edit 'gren'; did you mean 'green'"),
         ({"scenes": ["spheres"], "edits": []}, "scene 'spheres' names no edits"),
-        ({"scenes": ["SCENE", "bear"]}, "edits: scene 'bear' has none of green, orange_box; there are polar"),
+        (
+            {"scenes": ["SCENE", "bear"]},
+            "edits: scene 'bear' has none of green, orange_box; there are polar",
+        ),
         ({"encoders": {"clip": "clip:/nowhere"}}, "encoders.clip: .*/nowhere"),
     ],
 )
@@ -240,7 +330,10 @@ def test_what_cannot_be_asked_says_why(scene, tmp_path, changes, message, reques
     if "encoders" not in changes:
         request.getfixturevalue("encoders")
     if "scenes" in changes:
-        changes = {**changes, "scenes": [str(scene) if s == "SCENE" else s for s in changes["scenes"]]}
+        changes = {
+            **changes,
+            "scenes": [str(scene) if s == "SCENE" else s for s in changes["scenes"]],
+        }
     with pytest.raises(StudyError, match=message):
         cell_of(scene, tmp_path, **changes)
 
@@ -262,22 +355,36 @@ def test_every_metric_of_every_condition_is_recorded_with_its_value(record, scen
     figures = record["views"][0]["metrics"]
     names = {key.rpartition(".")[0] for key in figures}
     assert len(figures) == len(names) * len(CONDITIONS)
-    assert {"embedding.clip_directional", "embedding.dino_image", "fidelity.distance.inside"} <= names
+    assert {
+        "embedding.clip_directional",
+        "embedding.dino_image",
+        "fidelity.distance.inside",
+    } <= names
 
     # The same by hand: pictures from the renderer, embeddings as means of pixels.
     at = load_scene(str(scene)).with_size(32, 32)
     camera = at.targets[0]
-    before, after = (np.clip(appearance(s, camera, spp=4, seed=0), 0, 1) for s in (at, at.edited("green")))
+    before, after = (
+        np.clip(appearance(s, camera, spp=4, seed=0), 0, 1) for s in (at, at.edited("green"))
+    )
     half = to_srgb((before + after) / 2).astype(np.float64)
     mean = half.mean((0, 1))
     green, blue = np.array([0, 1.0, 0]), np.array([0, 0, 1.0])
-    assert figures["embedding.clip_similarity.strength_050"] == pytest.approx(cosine(mean, green), abs=1e-6)
+    assert figures["embedding.clip_similarity.strength_050"] == pytest.approx(
+        cosine(mean, green), abs=1e-6
+    )
     unedited = to_srgb(before).mean((0, 1), dtype=np.float64)
     change = mean / np.linalg.norm(mean) - unedited / np.linalg.norm(unedited)
     # The change is a small difference of means of float32 pictures.
-    assert figures["embedding.clip_directional.strength_050"] == pytest.approx(cosine(change, green - blue), abs=1e-3)
-    source = to_srgb(np.clip(appearance(at.edited("green"), at.source, spp=4, seed=0), 0, 1)).mean((0, 1))
-    assert figures["embedding.dino_image.strength_050"] == pytest.approx(cosine(mean, source), abs=1e-6)
+    assert figures["embedding.clip_directional.strength_050"] == pytest.approx(
+        cosine(change, green - blue), abs=1e-3
+    )
+    source = to_srgb(np.clip(appearance(at.edited("green"), at.source, spp=4, seed=0), 0, 1)).mean(
+        (0, 1)
+    )
+    assert figures["embedding.dino_image.strength_050"] == pytest.approx(
+        cosine(mean, source), abs=1e-6
+    )
     error = ((half - to_srgb(after)) ** 2).mean()
     assert figures["fidelity.mse.strength_050"] == pytest.approx(error, rel=1e-4)
     distance = np.abs(half - to_srgb(after)).mean()
@@ -294,13 +401,21 @@ def test_what_is_undefined_is_null_and_what_is_equal_has_its_mse(record):
 def test_seconds_are_taken_in_turn_for_every_metric(record):
     rounds = record["cost"]["rounds"]
     assert set(rounds) == {
-        "fidelity.mse", "fidelity.ssim", "fidelity.distance", "consistency.delta_e", "embedding.clip_similarity",
-        "embedding.clip_directional", "embedding.clip_image", "embedding.dino_image",
-    }  # fmt: skip
+        "fidelity.mse",
+        "fidelity.ssim",
+        "fidelity.distance",
+        "consistency.delta_e",
+        "embedding.clip_similarity",
+        "embedding.clip_directional",
+        "embedding.clip_image",
+        "embedding.dino_image",
+    }
     assert all(len(taken) == 3 and min(taken) > 0 for taken in rounds.values())
 
 
-def test_without_encoders_their_metrics_are_left_out_and_a_missing_flaw_is_undefined(scene, tmp_path, encoders):
+def test_without_encoders_their_metrics_are_left_out_and_a_missing_flaw_is_undefined(
+    scene, tmp_path, encoders
+):
     path = tmp_path / "one.yaml"
     path.write_text(yaml.safe_dump({**SCENE, "edits": SCENE["edits"][:1]}))
     cell = cell_of(path, tmp_path, encoders={}, edits=[])
