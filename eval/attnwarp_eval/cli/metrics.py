@@ -82,7 +82,7 @@ def metrics(
                 inputs,
                 kinds,
                 device=device,
-                progress=lambda done, total, view: show(view, done, total),
+                progress=show,
             )
         paths = write.write(measured, out)
     if as_json:

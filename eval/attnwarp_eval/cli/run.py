@@ -86,11 +86,11 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
         def listen(event: str, info: dict[str, Any]) -> None:
             nonlocal finished
             if event == "start":
-                show(info["title"])
+                show.step(info["title"])
                 return
             finished += 1
             error = f" FAILED: {info['error']}" if event == "failed" else ""
-            show(info["title"] + error, finished)
+            show(finished, total, info["title"] + error)
             if error and show.console.is_terminal:
                 show.line(info["title"] + error)
 

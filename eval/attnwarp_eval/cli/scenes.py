@@ -65,7 +65,9 @@ def render(
         loaded = load_scene(scene).with_size(size, size)
         folder = out or Path("runs") / "scenes" / loaded.name
         with progress() as show:
-            written = list(render_views(loaded, folder, views=names(views), spp=spp, progress=show))
+            written = list(
+                render_views(loaded, folder, views=names(views), spp=spp, progress=show.step)
+            )
     typer.echo(written[-1])
 
 
@@ -97,7 +99,7 @@ def export(
         with progress() as show:
             fitted.export(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
-                progress=lambda text: show(f"{loaded.name}: {text}"),
+                progress=lambda text: show.step(f"{loaded.name}: {text}"),
             )  # fmt: skip
     typer.echo(out / "transforms.json")
 
@@ -182,7 +184,11 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
             progress(len(scenes), lines=True) as show,
             resumable(lambda: "finished scenes are kept"),
         ):
-            entries = collect(scenes, out, Settings(prove=prove, budget=budget), show)
+
+            def watch(text: str, done: int) -> None:
+                show(done, len(scenes), text)
+
+            entries = collect(scenes, out, Settings(prove=prove, budget=budget), watch)
     typer.echo(out / "effects.md")
     doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
                 and e["proof"]["verdict"] != "certified"]  # fmt: skip
@@ -208,7 +214,7 @@ def accuracy(
         from attnwarp_eval.experiments import accuracy as truth
 
         with progress() as show:
-            panels = truth.measure(scenes or (), rounds=rounds, progress=show)
+            panels = truth.measure(scenes or (), rounds=rounds, progress=show.step)
         for path in truth.write(panels, out):
             typer.echo(path)
 
@@ -248,7 +254,7 @@ def time_(
                 size=size,
                 spp=spp,
                 geometry_size=geometry_size,
-                progress=show,
+                progress=show.step,
             ):
                 times.append(taken)
                 # All of them take minutes, so each is printed as soon as it is measured.

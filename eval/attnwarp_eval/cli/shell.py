@@ -74,18 +74,21 @@ class Progress:
         self._task = task
         self._lines = lines and not console.is_terminal
 
-    def __call__(self, text: str, done: int | None = None, total: int | None = None) -> None:
-        """Show what is being done now.
+    def __call__(self, done: int, total: int, step: str) -> None:
+        """Show how far the work is.
 
         Args:
-            text: the step that starts or has just ended.
-            done: steps finished; unchanged if left out.
-            total: steps in all; unchanged if left out.
+            done: steps finished.
+            total: steps in all; 0 while their number is unknown.
+            step: what is at work, or has just ended.
         """
-        self._bar.update(self._task, description=text, completed=done, total=total)
-        if self._lines and done is not None:
-            count = f"[{done}/{self._bar.tasks[0].total:.0f}] " if self._bar.tasks[0].total else ""
-            self.line(count + text)
+        self._bar.update(self._task, description=step, completed=done, total=total or None)
+        if self._lines:
+            self.line(f"[{done}/{total}] {step}" if total else step)
+
+    def step(self, text: str) -> None:
+        """Name what is at work, without a count."""
+        self._bar.update(self._task, description=text)
 
     def line(self, text: str) -> None:
         """Print a line above the bar."""
@@ -93,13 +96,13 @@ class Progress:
 
 
 @contextmanager
-def progress(total: int | None = None, *, done: int = 0, lines: bool = False) -> Iterator[Progress]:
+def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[Progress]:
     """The progress bar of a command.
 
     Args:
-        total: number of steps; None while it is unknown.
+        total: number of steps; 0 while it is unknown.
         done: steps finished before.
-        lines: without a terminal, print a line for every call that gives ``done``.
+        lines: without a terminal, print a line for every call.
     """
     from rich.console import Console
     from rich.progress import (
@@ -121,4 +124,6 @@ def progress(total: int | None = None, *, done: int = 0, lines: bool = False) ->
         TimeRemainingColumn(),
     )
     with RichProgress(*columns, console=console, disable=not console.is_terminal) as bar:
-        yield Progress(console, bar, bar.add_task("starting", total=total, completed=done), lines)
+        yield Progress(
+            console, bar, bar.add_task("starting", total=total or None, completed=done), lines
+        )
