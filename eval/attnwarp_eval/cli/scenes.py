@@ -93,11 +93,11 @@ def export(
     """
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
-        from attnwarp_eval.splats import fitted
+        from attnwarp_eval.splats.export import export as write_scene
 
         loaded = load_scene(scene)
         with progress() as show:
-            fitted.export(
+            write_scene(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
                 progress=lambda text: show.step(f"{loaded.name}: {text}"),
             )  # fmt: skip
