@@ -65,8 +65,8 @@ def metrics(
         bool, typer.Option("--json", help="Print metrics.json instead of a table.")
     ] = False,
 ) -> None:
-    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures. What is left out is said,
-    with the reason.
+    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures; a figure that cannot be
+    computed is named with the reason.
     """
     from rich.console import Console
 
@@ -129,10 +129,10 @@ def encoders(
     import json
 
     with clear_errors():
-        from attnwarp import encoders as known
+        from attnwarp.encoders import BUNDLED, REAL, load_encoder
 
         if name is not None:
-            about = known.load_encoder(name).about.to_dict()
+            about = load_encoder(name).about.to_dict()
             lines = (
                 [json.dumps(about, indent=2)]
                 if as_json
@@ -140,13 +140,13 @@ def encoders(
             )
         elif as_json:
             rows = [
-                {"name": n, "kind": kind, "about": line, "bundled": n in known.BUNDLED}
-                for n, (kind, line) in (known.BUNDLED | known.REAL).items()
+                {"name": n, "kind": kind, "about": line, "bundled": n in BUNDLED}
+                for n, (kind, line) in (BUNDLED | REAL).items()
             ]
             lines = [json.dumps(rows, indent=2)]
         else:
             lines = ["ships with the package:"]
-            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.BUNDLED.items()]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in BUNDLED.items()]
             lines += ["read from a place of yours (docs/encoders.md says which files go there):"]
-            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.REAL.items()]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in REAL.items()]
     typer.echo("\n".join(lines))

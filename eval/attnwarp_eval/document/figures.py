@@ -1,4 +1,4 @@
-"""Figures of the report, as SVG whose bytes depend on the numbers alone."""
+"""Figures as SVG, whose bytes depend on the numbers alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.transforms import BboxBase
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#000000")
-"""Okabe and Ito's colours, which people with any kind of colour vision can tell apart."""
+"""Okabe and Ito's colours, distinct for every kind of colour vision."""
 
 MARKERS = "osD^vP*X"
 
@@ -94,13 +94,13 @@ def lines(
         keep = np.isfinite(mean)
         if not keep.any():
             continue
-        where = np.asarray(line.x, dtype=float)[keep]
+        x_values = np.asarray(line.x, dtype=float)[keep]
         low = np.array([v.low if v.known else v.mean for v in line.y])[keep]
         high = np.array([v.high if v.known else v.mean for v in line.y])[keep]
         shift = (i - (len(series) - 1) / 2) * 0.8
         bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
         axes.errorbar(
-            where + shift,
+            x_values + shift,
             mean[keep],
             yerr=bars,
             color=PALETTE[i % len(PALETTE)],
@@ -147,12 +147,12 @@ def heatmap(
         np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1
     )
     for (i, j), value in np.ndenumerate(values):
-        shown = f"{value:.2f}" if np.isfinite(value) else "–"
+        text = f"{value:.2f}" if np.isfinite(value) else "–"
         dark = np.isfinite(value) and abs(value - 0.5) > 0.33
         axes.text(
             j + 0.5,
             i + 0.5,
-            shown,
+            text,
             ha="center",
             va="center",
             fontsize=8,
@@ -192,13 +192,13 @@ def cost_front(
     names = list(points)
     cost = [points[n][0].mean for n in names]
     error = [points[n][1].mean for n in names]
-    kept = front(cost, error)
+    on_front = front(cost, error)
     notes = []
     for i, name in enumerate(names):
         seconds, quality = points[name]
         if not (np.isfinite(seconds.mean) and np.isfinite(quality.mean)):
             continue
-        on = i in kept
+        on = i in on_front
         colour = PALETTE[0] if on else "#999999"
         # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above
         # it.
@@ -224,10 +224,10 @@ def cost_front(
                 color=colour,
             )
         )
-    if kept:
+    if on_front:
         axes.step(
-            [cost[i] for i in kept],
-            [error[i] for i in kept],
+            [cost[i] for i in on_front],
+            [error[i] for i in on_front],
             where="post",
             color=PALETTE[0],
             linewidth=1,
@@ -237,7 +237,7 @@ def cost_front(
     axes.set_title(title, loc="left", fontsize=9.5)
     axes.margins(0.2)
     _move_apart(axes, notes)
-    return [names[i] for i in kept]
+    return [names[i] for i in on_front]
 
 
 def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:

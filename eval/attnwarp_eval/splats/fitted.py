@@ -46,7 +46,7 @@ def fit_scene(
     Args:
         scene: with the image size that the fit is to have.
         settings: what is fitted and how.
-        folder: where the fit is kept; one that was stopped there is resumed.
+        folder: of the fit's files; a fit that was stopped there is resumed.
         views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
         watch: as in :func:`attnwarp.fit.fit`.

@@ -1,6 +1,4 @@
-"""Gaussian splats made from a scene's surfaces: a model whose errors are known, because they were
-put in.
-"""
+"""Gaussian splats sampled on a scene's surfaces: a model with errors of known size."""
 
 from __future__ import annotations
 
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 CANDIDATES = 4
-"""Random points drawn for each one that is kept. Yuksel 2015 recommends 3 to 5."""
+"""Random points drawn for each one that stays. Yuksel 2015 recommends 3 to 5."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,7 @@
 """Right results of an edit, and results with one known flaw each.
 
-A scene's edit has a true result, so the pictures that a method should have made are known, and so
-are pictures that it should not have made: an edit too weak, of a wrong colour, of a wrong thing,
-another in each view, blurred, noisy or out of place.
+A scene's edit has a true result, so both the right picture and wrong ones can be rendered: an edit
+too weak, of a wrong colour, of a wrong object, another in each view, blurred, noisy or misplaced.
 """
 
 from __future__ import annotations

@@ -1,4 +1,10 @@
-"""The probes: one file each. The modules of this folder are all that is known of them elsewhere."""
+"""The probes, one file each; other code finds them here by name.
+
+>>> [probe.name for probe in probes()]
+['calibration', 'depth', 'fit', 'sensitivity', 'timing', 'warp']
+>>> probe("depth").columns["AbsRel"]
+'depth.abs_rel'
+"""
 
 from __future__ import annotations
 

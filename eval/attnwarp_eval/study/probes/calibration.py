@@ -23,9 +23,9 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.table import USUAL, plan_words, said_by
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.parts import Study
+from attnwarp_eval.study.pictures import of_warp
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record
@@ -104,8 +104,8 @@ class Calibration(Probe[Extra]):
                 "feature_channels": study.feature_channels,
                 "spp": study.spp,
             }
-            shown = study.pictures_of(spec["views"])
-            yield Cell(spec, name, self.name, self.name, seed, (self.name,), shown)
+            pictures = study.pictures_of(spec["views"])
+            yield Cell(spec, name, self.name, self.name, seed, (self.name,), pictures)
 
     def compute(self, work: Work) -> Extra:
         """Warp the truth's own depth by the exact rules, view by view."""
@@ -123,7 +123,7 @@ class Calibration(Probe[Extra]):
             )
             figures |= {f"{key}.exact": value for key, value in own.items()}
             work.meter.count(pixels=size * size)
-            draw = partial(pictures.of_warp, work.world, name, spec["spp"], truth, view)
+            draw = partial(of_warp, work.world, name, spec["spp"], truth, view)
             work.add(name, figures, draw)
         return Extra(Transport(**said_by(work.world.scene)))
 

@@ -26,7 +26,7 @@ PLACES = (
     "depth.delta_1_25",
     "depth.normal_median",
 )
-"""Metrics that are shown inside surfaces and at edges apart."""
+"""Metrics with a table of their own for the inside of surfaces and for edges."""
 
 
 @register

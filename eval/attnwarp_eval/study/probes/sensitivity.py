@@ -45,11 +45,11 @@ FIDELITY = (
     ),
     *(f"fidelity.preserved_{name}" for name in ("mse", "psnr", "ssim", "distance")),
 )
-"""What is kept of :func:`attnwarp_eval.metrics.fidelity`."""
+"""Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has."""
 
 CONSISTENCY = ("consistency.delta_e", "consistency.rmse_srgb", "consistency.pixels")
-"""What is kept of :func:`attnwarp_eval.metrics.cross_view`: of the edited object, against the
-source view.
+"""Figures of :func:`attnwarp_eval.metrics.cross_view` that a record has: of the edited object,
+against the source view.
 """
 
 
@@ -412,7 +412,7 @@ def _rounds(
     spec: Mapping[str, Any],
 ) -> dict[str, list[float]]:
     """Seconds that one picture costs each metric, in turn in an order drawn anew each round; a
-    first round is not kept.
+    first round does not count.
 
     What is made once for all pictures is in none of them: truth, correspondences, and the
     embeddings of the prompts, of the edited source view and of the view before the edit.

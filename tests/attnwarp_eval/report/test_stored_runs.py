@@ -1,0 +1,48 @@
+"""Two runs that former code computed: today's code verifies them and writes the same reports.
+
+``data/runs.tar.xz`` holds ``variants`` (the probes of variants on two scenes, 24 x 24 px) and
+``edits`` (sensitivity, without encoders) as revision 33b7813e6823 wrote them, with its report.md and
+results.jsonl of ``report --no-timings --no-pictures``. Where a protocol or a scene is changed on
+purpose, run the studies in their study.json again and put the new folders there.
+"""
+
+import pathlib
+import tarfile
+
+import pytest
+
+from attnwarp_eval.report import write_report
+from attnwarp_eval.study import Store
+from attnwarp_eval.study import run as runner
+from attnwarp_eval.study.probes import probe
+
+DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stored")
+    with tarfile.open(DATA) as archive:
+        archive.extractall(folder, filter="data")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["variants", "edits"])
+def test_ids_records_and_reports_are_the_bytes_that_they_were(folder, name):
+    store = Store(folder / name)
+    # The ids follow from the study, the scenes and the protocols of today.
+    problems = runner.verify(store)
+    assert problems.ok, problems
+    assert problems.checked == {"variants": 16, "edits": 2}[name]
+    for cell in store.done():
+        data = store.read(cell)
+        stored = store.path(cell).read_bytes()
+        store.write(probe(data["spec"]["probe"]).read(data).to_json())
+        assert store.path(cell).read_bytes() == stored
+
+    files = ("report.md", "results.jsonl")
+    expected = {file: (store.root / file).read_bytes() for file in files}
+    for file in files:
+        (store.root / file).unlink()
+    write_report(store, timings=False, pictures=False)
+    assert {file: (store.root / file).read_bytes() for file in files} == expected
