@@ -1,4 +1,4 @@
-# Every target makes .venv first (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
+# Every target makes .venv first, with the extras it needs (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
 SHELL := /bin/bash
 BIN := .venv/bin
 RUN ?= runs/demo
@@ -8,7 +8,8 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 .PHONY: demo test test-all bench lint venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
-demo: venv
+demo:
+	@scripts/venv.sh edit,eval
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
 ## lint, types and the tests that fit in a coffee break
