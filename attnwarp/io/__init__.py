@@ -4,6 +4,7 @@ from attnwarp.io.colmap import read_colmap
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.folder import read_dataset
+from attnwarp.io.images import image_size, read_image
 from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
 from attnwarp.io.splat import write_splat
 from attnwarp.io.transforms import read_transforms, write_transforms
@@ -12,8 +13,10 @@ __all__ = [
     "THIRD_SCALE",
     "Dataset",
     "FileFormatError",
+    "image_size",
     "read_colmap",
     "read_dataset",
+    "read_image",
     "read_ply",
     "read_points",
     "read_transforms",

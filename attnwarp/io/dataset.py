@@ -13,6 +13,7 @@ import numpy.typing as npt
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.io.file import FileFormatError
+from attnwarp.io.images import image_size
 
 Array = npt.NDArray[np.float64]
 
@@ -134,21 +135,6 @@ def nearest_rotation(path: Path, where: str, R: Array) -> Array:
     U, _, Vt = np.linalg.svd(R)
     rotation: Array = U @ Vt
     return rotation
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from an image's header, without decoding it and without turning it by its
-    EXIF tag.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except UnidentifiedImageError as error:
-        raise FileFormatError(
-            path, "not an image that can be read; replace it or leave it out"
-        ) from error
 
 
 def with_images(

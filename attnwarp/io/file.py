@@ -10,8 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+from attnwarp.errors import InputError
 
-class FileFormatError(ValueError):
+
+class FileFormatError(InputError):
     """A file that cannot be read as what it claims to be.
 
     The message names the file, the property or field, the first bad row where there is one (counted

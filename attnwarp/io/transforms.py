@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp.io.dataset import Dataset, Missing, image_size, nearest_rotation, with_images
+from attnwarp.io.dataset import Dataset, Missing, nearest_rotation, with_images
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
+from attnwarp.io.images import image_size
 from attnwarp.io.ply import read_points, write_points
 
 Array = npt.NDArray[np.float64]

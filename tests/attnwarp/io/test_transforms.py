@@ -249,7 +249,7 @@ def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
 def test_a_file_that_is_no_image_is_refused(tmp_path):
     path = folder_of(tmp_path)
     (tmp_path / "images/001.png").write_text("not a picture")
-    with pytest.raises(FileFormatError, match=r"001.png: not an image"):
+    with pytest.raises(FileFormatError, match=r"001.png: cannot be read as an image"):
         read_transforms(path)
 
 
