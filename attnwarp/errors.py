@@ -1,5 +1,5 @@
-"""The one kind of error that is a person's to mend: the command line shows its message and exits
-with code 2.
+"""Errors and warnings about a person's input: the command line shows their message, and exits with
+code 2 after an error.
 """
 
 from __future__ import annotations
@@ -14,7 +14,18 @@ class InputError(ValueError):
     """
 
 
-def suggest(word: str, known: Sequence[str]) -> str:
-    """The end of a message: the known word nearest to a misspelt one; empty where none is near."""
-    near = difflib.get_close_matches(word, known, n=1)
+class InputWarning(UserWarning):
+    """An input that is used, though perhaps not as it was meant. The message names the file, and
+    what was left out or changed.
+    """
+
+
+def suggest(word: str, allowed: Sequence[str]) -> str:
+    """The end of a message: the allowed word nearest to a misspelt one; empty where none is near.
+
+    Example:
+        >>> suggest("lr_mean", ["lr_means", "ssim"])
+        "; did you mean 'lr_means'?"
+    """
+    near = difflib.get_close_matches(word, allowed, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

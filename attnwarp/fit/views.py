@@ -119,9 +119,15 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
         ValueError: no camera has a picture.
     """
     cameras, images = [], []
-    for camera, path in zip(dataset.cameras, dataset.image_paths, strict=True):
+    for camera, path, lens in zip(
+        dataset.cameras, dataset.image_paths, dataset.lenses, strict=True
+    ):
         if path is None:
             continue
+        if lens is not None:
+            raise FileFormatError(
+                path, "was taken through a lens that distorts; undistort the data set first"
+            )
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
             raise FileFormatError(

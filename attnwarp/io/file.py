@@ -34,6 +34,14 @@ class FileFormatError(InputError):
         super().__init__(f"{path}: {field}: {message}" if field else f"{path}: {message}")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; False too for a name that no file system can hold."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def existing_file(path: str | os.PathLike[str]) -> Path:
     """``path`` as a Path.
 
@@ -42,7 +50,11 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
         FileFormatError: it is a folder, or it is empty.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        exists = path.exists()
+    except ValueError:  # a zero byte in the name
+        exists = False
+    if not exists:
         raise FileNotFoundError(f"{path}: no such file")
     if path.is_dir():
         raise FileFormatError(path, "is a folder, expected a file")

@@ -80,6 +80,19 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     return np.asarray(cv2.cvtColor(image, code))
 
 
+def encode_png(rgb: npt.NDArray[Any]) -> bytes:
+    """The PNG of a picture.
+
+    Args:
+        rgb: (H, W, 3) or (H, W, 4) uint8 or uint16 RGB(A).
+    """
+    import cv2
+
+    code = cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR
+    _, data = cv2.imencode(".png", cv2.cvtColor(rgb, code))
+    return bytes(data.tobytes())
+
+
 def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
     """What ``use`` makes of the picture opened by Pillow, with its errors in one line.
 
