@@ -207,7 +207,8 @@ def _camera(
         )
     fx, fy, cx, cy = (params[0], *params[:3]) if model in ONE_FOCAL else params[:4]
     quat = np.array(pose.quat)
-    norm = np.linalg.norm(quat)
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quat)
     if not (np.isfinite(norm) and norm > 0) or not np.isfinite(pose.translation).all():
         raise FileFormatError(
             source,

@@ -309,7 +309,11 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     text = _check_counts(path)
     try:
         # plyfile closes what it reads text from.
-        with io.BytesIO(path.read_bytes()) if text else path.open("rb") as stream:
+        # Values too large for their type become infinite, and are refused as such.
+        with (
+            np.errstate(over="ignore"),
+            io.BytesIO(path.read_bytes()) if text else path.open("rb") as stream,
+        ):
             data = plyfile.PlyData.read(stream)
             left = 0 if text else path.stat().st_size - stream.tell()
     except plyfile.PlyHeaderParseError as error:
@@ -405,7 +409,7 @@ def _column(
             field=name,
         )
     raw = columns[name]
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         values = raw.astype(dtype)
     bad = np.isnan(values) if infinities else ~np.isfinite(values)
     _refuse(
