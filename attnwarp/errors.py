@@ -1,4 +1,6 @@
-"""Errors that the user can mend: the command line prints the message and exits with code 2."""
+"""Errors and warnings about a person's input: the command line shows their message, and exits with
+code 2 after an error.
+"""
 
 from __future__ import annotations
 
@@ -84,12 +86,18 @@ def optional_imports() -> Iterator[None]:
         raise explained from error
 
 
-def suggest(word: str, known: Sequence[str]) -> str:
-    """The end of a message: the known word nearest to a misspelt one; empty where none is near.
+class InputWarning(UserWarning):
+    """An input that is used, though perhaps not as it was meant. The message names the file, and
+    what was left out or changed.
+    """
+
+
+def suggest(word: str, allowed: Sequence[str]) -> str:
+    """The end of a message: the allowed word nearest to a misspelt one; empty where none is near.
 
     Example:
-        >>> suggest("bera", ["bear", "fence"])
-        "; did you mean 'bear'?"
+        >>> suggest("lr_mean", ["lr_means", "ssim"])
+        "; did you mean 'lr_means'?"
     """
-    near = difflib.get_close_matches(word, known, n=1)
+    near = difflib.get_close_matches(word, allowed, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
