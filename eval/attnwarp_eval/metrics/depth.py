@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from attnwarp.warp.view import angle_between
+from attnwarp.warp.rules import angle_between
 from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
 
 

@@ -19,10 +19,10 @@ import torch
 from attnwarp.errors import InputError
 from attnwarp.fit import FitSettings
 from attnwarp.render.threads import set_thread_count, thread_count
-from attnwarp.warp.correspondence import TAP_SPREAD
+from attnwarp.warp.depth import TAP_SPREAD
+from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
 from attnwarp.warp.settings import PRESETS, WarpSettings
 from attnwarp.warp.view import (
-    EXACT_DEPTH_TOLERANCE,
     Surface,
     WarpedView,
     render_surface,
