@@ -8,6 +8,7 @@ from attnwarp.warp.correspondence import (
     layer_size,
 )
 from attnwarp.warp.depth import TAP_SPREAD, depth_slope, resize_depth
+from attnwarp.warp.features import FeatureWarp
 from attnwarp.warp.masks import resize_mask
 from attnwarp.warp.rules import (
     EXACT_DEPTH_TOLERANCE,
@@ -25,7 +26,6 @@ from attnwarp.warp.sampling import sample, sample_at, sample_depth
 from attnwarp.warp.settings import PRESETS, WarpSettings, preset
 from attnwarp.warp.taps import SNAP
 from attnwarp.warp.view import (
-    FeatureWarp,
     Surface,
     WarpedView,
     render_surface,

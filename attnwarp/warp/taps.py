@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -35,3 +37,40 @@ def bilinear_taps(xy: Tensor, h: int, w: int) -> tuple[list[Tensor], Tensor]:
     taps = [y0 * w + x0, y0 * w + x1, y1 * w + x0, y1 * w + x1]
     weight = torch.stack([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy])
     return taps, weight
+
+
+@dataclass(frozen=True, eq=False)
+class Taps:
+    """The four taps of N positions on one grid of pixels.
+
+    Args:
+        index: (N, 4) int64, flat indices into the grid's pixels, row by row.
+        weight: (N, 4) float64 or float32, in [0, 1]; 0 for a tap that is not read. A position that
+            is undefined reads none.
+        pixels: the number of pixels of the grid.
+    """
+
+    index: Tensor
+    weight: Tensor
+    pixels: int
+
+    def to(self, device: torch.device, dtype: torch.dtype) -> Taps:
+        """The same taps on another device, with weights of another type."""
+        return Taps(self.index.to(device), self.weight.to(device, dtype), self.pixels)
+
+
+def taps_of(xy: Tensor, h: int, w: int) -> Taps:
+    """The taps of positions on an h x w grid.
+
+    Args:
+        xy: (H, W, 2) float64 positions in pixels of the grid (centres at +0.5); NaN reads nothing.
+        h, w: the grid's size.
+    """
+    defined = torch.isfinite(xy).all(dim=-1)
+    index, weight = bilinear_taps(torch.where(defined[..., None], xy, 0.5), h, w)
+    weight = torch.where(defined, weight, 0)
+    return Taps(
+        torch.stack(index, dim=-1).reshape(-1, 4),
+        weight.movedim(0, -1).reshape(-1, 4).contiguous(),
+        h * w,
+    )

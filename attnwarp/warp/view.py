@@ -18,6 +18,7 @@ from attnwarp.warp.correspondence import (
     layer_size,
 )
 from attnwarp.warp.depth import Array
+from attnwarp.warp.features import FeatureWarp
 from attnwarp.warp.masks import resize_mask
 from attnwarp.warp.rules import (
     camera_frame,
@@ -29,7 +30,6 @@ from attnwarp.warp.rules import (
     photometric,
     source_incidence,
 )
-from attnwarp.warp.sampling import sample
 from attnwarp.warp.settings import PRESETS, NormalTest, WarpSettings
 
 
@@ -50,25 +50,6 @@ class Surface:
     alpha: Array | None = None
     image: Array | None = None
     counters: dict[str, int] = field(default_factory=dict, repr=False)
-
-
-@dataclass(frozen=True, eq=False)
-class FeatureWarp:
-    """The warp at one feature size.
-
-    Args:
-        correspondence: on the target's feature grid, into the source's.
-        mask: (h, w) bool, where the warped features count.
-    """
-
-    correspondence: Correspondence
-    mask: Tensor
-
-    def warp(self, features: Tensor) -> Tensor:
-        """Target features (..., h, w) from (C, h, w) or (B, C, h, w) source ones;
-        :func:`attnwarp.warp.sample`.
-        """
-        return sample(features, self.correspondence)[0]
 
 
 @dataclass(frozen=True, eq=False)
