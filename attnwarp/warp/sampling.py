@@ -1,4 +1,8 @@
-"""Sampling of features and depth at the positions of a correspondence."""
+"""Sampling of features and depth at the positions of a correspondence, in torch on any device.
+
+This is the definition. :mod:`attnwarp.warp.cpu` has kernels that give the same bits for feature
+maps and tokens in the host's memory.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,7 @@ from attnwarp import check
 from attnwarp.warp.correspondence import Correspondence, in_bounds, positions_in
 from attnwarp.warp.depth import TAP_SPREAD, Array, blend_depth, valid_depth
 from attnwarp.warp.settings import DepthInterpolation
-from attnwarp.warp.taps import bilinear_taps, clamp_index
-
-_HALF_PRECISION = (torch.float16, torch.bfloat16)
+from attnwarp.warp.taps import Taps, clamp_index, taps_of
 
 
 def sample(
@@ -80,25 +82,69 @@ def sample_at(
         )
     h, w = features.shape[-2:]
     xy = xy.to(device=features.device, dtype=torch.float64)
-    # NaN is masked before it reaches an index.
-    defined = torch.isfinite(xy).all(dim=-1)
-    xy = torch.where(defined[..., None], xy, 0.5)
+    size = xy.shape[:2]
     flat = features.flatten(-2)
     if mode == "nearest":
+        # NaN is masked before it reaches an index.
+        defined = torch.isfinite(xy).all(dim=-1)
+        xy = torch.where(defined[..., None], xy, 0.5)
         j = clamp_index(torch.floor(xy[..., 0]), w)
         i = clamp_index(torch.floor(xy[..., 1]), h)
-        warped = flat[..., (i * w + j).reshape(-1)].unflatten(-1, defined.shape)
+        warped = flat[..., (i * w + j).reshape(-1)].unflatten(-1, size)
         return torch.where(
             defined, warped, torch.zeros((), dtype=features.dtype, device=features.device)
         )
-    index, weight = bilinear_taps(xy, h, w)
-    work = torch.float32 if features.dtype in _HALF_PRECISION else features.dtype
-    total = torch.zeros((), dtype=work, device=features.device)
-    for tap, share in zip(index, weight.to(work), strict=True):
-        value = flat[..., tap.reshape(-1)].unflatten(-1, defined.shape).to(work)
+    taps = taps_of(xy, h, w)
+    taps = Taps(taps.index, taps.weight.to(work_type(features.dtype)))
+    return sample_maps(flat, taps).unflatten(-1, size)
+
+
+def work_type(dtype: torch.dtype) -> torch.dtype:
+    """The type of weights and sums: float32 for half precision, else the features' own."""
+    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
+
+
+def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
+    """(..., N) weighted sums of the pixels of maps, in the maps' type.
+
+    Args:
+        maps: (..., h*w) floating.
+        taps: of N positions, with weights of :func:`work_type`, on the maps' device.
+    """
+    total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
+    for index, share in zip(taps.index, taps.weight, strict=True):
+        value = maps[..., index].to(total.dtype)
         # A tap of weight 0 may hold anything, an infinity included.
         total = total + torch.where(share > 0, value * share, 0)
-    return torch.where(defined, total, 0).to(features.dtype)
+    return total.to(maps.dtype)
+
+
+def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
+    """(B, N, C) weighted sums of tokens, in the weights' type.
+
+    Args:
+        tokens: (B, h*w, C) floating, row by row of the picture.
+        taps: as in :func:`sample_maps`.
+    """
+    total = torch.zeros((), dtype=taps.weight.dtype, device=tokens.device)
+    for index, share in zip(taps.index, taps.weight[..., None], strict=True):
+        value = tokens[:, index].to(total.dtype)
+        total = total + torch.where(share > 0, value * share, 0)
+    return total
+
+
+def blend_tokens(source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float) -> Tensor:
+    """a (M warp(source) + (1 - M) new) + (1 - a) new, in the type of ``new``, rounded once.
+
+    Args:
+        source: (B or 1, h*w, C), new: (B, N, C), of one type.
+        taps: as in :func:`sample_maps`.
+        mask: (N,) bool. Where it is False the result has the bits of ``new``.
+        alpha: in [0, 1].
+    """
+    warped = sample_tokens(source, taps)
+    mixed = alpha * warped + (1 - alpha) * new.to(warped.dtype)
+    return torch.where(mask[:, None], mixed.to(new.dtype), new)
 
 
 def sample_depth(

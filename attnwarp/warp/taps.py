@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,33 +46,28 @@ class Taps:
     """The four taps of N positions on one grid of pixels.
 
     Args:
-        index: (N, 4) int64, flat indices into the grid's pixels, row by row.
-        weight: (N, 4) float64 or float32, in [0, 1]; 0 for a tap that is not read. A position that
+        index: (4, N) int64, flat indices into the grid's pixels, row by row.
+        weight: (4, N) float64 or float32, in [0, 1]; 0 for a tap that is not read. A position that
             is undefined reads none.
-        pixels: the number of pixels of the grid.
     """
 
     index: Tensor
     weight: Tensor
-    pixels: int
 
-    def to(self, device: torch.device, dtype: torch.dtype) -> Taps:
-        """The same taps on another device, with weights of another type."""
-        return Taps(self.index.to(device), self.weight.to(device, dtype), self.pixels)
+    @functools.cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """``index`` as uint32 and ``weight``, for the kernels."""
+        return self.index.cpu().numpy().astype(np.uint32), self.weight.cpu().numpy()
 
 
 def taps_of(xy: Tensor, h: int, w: int) -> Taps:
-    """The taps of positions on an h x w grid.
+    """The taps of positions on an h x w grid, weights in float64.
 
     Args:
         xy: (H, W, 2) float64 positions in pixels of the grid (centres at +0.5); NaN reads nothing.
         h, w: the grid's size.
     """
+    # NaN is masked before it reaches an index.
     defined = torch.isfinite(xy).all(dim=-1)
     index, weight = bilinear_taps(torch.where(defined[..., None], xy, 0.5), h, w)
-    weight = torch.where(defined, weight, 0)
-    return Taps(
-        torch.stack(index, dim=-1).reshape(-1, 4),
-        weight.movedim(0, -1).reshape(-1, 4).contiguous(),
-        h * w,
-    )
+    return Taps(torch.stack(index).flatten(1), torch.where(defined, weight, 0).flatten(1))
