@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import get_args
 
@@ -28,14 +29,22 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
     if mask.dtype != torch.bool:
         raise ValueError(f"mask: got {mask.dtype}, expected bool")
     check.shape(mask, ("H", "W"), "mask")
+    rows = axis_weights(size[0], mask.shape[0], mode)
+    columns = axis_weights(size[1], mask.shape[1], mode)
+    share = rows @ mask.double().cpu() @ columns.T
+    # Half of a pixel is not more than half, whatever the last bit of the sum says.
+    return (share > 0.5 + 1e-9).to(mask.device)
+
+
+@functools.lru_cache(maxsize=32)
+def axis_weights(new: int, old: int, mode: MaskResize) -> Tensor:
+    """(new, old) float64 shares of each old pixel of an axis in each new one; not to be written."""
     weigh: Callable[[int, int], Tensor] = {
         "area": _area_weights,
         "bilinear": _linear_weights,
         "nearest": _nearest,
     }[mode]
-    share = weigh(size[0], mask.shape[0]) @ mask.double().cpu() @ weigh(size[1], mask.shape[1]).T
-    # Half of a pixel is not more than half, whatever the last bit of the sum says.
-    return (share > 0.5 + 1e-9).to(mask.device)
+    return weigh(new, old)
 
 
 def _area_weights(new: int, old: int) -> Tensor:

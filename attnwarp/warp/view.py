@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from attnwarp.warp.correspondence import (
     layer_size,
 )
 from attnwarp.warp.depth import Array
-from attnwarp.warp.features import FeatureWarp
+from attnwarp.warp.features import Backend, FeatureWarp
 from attnwarp.warp.masks import resize_mask
 from attnwarp.warp.rules import (
     camera_frame,
@@ -31,25 +32,7 @@ from attnwarp.warp.rules import (
     source_incidence,
 )
 from attnwarp.warp.settings import PRESETS, NormalTest, WarpSettings
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """What one view knows of the surface before it.
-
-    Args:
-        depth: (H, W) along the optical axis, NaN where undefined.
-        normal: (H, W, 3) world normals of either sign and any length, NaN or zero where undefined.
-        alpha: (H, W) in [0, 1].
-        image: (H, W, C) sRGB in [0, 1], before any edit.
-        counters: how much work it was to render, see :class:`attnwarp.render.Render`.
-    """
-
-    depth: Array
-    normal: Array | None = None
-    alpha: Array | None = None
-    image: Array | None = None
-    counters: dict[str, int] = field(default_factory=dict, repr=False)
+from attnwarp.warp.surface import Surface, needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +46,7 @@ class WarpedView:
         rules: each rule's own (H, W) mask, by name, in the order they were applied. ``defined`` is
             always among them.
         target, source: the surfaces it was made from; ``source`` is None where no rule needed it.
+        backend: who computes the feature grids, see :func:`warp_surfaces`.
     """
 
     settings: WarpSettings
@@ -71,6 +55,7 @@ class WarpedView:
     rules: dict[str, Tensor]
     target: Surface
     source: Surface | None = None
+    backend: Backend = "auto"
     _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, repr=False)
 
     def at(
@@ -90,13 +75,18 @@ class WarpedView:
         source_size = layer_size(source, target, size) if source_size is None else source_size
         key = (*size, *source_size)
         if key == (target.height, target.width, source.height, source.width):
-            return FeatureWarp(self.correspondence, self.mask)
+            self._at.setdefault(key, FeatureWarp(self.correspondence, self.mask, self.backend))
         if key not in self._at:
-            settings = self.settings
+            self._at[key] = self._layer(size, source_size)
+        return self._at[key]
+
+    def _layer(self, size: tuple[int, int], source_size: tuple[int, int]) -> FeatureWarp:
+        settings, full = self.settings, self.correspondence
+        if self.backend == "reference":
             layer = correspond_at(
-                source,
-                target,
-                self.correspondence.target_depth,
+                full.source,
+                full.target,
+                full.target_depth,
                 size,
                 source_size=source_size,
                 pixel_centers=settings.pixel_centers,
@@ -104,10 +94,18 @@ class WarpedView:
                 interpolation=settings.depth_interpolation,
                 spread=settings.depth_spread,
             )
-            self._at[key] = FeatureWarp(
-                layer, resize_mask(self.mask, size, settings.mask_resize) & layer.defined
-            )
-        return self._at[key]
+            mask = resize_mask(self.mask, size, settings.mask_resize) & layer.defined
+            return FeatureWarp(layer, mask, self.backend)
+        from attnwarp.warp import cpu
+
+        layer = cpu.correspond_layer(
+            full.source.resize(source_size[1], source_size[0]),
+            full.target.resize(size[1], size[0]),
+            full.target_depth,
+            settings,
+        )
+        mask = cpu.resize_mask(self.mask, size, settings.mask_resize, layer.defined)
+        return FeatureWarp(layer, mask, self.backend)
 
 
 def warp_surfaces(
@@ -118,6 +116,7 @@ def warp_surfaces(
     settings: WarpSettings = PRESETS["corrected"],
     *,
     target_segment: Tensor | None = None,
+    backend: Backend = "auto",
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or
     exact.
@@ -131,11 +130,24 @@ def warp_surfaces(
         settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
             concern the rendering of the surfaces and play no part here.
         target_segment: (H, W) bool, the part of the target that is edited.
+        backend: "auto" computes with kernels (:mod:`attnwarp.warp.cpu`), "reference" with the
+            definition in torch. Positions agree to 1e-6 px, masks but for a pixel within rounding
+            of a rule's threshold.
 
     Raises:
         ValueError: a rule needs something that is not given; the message names the rule and what it
             needs.
     """
+    check.one_of(backend, get_args(Backend), "backend")
+    if backend != "reference":
+        from attnwarp.warp import cpu
+
+        correspondence, rules, mask = cpu.correspond_and_mask(
+            source, target, target_surface, source_surface, settings, target_segment
+        )
+        return WarpedView(
+            settings, correspondence, mask, rules, target_surface, source_surface, backend
+        )
     correspondence = correspond(
         source,
         target,
@@ -160,7 +172,7 @@ def warp_surfaces(
     if settings.depth_agreement:
         rules["depth_agrees"] = depth_agrees(
             correspondence,
-            _needed(source_surface, "source_surface", "depth", "depth_agreement"),
+            needed(source_surface, "source_surface", "depth", "depth_agreement"),
             relative=settings.depth_relative,
             slope=settings.depth_slope,
             spread=settings.depth_spread,
@@ -168,12 +180,12 @@ def warp_surfaces(
     if settings.photometric is not None:
         rules["photometric"] = photometric(
             correspondence,
-            _needed(source_surface, "source_surface", "image", "photometric"),
-            _needed(target_surface, "target_surface", "image", "photometric"),
+            needed(source_surface, "source_surface", "image", "photometric"),
+            needed(target_surface, "target_surface", "image", "photometric"),
             settings.photometric,
         )
     if settings.normal_test != "none":
-        normal = _needed(
+        normal = needed(
             target_surface, "target_surface", "normal", f"normal_test={settings.normal_test!r}"
         )
         rules[settings.normal_test] = _normal_rule(
@@ -183,7 +195,9 @@ def warp_surfaces(
         check.shape(target_segment, (target.height, target.width), "target_segment")
         rules["segment"] = target_segment.to(device="cpu", dtype=torch.bool)
     mask = torch.stack(list(rules.values())).all(dim=0)
-    return WarpedView(settings, correspondence, mask, rules, target_surface, source_surface)
+    return WarpedView(
+        settings, correspondence, mask, rules, target_surface, source_surface, backend
+    )
 
 
 def warp_view(
@@ -197,6 +211,7 @@ def warp_view(
     target_segment: Tensor | None = None,
     source_surface: Surface | None = None,
     backend: str = "auto",
+    warp_backend: Backend = "auto",
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from splats.
 
@@ -213,7 +228,8 @@ def warp_view(
         target_segment: (H, W) bool, the part of the target that is edited.
         source_surface: the source's render if it is at hand, :func:`render_surface`; one source
             serves many targets.
-        backend: as in :func:`attnwarp.render.render`.
+        backend: of the renderer, as in :func:`attnwarp.render.render`.
+        warp_backend: of the warp, as in :func:`warp_surfaces`.
     """
     keep = gaussian_filter(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
@@ -233,7 +249,13 @@ def warp_view(
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
     return warp_surfaces(
-        source, target, seen, source_surface, settings, target_segment=target_segment
+        source,
+        target,
+        seen,
+        source_surface,
+        settings,
+        target_segment=target_segment,
+        backend=warp_backend,
     )
 
 
@@ -266,12 +288,3 @@ def _normal_rule(
     return (source_incidence if rule == "source_incidence" else camera_frame)(
         correspondence, normal, angle
     )
-
-
-def _needed(surface: Surface | None, view: str, part: str, rule: str) -> Array:
-    value: Array | None = getattr(surface, part, None)
-    if value is None:
-        raise ValueError(
-            f"{view}.{part}: got None, but the rule {rule} needs it; give it or turn the rule off"
-        )
-    return value
