@@ -123,7 +123,8 @@ def _valid(depth):
 
 @jit
 def _clamp(value, length):
-    return int(min(max(value, 0.0), length - 1.0))
+    # Unsigned, so that numba does not look for indices that count from the end.
+    return np.uint64(min(max(value, 0.0), length - 1.0))
 
 
 @jit
@@ -133,19 +134,24 @@ def _axis(position, length, snap):
     nearest = np.floor(index + 0.5)
     if abs(index - nearest) < snap:
         index = nearest
-    low = np.floor(index)
-    return _clamp(low, length), _clamp(low + 1, length), index - low
+    floor = np.floor(index)
+    low = int(floor)
+    first, last = min(max(low, 0), length - 1), min(max(low + 1, 0), length - 1)
+    return np.uint64(first), np.uint64(last), index - floor
 
 
 @jit
-def _blend_depth(depth, x, y, how, spread, snap):
-    """Depth at a position, NaN where taps are undefined or spread too far."""
-    h, w = depth.shape
-    if how == NEAREST:
-        value = float(depth[_clamp(np.floor(y), h), _clamp(np.floor(x), w)])
-        return value if _valid(value) else np.nan
-    x0, x1, fx = _axis(x, w, snap)
-    y0, y1, fy = _axis(y, h, snap)
+def _taps(x, y, shape, snap):
+    """Columns and rows of four taps in an image of ``shape``, and their shares along both axes."""
+    x0, x1, fx = _axis(x, shape[1], snap)
+    y0, y1, fy = _axis(y, shape[0], snap)
+    return x0, x1, y0, y1, fx, fy
+
+
+@jit
+def _blend_depth(depth, taps, how, spread):
+    """Depth between four taps, NaN where they are undefined or spread too far."""
+    x0, x1, y0, y1, fx, fy = taps
     total, largest, smallest = 0.0, -np.inf, np.inf
     for k in range(4):
         right, below = k & 1, k >> 1
@@ -162,11 +168,16 @@ def _blend_depth(depth, x, y, how, spread, snap):
 
 
 @jit
-def _sample(image, x, y, snap):
-    """An (h, w) image at a position, bilinear, borders clamped."""
-    h, w = image.shape
-    x0, x1, fx = _axis(x, w, snap)
-    y0, y1, fy = _axis(y, h, snap)
+def _nearest_depth(depth, x, y):
+    """Depth of the pixel that holds the position, NaN where it is undefined."""
+    value = float(depth[_clamp(np.floor(y), depth.shape[0]), _clamp(np.floor(x), depth.shape[1])])
+    return value if _valid(value) else np.nan
+
+
+@jit
+def _sample(image, taps):
+    """An (h, w) image between four taps."""
+    x0, x1, y0, y1, fx, fy = taps
     total = 0.0
     for k in range(4):
         right, below = k & 1, k >> 1
@@ -192,10 +203,11 @@ def _slope(depth, i, j):
     z = float(depth[i, j])
     if not abs(z) < np.inf:
         return 0.0
-    up = abs(z - depth[i - 1, j]) if i > 0 else np.inf
-    down = abs(depth[i + 1, j] - z) if i + 1 < h else np.inf
-    left = abs(z - depth[i, j - 1]) if j > 0 else np.inf
-    right = abs(depth[i, j + 1] - z) if j + 1 < w else np.inf
+    one = np.uint64(1)
+    up = abs(z - depth[i - one, j]) if i > 0 else np.inf
+    down = abs(depth[i + one, j] - z) if i + one < np.uint64(h) else np.inf
+    left = abs(z - depth[i, j - one]) if j > 0 else np.inf
+    right = abs(depth[i, j + one] - z) if j + one < np.uint64(w) else np.inf
     return _smaller(up, down) + _smaller(left, right)
 
 
@@ -205,6 +217,13 @@ def _scaled(position, length, other, integer):
     if integer:
         return (position - 0.5) * ((other - 1) / max(length - 1, 1.0)) + 0.5
     return position * (other / length)
+
+
+@jit
+def _in_image(pair, shape, x, y):
+    """A source position in pixels of an image of ``shape``."""
+    u = _scaled(x, pair.source.width, float(shape[1]), pair.integer)
+    return u, _scaled(y, pair.source.height, float(shape[0]), pair.integer)
 
 
 @jit
@@ -257,7 +276,10 @@ def layer(begin, end, pair, depth, how, spread, positions):
     for i in range(begin, end):
         for j in range(w):
             x, y = (j + 0.5) * step_x, (i + 0.5) * step_y
-            z = _blend_depth(depth, x, y, how, spread, pair.snap)
+            if how == NEAREST:
+                z = _nearest_depth(depth, x, y)
+            else:
+                z = _blend_depth(depth, _taps(x, y, depth.shape, pair.snap), how, spread)
             _locate(pair, i, j, z, positions)
 
 
@@ -274,7 +296,7 @@ def _angle(ax, ay, az, bx, by, bz):
 @jit
 def _normal_passes(pair, rules, normal, i, j, positions):
     x, y, z = float(normal[i, j, 0]), float(normal[i, j, 1]), float(normal[i, j, 2])
-    length = math.sqrt(x * x + y * y + z * z)
+    length = x * x + y * y + z * z
     X, Y, Z = positions.points[i, j, 0], positions.points[i, j, 1], positions.points[i, j, 2]
     if not (length > 0 and length < np.inf and abs(Z) < np.inf):
         return False
@@ -305,24 +327,22 @@ def _normal_passes(pair, rules, normal, i, j, positions):
 
 
 @jit
-def _depth_passes(pair, rules, depth, x, y, z):
-    """The point's depth is what the source sees at (x, y), which lies inside its image."""
+def _depth_passes(rules, depth, taps, u, v, z):
+    """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
     h, w = depth.shape
-    x = _scaled(x, pair.source.width, float(w), pair.integer)
-    y = _scaled(y, pair.source.height, float(h), pair.integer)
-    d = _blend_depth(depth, x, y, INVERSE, rules.spread, pair.snap)
-    change = _slope(depth, _clamp(np.floor(y), h), _clamp(np.floor(x), w))
+    d = _blend_depth(depth, taps, INVERSE, rules.spread)
+    change = _slope(depth, _clamp(np.floor(v), h), _clamp(np.floor(u), w))
     return abs(z - d) <= rules.relative * z + rules.slope * change
 
 
 @jit
 def _photometric_passes(pair, rules, source, target, i, j, x, y):
     h, w, channels = source.shape
-    x = _scaled(x, pair.source.width, float(w), pair.integer)
-    y = _scaled(y, pair.source.height, float(h), pair.integer)
+    u, v = _in_image(pair, (h, w), x, y)
+    taps = _taps(u, v, (h, w), pair.snap)
     total = 0.0
     for c in range(channels):
-        total += abs(_sample(source[..., c], x, y, pair.snap) - float(target[i, j, c]))
+        total += abs(_sample(source[..., c], taps) - float(target[i, j, c]))
     return total / channels <= rules.photometric
 
 
@@ -339,6 +359,8 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
     """
     width = mask.shape[1]
     image = pair.source
+    of_depth, of_alpha = source.depth.shape, source.alpha.shape
+    together = of_depth == of_alpha
     for i in range(begin, end):
         for j in range(width):
             defined = _locate(pair, i, j, float(target.depth[i, j]), positions)
@@ -352,21 +374,27 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
                 good = z > 0
                 passes[rules.row_in_front, i, j] = good
                 every = every and good
+            taps = _taps(0.5, 0.5, (1, 1), pair.snap)
+            u = v = 0.5
+            if inside and of_depth[0] > 0:
+                u, v = _in_image(pair, of_depth, x, y)
+                taps = _taps(u, v, of_depth, pair.snap)
             if rules.row_opaque >= 0:
                 good = True
                 if target.alpha.size > 0:
                     good = float(target.alpha[i, j]) >= rules.opaque
-                if source.alpha.size > 0:
+                if of_alpha[0] > 0:
                     good = good and inside
                     if good:
-                        h, w = source.alpha.shape
-                        u = _scaled(x, image.width, float(w), pair.integer)
-                        v = _scaled(y, image.height, float(h), pair.integer)
-                        good = _sample(source.alpha, u, v, pair.snap) >= rules.opaque
+                        there = taps
+                        if not together:
+                            s, t = _in_image(pair, of_alpha, x, y)
+                            there = _taps(s, t, of_alpha, pair.snap)
+                        good = _sample(source.alpha, there) >= rules.opaque
                 passes[rules.row_opaque, i, j] = good
                 every = every and good
             if rules.row_depth >= 0:
-                good = inside and _depth_passes(pair, rules, source.depth, x, y, z)
+                good = inside and _depth_passes(rules, source.depth, taps, u, v, z)
                 passes[rules.row_depth, i, j] = good
                 every = every and good
             if rules.row_photometric >= 0:
