@@ -22,7 +22,7 @@ from attnwarp.warp._kernels import sampling as kernels
 from attnwarp.warp.correspondence import Correspondence
 from attnwarp.warp.depth import Array
 from attnwarp.warp.masks import axis_weights
-from attnwarp.warp.settings import DepthInterpolation, MaskResize, WarpSettings
+from attnwarp.warp.settings import DepthInterpolation, MaskResize, NormalTest, WarpSettings
 from attnwarp.warp.surface import Surface, needed
 from attnwarp.warp.taps import SNAP, Taps
 
@@ -60,7 +60,6 @@ def correspond_and_mask(
             names.append(name)
     row = {name: k for k, name in enumerate(names)}
     bounds = source if settings.bounds == "source" else target
-    tests = ("facing", "source_incidence", "camera_frame")
     rules = pairs.Rules(
         float(bounds.width),
         float(bounds.height),
@@ -70,10 +69,11 @@ def correspond_and_mask(
         _limit(settings.depth_spread),
         _limit(settings.photometric),
         settings.normal_angle,
-        (pairs.FACING, pairs.SOURCE_INCIDENCE, pairs.CAMERA_FRAME)[
-            tests.index(settings.normal_test) if settings.normal_test in tests else 0
-        ],
-        *(row.get(name, -1) for name in ("in_front", "opaque", "depth_agrees", "photometric")),
+        _NORMAL_TEST[settings.normal_test],
+        row.get("in_front", -1),
+        row.get("opaque", -1),
+        row.get("depth_agrees", -1),
+        row.get("photometric", -1),
         row.get(settings.normal_test, -1),
     )
     segment = np.zeros((0, 0), np.bool_)
@@ -280,6 +280,12 @@ _INTERPOLATION: dict[DepthInterpolation, int] = {
     "inverse": pairs.INVERSE,
     "bilinear": pairs.BILINEAR,
     "nearest": pairs.NEAREST,
+}
+_NORMAL_TEST: dict[NormalTest, int] = {
+    "none": pairs.FACING,  # not asked for
+    "facing": pairs.FACING,
+    "source_incidence": pairs.SOURCE_INCIDENCE,
+    "camera_frame": pairs.CAMERA_FRAME,
 }
 
 
