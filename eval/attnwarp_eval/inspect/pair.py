@@ -20,7 +20,7 @@ from attnwarp.warp import (
     warp_view,
 )
 from attnwarp_eval.study import pictures
-from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
+from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 from attnwarp_eval.world import World
 
 Image = npt.NDArray[np.float32]
@@ -65,11 +65,15 @@ class Pair:
         """What source and target know of the surface, as the warp takes it."""
         source, target = self.world.source, self.world.targets[self.target]
         if self.model is not None:
-            return tuple(render_surface(self.model, c, self.settings) for c in (source, target))
-        hits = [self.world.geometry.trace(camera) for camera in (source, target)]
-        return tuple(
-            Surface(h.depth, h.normal, image=image)
-            for h, image in zip(hits, self.images, strict=True)
+            return (
+                render_surface(self.model, source, self.settings),
+                render_surface(self.model, target, self.settings),
+            )
+        source_hits = self.world.geometry.trace(source)
+        target_hits = self.world.geometry.trace(target)
+        return (
+            Surface(source_hits.depth, source_hits.normal, image=self.images[0]),
+            Surface(target_hits.depth, target_hits.normal, image=self.images[1]),
         )
 
     @cached_property

@@ -166,7 +166,9 @@ def _margin(pair: Pair, rule: str, pixel: tuple[int, int]) -> tuple[float, str]:
         return float(pair.view.target.depth[pixel]), "of depth"
     if rule == "in_bounds":
         camera = correspondence.source if settings.bounds == "source" else correspondence.target
-        x, y = correspondence.xy[pixel].tolist()
+        # With integer centres the rule holds the index against the border, as the method does.
+        slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
+        x, y = (correspondence.xy[pixel] - slip).tolist()
         return min(x, y, camera.width - x, camera.height - y), "px to the border"
     if rule == "in_front":
         return float(correspondence.z[pixel]), "of depth"
@@ -176,17 +178,18 @@ def _margin(pair: Pair, rule: str, pixel: tuple[int, int]) -> tuple[float, str]:
             margins.append(float(pair.view.target.alpha[pixel]) - settings.opaque)
         if source.alpha is not None:
             alpha = torch.as_tensor(np.asarray(source.alpha, dtype=np.float64))
-            margins.append(
-                float(sample(alpha[None], correspondence)[0][0][pixel]) - settings.opaque
-            )
+            sampled, inside = sample(alpha[None], correspondence)
+            if not inside[pixel]:
+                return float("nan"), "of alpha: outside the source image"
+            margins.append(float(sampled[0][pixel]) - settings.opaque)
         return min(margins, default=float("nan")), "of alpha"
     if rule == "depth_agrees":
         depth, tolerance = _source_depth(pair, pixel)
         return tolerance - abs(float(correspondence.z[pixel]) - depth), "of depth"
     if rule == "photometric" and settings.photometric is not None:
-        image = torch.as_tensor(np.asarray(pair.view.source.image, dtype=np.float64))
+        image = torch.as_tensor(np.asarray(pair.images[0], dtype=np.float64))
         warped = sample(image.permute(2, 0, 1), correspondence)[0][(slice(None), *pixel)].numpy()
-        away = np.abs(warped - np.asarray(pair.view.target.image)[pixel]).mean()
+        away = np.abs(warped - np.asarray(pair.images[1])[pixel]).mean()
         return settings.photometric - float(away), "of colour"
     if rule in ("facing", "source_incidence"):
         limit = 90.0 if rule == "facing" else settings.normal_angle
@@ -197,7 +200,7 @@ def _margin(pair: Pair, rule: str, pixel: tuple[int, int]) -> tuple[float, str]:
 def _incidence(pair: Pair, pixel: tuple[int, int]) -> float:
     """Degrees between the warp's normal, flipped to the target, and the ray to the source."""
     correspondence = pair.view.correspondence
-    normal = torch.as_tensor(np.asarray(pair.view.target.normal[pixel], dtype=np.float64))
+    normal = torch.as_tensor(np.asarray(pair.view.target.normal, dtype=np.float64)[pixel])
     source = torch.from_numpy(correspondence.source.rotation.copy())
     point = source.T @ correspondence.points[pixel]
     to_source = -point

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from attnwarp import Camera, Gaussians
 from attnwarp_eval.inspect.pair import Image, Pair
 from attnwarp_eval.inspect.pixel import PixelReport
-from attnwarp_eval.truth import Geometry, Hits
+from attnwarp_eval.truth import Geometry
+from attnwarp_eval.twoview import Hits
 
 if TYPE_CHECKING:
     import pyvista
@@ -65,7 +66,7 @@ def true_surface(geometry: Geometry) -> pyvista.PolyData:
     mesh = pyvista.PolyData(corners.reshape(-1, 3), faces=np.insert(faces, 0, 3, axis=1).ravel())
     for center, radius, _ in zip(*geometry.spheres(), strict=True):
         mesh = mesh.append_polydata(
-            pyvista.Sphere(radius, center, theta_resolution=48, phi_resolution=48)
+            pyvista.Sphere(radius=radius, center=center, theta_resolution=48, phi_resolution=48)
         )
     return mesh
 

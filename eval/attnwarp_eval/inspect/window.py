@@ -42,6 +42,9 @@ class Window:
     Args:
         make_pair: the pair of a (variant, target); called on first use of each.
         variants, targets: their names, in order.
+        variant, target: those to begin with; the first ones if left out.
+        coloring: one of :data:`COLORINGS`.
+        splats: whether splats are drawn at first.
         off_screen: draw without a display.
         size: of the window, in pixels.
 
@@ -55,17 +58,22 @@ class Window:
         variants: Sequence[str],
         targets: Sequence[str],
         *,
+        variant: str | None = None,
+        target: str | None = None,
         coloring: str = "mask",
+        splats: bool = False,
         off_screen: bool = False,
         size: tuple[int, int] = SIZE,
     ) -> None:
         self._make_pair = make_pair
         self._pairs: dict[tuple[str, str], Pair] = {}
         self.variants, self.targets = list(variants), list(targets)
-        self.variant, self.target, self.coloring = self.variants[0], self.targets[0], coloring
+        self.variant, self.target = variant or self.variants[0], target or self.targets[0]
+        self.coloring = coloring
         self.picked: PixelReport | None = None
-        self.splats_shown = self.surface_shown = self.help_shown = False
-        self.plotter = _plotter(off_screen, size)
+        self.splats_shown, self.surface_shown, self.help_shown = splats, False, False
+        # PyVista wraps its methods in a way that mypy cannot follow.
+        self.plotter: Any = _plotter(off_screen, size)
         self._draw()
         self.look_from_outside()
 
@@ -303,11 +311,11 @@ class Window:
             font="courier",
         )
 
-    def _alone(self) -> pyvista.Plotter:
+    def _alone(self) -> Any:
         """The 3D view without insets: what exporters take."""
         import pyvista
 
-        plotter = pyvista.Plotter(off_screen=True)
+        plotter: Any = pyvista.Plotter(off_screen=True)
         pair = self.pair
         mesh = scene.seen_surface(pair.truth.hits, pair.colors(self.coloring))
         plotter.add_mesh(mesh, scalars="colors", rgb=True, lighting=False)
@@ -319,7 +327,7 @@ class Window:
         return plotter
 
 
-def _plotter(off_screen: bool, size: tuple[int, int]) -> pyvista.Plotter:
+def _plotter(off_screen: bool, size: tuple[int, int]) -> Any:
     import os
 
     import pyvista
@@ -329,7 +337,7 @@ def _plotter(off_screen: bool, size: tuple[int, int]) -> pyvista.Plotter:
             "inspect: this machine has no display; draw a picture instead with --screenshot FILE,"
             " or write a page with --export FILE.html"
         )
-    plotter = pyvista.Plotter(
+    plotter: Any = pyvista.Plotter(
         shape="4|1", off_screen=off_screen, window_size=list(size), splitting_position=0.2
     )
     plotter.set_background("white")
