@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from attnwarp_eval.cli import cache, metrics, run, scenes
+from attnwarp_eval.cli import cache, inspect, metrics, run, scenes
 from attnwarp_eval.cli.shell import CRASH
 
 app = typer.Typer(
@@ -28,6 +28,7 @@ for command in (
     run.studies,
     metrics.metrics,
     metrics.encoders,
+    inspect.inspect,
 ):
     app.command()(command)
 app.add_typer(scenes.app, name="scenes")
