@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from attnwarp_eval.cli import cache, inspect, metrics, run, scenes
-from attnwarp_eval.cli.shell import CRASH
+from attnwarp_eval.cli.shell import CRASH, USAGE
 
 app = typer.Typer(
     name="attnwarp-eval",

@@ -10,7 +10,7 @@ from attnwarp.warp import PRESETS
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.study.parts import Splats, Variant
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.study import Study
+from attnwarp_eval.study.study import parse_study
 from attnwarp_eval.world import splats, world
 
 SIZE = 512
@@ -77,7 +77,7 @@ def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> S
     Raises:
         InputError: the folder is no run, or the run has no such scene or no warps.
     """
-    study = Study.model_validate(Store(folder).read_study()["study"])
+    study = parse_study(Store(folder).read_study()["study"])
     scene = scene or study.scenes[0]
     one_of(scene, study.scenes, "scene")
     variants = {
