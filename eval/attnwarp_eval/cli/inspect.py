@@ -14,7 +14,7 @@ def inspect(
     what: Annotated[str, typer.Argument(help="A run's folder, or a scene's name or file.")],
     scene: Annotated[str | None, typer.Option(help="Of a run; its first if left out.")] = None,
     variant: Annotated[
-        str | None, typer.Option(help="Such as corrected; the first if left out.")
+        str | None, typer.Option(help="Of the run, or a preset; corrected if left out.")
     ] = None,
     view: Annotated[str | None, typer.Option(help="Target view; the first if left out.")] = None,
     pixel: Annotated[str | None, typer.Option(help="Target pixel COLUMN,ROW to explain.")] = None,
@@ -47,7 +47,8 @@ def inspect(
         else:
             chosen = subject.of_scene(what, size or subject.SIZE)
         variants, targets = list(chosen.variants), list(chosen.targets)
-        variant, view = variant or variants[0], view or targets[0]
+        preferred = "corrected" if "corrected" in variants else variants[0]
+        variant, view = variant or preferred, view or targets[0]
         pair = chosen.pair(variant, view)
         if place is not None:
             try:
