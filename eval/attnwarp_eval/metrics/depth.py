@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
-from attnwarp.warp.view import angle_between
 from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
 
 
@@ -35,6 +33,11 @@ def depth_error(
         raise ValueError("normal, true_normal: got one of them, expected both or neither")
     angle = None
     if normal is not None:
+        # Imported here: torch takes a second, which a reader of the metrics' names should not wait.
+        import torch
+
+        from attnwarp.warp import angle_between
+
         ours = floats(normal, (*truth.shape, 3), "normal")
         exact = floats(true_normal, (*truth.shape, 3), "true_normal")
         angle = angle_between(torch.tensor(ours), torch.tensor(exact)).numpy()

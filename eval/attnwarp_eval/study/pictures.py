@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from attnwarp.warp.correspondence import sample
-from attnwarp.warp.view import Surface, WarpedView
+from attnwarp.warp import Surface, WarpedView, sample
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 if TYPE_CHECKING:

@@ -74,12 +74,12 @@ def test_an_edit_with_one_result_is_refused():
         next(flow.study("bear", "polar", size=16, spp=1, yaws=[5]))
 
 
-def row(scene, yaw, *, exact, flow):
+def row(scene, yaw, *, exact, by_flow):
     figures = {
         kind: {
             "consistency.delta_e": exact * k,
-            "consistency.flow_delta_e": flow * k,
-            "consistency.flow_same_delta_e": flow,
+            "consistency.flow_delta_e": by_flow * k,
+            "consistency.flow_same_delta_e": by_flow,
             "consistency.pixels": 7,
         }
         for k, kind in enumerate(flow.PAIRS, 1)
@@ -89,8 +89,8 @@ def row(scene, yaw, *, exact, flow):
 
 
 def test_the_report_gives_the_least_and_the_largest_ratio_over_the_scenes(tmp_path):
-    rows = [row("bear", 5.0, exact=1.0, flow=2.0), row("person", 5.0, exact=2.0, flow=3.0)]
-    rows += [row("bear", 60.0, exact=1.0, flow=float("nan"))]
+    rows = [row("bear", 5.0, exact=1.0, by_flow=2.0), row("person", 5.0, exact=2.0, by_flow=3.0)]
+    rows += [row("bear", 60.0, exact=1.0, by_flow=float("nan"))]
     flow.write_report(rows, tmp_path, size=64, spp=2)
     said = (tmp_path / "report.md").read_text().splitlines()
     # truth 3/2 to 2; one answer alike; at the exact figure's pixels flow over twice the exact; slip

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import render_surface, warp_view
+from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.parts import Study
