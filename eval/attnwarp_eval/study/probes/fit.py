@@ -18,13 +18,14 @@ from attnwarp_eval.document import figures
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import canonical_json, digest
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
-from attnwarp_eval.study.record import Json, finite, with_nan
+from attnwarp_eval.study.record import Json, Record, finite, with_nan
 from attnwarp_eval.study.results import Results
 
 GOOD_PSNR = 28.0
@@ -143,7 +144,7 @@ class Fit(Probe[Curve]):
         if self.name in study.probes or own or study.part(StudyPart).fit.settings:
             settings_of(study, variant, 0)
 
-    def common_spec(self, study: Study, scene: Any, seed: int) -> Json:
+    def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:
         """The views are those held out, not the scene's targets."""
         study.views_of(scene)
         views = export.held_out_names(study.part(StudyPart).fit.views)
@@ -291,9 +292,9 @@ class Fit(Probe[Curve]):
             section.figures.append(self._curves(results, layout, names))
         return section
 
-    def _row(self, name: str, scene: str, seed: int, record: Any) -> list[str]:
+    def _row(self, name: str, scene: str, seed: int, record: Record[Curve]) -> list[str]:
         points = record.extra.points
-        last: Point = points[-1]
+        last = points[-1]
         reached = next((p.cpu_seconds for p in points if p.psnr >= GOOD_PSNR), None)
         return [
             name,
