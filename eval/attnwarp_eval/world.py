@@ -1,36 +1,34 @@
-"""A scene's truth and its splats, made once and shared by the cells that a process computes."""
+"""A scene's truth and its splats, computed once for all cells of a process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from attnwarp import Gaussians
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.truth import Geometry, TwoView, appearance, edge_band, two_view
+from attnwarp_eval.splats.surface import surface_splats
+from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
-
-if TYPE_CHECKING:
-    from attnwarp import Gaussians
-    from attnwarp_eval.study.parts import Splats
-
+from attnwarp_eval.twoview import TwoView
 
 SPLATS_PROTOCOL = 1
-"""Raised whenever the same spec would give other splats: those on disk are then made anew."""
+"""Version of the sampling. Raise it when the same settings give other splats."""
 
 Features = npt.NDArray[np.float64]
 
 
 class World:
-    """Everything about a scene that is the same for all variants.
+    """What all variants share of a scene: truth, memoised by view.
 
     Args:
         scene: as it was loaded.
@@ -53,17 +51,16 @@ class World:
             camera.name: abs((view.yaw - scene.spec.cameras.source.yaw + 180) % 360 - 180)
             for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
         }
-        # Cells of a scene ask for the same pairs again and again; a world lives as long as its
-        # scene is at work.
+        # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
         self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
 
     def add(self, camera: Camera) -> None:
-        """Make a further camera known by its name, as the scene's own are."""
-        to_here, to_source = (c.position[:2] - self.scene.center[:2] for c in (camera, self.source))
-        cosine = to_here @ to_source / (np.linalg.norm(to_here) * np.linalg.norm(to_source))
+        """Add a target camera under its name."""
+        offset, source = (c.position[:2] - self.scene.center[:2] for c in (camera, self.source))
+        cosine = offset @ source / (np.linalg.norm(offset) * np.linalg.norm(source))
         self.targets[camera.name] = camera
         self.yaw[camera.name] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -72,13 +69,13 @@ class World:
         return self.source if name == self.source.name else self.targets[name]
 
     def _pair(self, target: str, size: int) -> TwoView:
-        """What is exactly known about the source and a target, on a grid of ``size`` x ``size``."""
+        """The exact relation of the source and a target, on a grid of ``size`` x ``size``."""
         return two_view(
             self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size)
         )
 
     def _edge(self, name: str) -> npt.NDArray[np.bool_]:
-        """(H, W) the band around the depth and object edges of a view."""
+        """(H, W) bool: the band around the depth and object edges of a view."""
         return edge_band(self.geometry, self.camera(name))
 
     def _image(self, name: str, spp: int) -> npt.NDArray[np.float32]:
@@ -94,31 +91,53 @@ class World:
         return self._field(channels, seed).on_grid(points, background=background)
 
     def _field(self, channels: int, seed: int) -> SolidField:
-        """The feature field, as wide as what the cameras look at."""
+        """The feature field, as wide as the field of view at the scene's centre."""
         distance = float(np.linalg.norm(self.source.position - self.scene.center))
-        seen = 2 * distance * float(np.tan(np.arctan(self.source.height / 2 / self.source.K[1, 1])))
-        return SolidField(self.scene.center, seen, channels=channels, seed=seed)
+        width = (
+            2 * distance * float(np.tan(np.arctan(self.source.height / 2 / self.source.K[1, 1])))
+        )
+        return SolidField(self.scene.center, width, channels=channels, seed=seed)
 
 
 @lru_cache(maxsize=1)
 def world(scene: str, size: int) -> World:
-    """The world of a scene (a name or a path) at an image size; the last one is kept."""
+    """The world of a scene (a name or a path) at an image size; the last one is cached."""
     return World(load_scene(scene), size)
 
 
 @lru_cache(maxsize=8)
-def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
-    """Gaussians on a scene's surfaces; the last few are kept, and all of them in the cache on
-    disk."""
-    from attnwarp import Gaussians
-    from attnwarp_eval.splats.surface import surface_splats
+def splats(
+    scene: str,
+    size: int,
+    seed: int,
+    *,
+    kind: Literal["2d", "3d"],
+    count: int,
+    position_noise: float,
+    normal_noise: float,
+) -> Gaussians:
+    """Gaussians on a scene's surfaces; the last few are cached here, all of them on disk.
 
-    at = world(scene, size)
-    key = content_key("surface splats", SPLATS_PROTOCOL, at.content_hash, seed, spec.model_dump())
+    Args:
+        scene, size: of the :func:`world`.
+        seed: of their places and their noise.
+        kind, count, position_noise, normal_noise: see
+            :func:`attnwarp_eval.splats.surface.surface_splats`.
+    """
+    scene_world = world(scene, size)
+    settings: dict[str, Any] = {
+        "kind": kind,
+        "count": count,
+        "position_noise": position_noise,
+        "normal_noise": normal_noise,
+    }
+    key = content_key("surface splats", SPLATS_PROTOCOL, scene_world.content_hash, seed, settings)
     stored = read_arrays("splats", key)
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
-        made = surface_splats(at.scene, seed=seed, geometry=at.geometry, **spec.model_dump())
+        made = surface_splats(
+            scene_world.scene, seed=seed, geometry=scene_world.geometry, **settings
+        )
         write_arrays(
             "splats",
             key,
@@ -126,4 +145,4 @@ def splats(scene: str, size: int, seed: int, spec: Splats) -> Gaussians:
         )
         return made
     means, quats, scales, opacities, sh = (torch.from_numpy(stored[name]) for name in names)
-    return Gaussians(spec.kind, means, quats, scales, opacities, sh, origin=stored["origin"])
+    return Gaussians(kind, means, quats, scales, opacities, sh, origin=stored["origin"])

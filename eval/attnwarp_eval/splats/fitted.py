@@ -1,14 +1,9 @@
-"""Views to fit splats on: cameras around a scene, their true pictures, and first points; as arrays
-or as a folder.
-"""
+"""Splats fitted to a scene's true pictures, and their errors against exact truth."""
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,152 +11,16 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval import metrics
-from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.scene.spec import SkySpec
-from attnwarp_eval.truth import Geometry, appearance
-from attnwarp_eval.truth.shading import sky_radiance
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.splats.export import first_points, held_out, orbit, picture
+from attnwarp_eval.truth import Geometry
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Step
     from attnwarp.gaussians import Gaussians
-    from attnwarp.io import Dataset
     from attnwarp.warp.settings import WarpSettings
     from attnwarp.warp.view import Surface
-    from attnwarp_eval.truth import Hits
-
-Array = npt.NDArray[np.float64]
-Progress = Callable[[str], object]
-
-HELD_OUT_EVERY = 8
-"""One view of so many is never fitted on; the field's habit since LLFF."""
-
-SKY_SHARE = 0.1
-"""Share of the first points that stand for the sky, where a scene has one."""
-
-SKY_DISTANCE = 4.0
-"""Distance of those points from the scene's centre, in radii of the orbit: behind all that the
-scene consists of.
-"""
-
-RINGS = 5
-"""Heights of the orbits. Prime to 8, so that the views held out are spread over them as well."""
-
-
-@dataclass(frozen=True, eq=False)
-class FirstPoints:
-    """A rough point cloud such as structure from motion would give.
-
-    Attributes:
-        points: (P, 3) float64 world coordinates.
-        colors: (P, 3) uint8 sRGB.
-    """
-
-    points: Array
-    colors: npt.NDArray[np.uint8]
-
-
-def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
-    """Cameras all around a scene, at the radius of its own cameras and at five heights that span
-    theirs.
-
-    Their yaws are evenly spaced and their heights take turns, two rings up each time.
-
-    Args:
-        scene: whose orbit it is.
-        count: number of cameras.
-        size: height and width of their images in px; the scene's if left out.
-
-    Raises:
-        SceneError: a camera would be inside an object; the message names both.
-    """
-    if count < 1:
-        raise ValueError(f"count: got {count}, expected at least 1")
-    spec = scene.spec.cameras
-    width, height = (size, size) if size else spec.size
-    heights = [camera.position[2] for camera in scene.cameras]
-    low, high = min(heights), max(heights)
-    solids = [(shape, scene.object_names[shape.object_id]) for shape in scene.shapes()]
-    cameras = []
-    for k in range(count):
-        yaw = 2 * math.pi * k / count
-        z = low + (high - low) * (2 * k % RINGS) / (RINGS - 1)
-        x = spec.look_at[0] + spec.radius * math.cos(yaw)
-        y = spec.look_at[1] + spec.radius * math.sin(yaw)
-        name = orbit_name(k, count)
-        camera = Camera.look_at(
-            (x, y, z), spec.look_at, width=width, height=height, fov_y=spec.fov, name=name
-        )
-        for solid, owner in solids:
-            if solid.contains(camera.position):
-                at = ", ".join(f"{v:.4g}" for v in camera.position)
-                raise SceneError(
-                    f"{name} at ({at}) would be inside the object {owner!r}; change cameras.radius"
-                )
-        cameras.append(camera)
-    return cameras
-
-
-def orbit_name(index: int, count: int) -> str:
-    """Name of a camera of :func:`orbit`."""
-    return f"orbit_{index:03d}_of_{count}"
-
-
-def held_out(count: int) -> list[bool]:
-    """Whether each of ``count`` views is held out: the first of every eight."""
-    return [k % HELD_OUT_EVERY == 0 for k in range(count)]
-
-
-def held_out_names(count: int) -> list[str]:
-    """Names of the cameras of :func:`orbit` that are held out."""
-    return [orbit_name(k, count) for k, out in enumerate(held_out(count)) if out]
-
-
-def first_points(
-    scene: Scene, count: int, *, noise: float = 0.5, seed: int = 0, geometry: Geometry | None = None
-) -> FirstPoints:
-    """Points on the scene's surfaces, displaced at random, with the colours that the truth has
-    there.
-
-    Where the scene has a sky, a tenth of them lie on the upper half of a sphere around everything,
-    in its colours.
-
-    Args:
-        scene: whose surfaces they lie on.
-        count: number of points, at least 10.
-        noise: standard deviation of the displacement along each axis, in local spacings of the
-            points.
-        seed: of the sampling and the noise.
-        geometry: ``Geometry(scene)``, if there is one already.
-    """
-    from attnwarp.gaussians import SH_C0
-    from attnwarp_eval.splats.surface import surface_splats
-
-    if count < 10:
-        raise ValueError(f"count: got {count}, expected at least 10")
-    sky = next((light for light in scene.spec.lights if isinstance(light, SkySpec)), None)
-    above = round(SKY_SHARE * count) if sky is not None else 0
-    found = surface_splats(
-        scene, "2d", count - above, position_noise=noise, seed=seed, geometry=geometry
-    )
-    points = found.world_means()
-    colors = found.sh[:, 0].numpy().astype(np.float64) * SH_C0 + 0.5
-    if sky is not None:
-        # Fibonacci's spiral over the upper half.
-        k = np.arange(above) + 0.5
-        z, turn = k / above, k * math.pi * (3 - math.sqrt(5))
-        r = np.sqrt(1 - z * z)
-        up = np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=-1)
-        points = np.concatenate(
-            [points, scene.center + SKY_DISTANCE * scene.spec.cameras.radius * up]
-        )
-        colors = np.concatenate([colors, to_srgb(sky_radiance(sky, up))])
-    return FirstPoints(points, np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8))
-
-
-def picture(scene: Scene, camera: Camera, spp: int) -> npt.NDArray[np.uint8]:
-    """(H, W, 3) uint8 sRGB truth of a view, rounded as an 8-bit file would have it."""
-    return np.round(255 * to_srgb(appearance(scene, camera, spp=spp))).astype(np.uint8)
+    from attnwarp_eval.twoview import Hits
 
 
 def fit_scene(
@@ -187,8 +46,8 @@ def fit_scene(
     Args:
         scene: with the image size that the fit is to have.
         settings: what is fitted and how.
-        folder: where the fit is kept; one that was stopped there is gone on with.
-        views, spp, points, noise, seed: see :func:`export`.
+        folder: where the fit is kept; one that was stopped there is resumed.
+        views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
         watch: as in :func:`attnwarp.fit.fit`.
     """
@@ -210,12 +69,12 @@ def fit_scene(
     truth = [geometry.trace(camera) for camera in parts[1].cameras]
 
     def errors(splats: Gaussians) -> dict[str, float]:
-        found = [
+        figures = [
             surface_error(splats, camera, hits)[1]
             for camera, hits in zip(parts[1].cameras, truth, strict=True)
         ]
         return {
-            name: float(np.mean([each[name] for each in found]))
+            name: float(np.mean([each[name] for each in figures]))
             for name in ("depth.abs_rel", "depth.normal_median")
         }
 
@@ -231,14 +90,19 @@ def surface_error(
     settings: WarpSettings | None = None,
     edge: Any = None,
 ) -> tuple[Surface, dict[str, float]]:
-    """What a camera sees of splats, and its errors of depth and normals; median depth if nothing
-    else is asked for.
-    """
-    from attnwarp.warp.settings import WarpSettings as Defaults
-    from attnwarp.warp.view import render_surface
-    from attnwarp_eval import metrics
+    """Render a surface of splats, and measure its errors of depth and normals.
 
-    surface = render_surface(splats, camera, settings or Defaults(depth_statistic="median"))
+    Args:
+        splats: what is rendered.
+        camera: the view, (H, W).
+        truth: of the same view.
+        settings: how depth is read off the splats; the median depth if left out.
+        edge: (H, W) bool, the band around edges; None for no scores by place.
+    """
+    from attnwarp.warp.settings import WarpSettings
+    from attnwarp.warp.view import render_surface
+
+    surface = render_surface(splats, camera, settings or WarpSettings(depth_statistic="median"))
     figures = metrics.depth_error(
         surface.depth, truth.depth, normal=surface.normal, true_normal=truth.normal, edge=edge
     )
@@ -251,60 +115,10 @@ def picture_error(image: npt.NDArray[Any], true_image: npt.NDArray[np.uint8]) ->
 
     SSIM is NaN below 11 x 11 px.
     """
-    ours = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
+    estimate = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
     truth = true_image.astype(np.float64) / 255
     return {
-        "fit.psnr": metrics.psnr(ours, truth),
-        "fit.mse": metrics.mse(ours, truth),
-        "fit.ssim": metrics.ssim(ours, truth),
+        "fit.psnr": metrics.psnr(estimate, truth),
+        "fit.mse": metrics.mse(estimate, truth),
+        "fit.ssim": metrics.ssim(estimate, truth),
     }
-
-
-def export(
-    scene: Scene,
-    folder: str | os.PathLike[str],
-    *,
-    views: int = 64,
-    size: int = 256,
-    spp: int = 16,
-    points: int = 5000,
-    noise: float = 0.5,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Dataset:
-    """Write a scene as other programs would hand it over: transforms.json, images/*.png, and
-    points.ply.
-
-    One view of eight is in the split "test", the others in "train". What is there already is
-    overwritten.
-
-    Args:
-        scene: any of scenes/.
-        folder: made if need be.
-        views, size: number of views, and the edge of their images in px.
-        spp: samples a pixel.
-        points, noise, seed: see :func:`first_points`.
-        progress: told in words what is done next.
-    """
-    import cv2
-
-    from attnwarp.io import Dataset, write_transforms
-
-    tell = progress or (lambda text: None)
-    folder = Path(folder)
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    tell("points")
-    cloud = first_points(scene, points, noise=noise, seed=seed)
-    cameras = orbit(scene, views, size)
-    paths: list[Path | None] = []
-    for k, camera in enumerate(cameras):
-        tell(f"view {k + 1} of {views}")
-        path = folder / "images" / f"{camera.name}.png"
-        image = cv2.cvtColor(picture(scene, camera, spp), cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(str(path), image):
-            raise SceneError(f"{path}: could not be written")
-        paths.append(path)
-    splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
-    dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
-    write_transforms(folder, dataset, points_name="points.ply")
-    return dataset

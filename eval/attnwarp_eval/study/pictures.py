@@ -10,8 +10,7 @@ import torch
 
 from attnwarp.warp.correspondence import sample
 from attnwarp.warp.view import Surface, WarpedView
-from attnwarp_eval.truth import Hits, TwoView
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 if TYPE_CHECKING:
     from attnwarp_eval.world import World

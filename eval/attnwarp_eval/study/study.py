@@ -371,7 +371,7 @@ class Study(Part):
                 "spp": self.spp,
             }
         if probe == "fit":
-            from attnwarp_eval.splats.fitted import held_out_names
+            from attnwarp_eval.splats.export import held_out_names
 
             how = {**self.fit.model_dump(), "settings": self.fit_of(variant, seed).to_dict()}
             depth = {name: settings[name] for name in ("depth", "depth_statistic")}

@@ -33,9 +33,8 @@ from attnwarp_eval import metrics
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.effects.table import said_by
 from attnwarp_eval.files import digest
-from attnwarp_eval.splats import fitted
+from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Splats
 from attnwarp_eval.study.store import write_atomic
 from attnwarp_eval.truth import TwoView
 from attnwarp_eval.world import World, splats, world
@@ -167,7 +166,7 @@ def _depth(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterato
     """Depth and normals of splats against truth."""
     size = spec["size"]
     with meter.stage("splats"):
-        model = splats(scene, size, spec["seed"], Splats.model_validate(spec["splats"]))
+        model = splats(scene, size, spec["seed"], **spec["splats"])
     settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
     for name in spec["views"]:
         with meter.stage("truth"):
@@ -193,7 +192,7 @@ def _warp(at: World, scene: str, spec: dict[str, Any], meter: Meter) -> Iterator
     model = source_surface = None
     if "splats" in spec:
         with meter.stage("splats"):
-            model = splats(scene, size, spec["seed"], Splats.model_validate(spec["splats"]))
+            model = splats(scene, size, spec["seed"], **spec["splats"])
         # One source serves every target, so its render is no part of what a target costs.
         with meter.stage("source"):
             source_surface = render_surface(model, at.source, settings)
@@ -241,7 +240,7 @@ def _fit(
     }
     with meter.stage("truth"):
         cameras = {
-            c.name: c for c in fitted.orbit(at.scene, how["views"]) if c.name in spec["views"]
+            c.name: c for c in export.orbit(at.scene, how["views"]) if c.name in spec["views"]
         }
     for camera in cameras.values():
         at.add(camera)
@@ -270,7 +269,7 @@ def _fit(
             surface = render_surface(result.gaussians, camera, settings)
         with meter.stage("truth"):
             truth = at.geometry.trace(camera)
-            image = fitted.picture(at.scene, camera, spec["spp"])
+            image = export.picture(at.scene, camera, spec["spp"])
             edge = at.edge(name)
         meter.count(pixels=camera.width * camera.height, **surface.counters)
         with meter.stage("checks"):
@@ -303,7 +302,7 @@ def _timing(
     target = at.targets[spec["views"][0]]
     contestants = [
         (
-            splats(scene, spec["size"], spec["seed"], Splats.model_validate(contestant["splats"])),
+            splats(scene, spec["size"], spec["seed"], **contestant["splats"]),
             WarpSettings.from_dict(contestant["settings"]),
         )
         for contestant in spec["contestants"]

@@ -19,6 +19,7 @@ from attnwarp_eval._open3d import open3d
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.truth.analytic import nearest_hit
+from attnwarp_eval.twoview import Hits
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -51,31 +52,6 @@ class RayHits:
     t: Array
     point: Array
     normal: Array
-    object_id: npt.NDArray[np.int32]
-    primitive_id: npt.NDArray[np.int64]
-    valid: Mask
-
-
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """What the central rays of a camera's pixels hit first.
-
-    Attributes:
-        depth: (H, W) float64 z along the optical axis; NaN where nothing is hit.
-        point: (H, W, 3) world coordinates; NaN where nothing is hit.
-        normal: (H, W, 3) unit geometric normal in world axes, facing the camera; NaN where nothing
-            is hit.
-        cosine: (H, W) of the angle between that normal and the ray, in (0, 1]; NaN where nothing is
-            hit.
-        object_id: (H, W) int32 index of the object in the scene, -1 where nothing is hit.
-        primitive_id: (H, W) int64, -1 where nothing is hit.
-        valid: (H, W) bool.
-    """
-
-    depth: Array
-    point: Array
-    normal: Array
-    cosine: Array
     object_id: npt.NDArray[np.int32]
     primitive_id: npt.NDArray[np.int64]
     valid: Mask

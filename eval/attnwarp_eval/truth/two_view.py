@@ -4,14 +4,12 @@ it shows there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp_eval.truth.raycast import Geometry, Hits
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.truth.raycast import Geometry
+from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -21,62 +19,6 @@ GRAZING_COSINE = 1e-3
 
 EDGE_BAND = 2.0
 """Width in pixels, on each side, of the band around depth and object edges."""
-
-
-@dataclass(frozen=True, eq=False)
-class TwoView:
-    """What is exactly known about a pair of views. H, W are the target's.
-
-    Attributes:
-        source, target: the cameras.
-        hits: what the target's pixels show.
-        xy: (H, W, 2) float64 source pixel coordinates of the same surface point; NaN where there is
-            no surface or it is not in front of the source camera.
-        z_source: (H, W) float64 depth of the point in the source camera, of either sign; NaN where
-            no surface.
-        in_source_image: (H, W) bool: in front of the source camera and inside its image.
-        label: (H, W) uint8.
-            0 NONE: no surface in the target pixel, or its point is outside the source image (or
-            behind its camera); ``hits.valid`` tells the two apart.
-            1 VISIBLE: inside the source image, on the side that faces it, and nothing in between.
-            2 HIDDEN: inside the source image, but occluded or turned away.
-            3 AMBIGUOUS: there is a surface, but the four corners of the pixel do not get the same
-            answer as its centre (no surface, outside, visible or hidden), or the surface is seen at
-            a cosine of incidence under 1e-3 by either camera.
-        edge: (H, W) bool: within 2 px of a depth or object edge of the target, or, where the point
-            falls inside the source image, within 2 px of one there.
-    """
-
-    source: Camera
-    target: Camera
-    hits: Hits
-    xy: Array
-    z_source: Array
-    in_source_image: Mask
-    label: npt.NDArray[np.uint8]
-    edge: Mask
-
-    @property
-    def visible(self) -> Mask:
-        """(H, W) bool: the source certainly shows this pixel's surface."""
-        return self.label == VISIBLE
-
-    @property
-    def outside(self) -> Mask:
-        """(H, W) bool: a surface, certainly not inside the source image (beside it, or behind the
-        camera).
-        """
-        return self.hits.valid & (self.label == NONE)
-
-    @property
-    def unseen(self) -> Mask:
-        """(H, W) bool: a surface that the source certainly does not show: hidden or outside."""
-        return (self.label == HIDDEN) | self.outside
-
-    @property
-    def behind(self) -> Mask:
-        """(H, W) bool: a surface point that is not in front of the source camera."""
-        return self.hits.valid & ~(self.z_source > 0)
 
 
 def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:

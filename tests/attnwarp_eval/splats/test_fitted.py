@@ -9,7 +9,7 @@ import pytest
 from attnwarp.io import read_dataset
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.splats import fitted
+from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import StudyError, load_study
@@ -38,7 +38,7 @@ def spheres():
 
 
 def test_the_orbit_goes_all_around_and_looks_at_the_scenes_centre(spheres):
-    cameras = fitted.orbit(spheres, 64, 256)
+    cameras = export.orbit(spheres, 64, 256)
     assert len({camera.name for camera in cameras}) == 64
     heights = [camera.position[2] for camera in spheres.cameras]
     for camera in cameras:
@@ -50,20 +50,20 @@ def test_the_orbit_goes_all_around_and_looks_at_the_scenes_centre(spheres):
 
 
 def test_views_held_out_are_spread_over_yaws_and_heights(spheres):
-    out = [c for c, o in zip(fitted.orbit(spheres, 64), fitted.held_out(64), strict=True) if o]
-    assert [c.name for c in out] == fitted.held_out_names(64)
+    out = [c for c, o in zip(export.orbit(spheres, 64), export.held_out(64), strict=True) if o]
+    assert [c.name for c in out] == export.held_out_names(64)
     yaws = np.sort(
         [np.degrees(np.arctan2(*(c.position - spheres.center)[1::-1])) % 360 for c in out]
     )
     np.testing.assert_allclose(np.diff(yaws), 45, atol=1e-6)
-    assert len({round(c.position[2], 6) for c in out}) == fitted.RINGS
+    assert len({round(c.position[2], 6) for c in out}) == export.RINGS
 
 
 def test_first_points_lie_on_surfaces_and_the_sky_around_them(spheres):
     geometry = Geometry(spheres)
-    cloud = fitted.first_points(spheres, 400, noise=0.0, geometry=geometry)
+    cloud = export.first_points(spheres, 400, noise=0.0, geometry=geometry)
     distance = np.linalg.norm(cloud.points - spheres.center, axis=1)
-    sky = distance > 0.99 * fitted.SKY_DISTANCE * spheres.spec.cameras.radius
+    sky = distance > 0.99 * export.SKY_DISTANCE * spheres.spec.cameras.radius
     assert sky.sum() == 40
     # A point of a surface is where a ray from inside the room that passes through it meets
     # something.
@@ -78,15 +78,15 @@ def test_first_points_lie_on_surfaces_and_the_sky_around_them(spheres):
 
 def test_noise_moves_points_by_the_spacing_between_them(spheres):
     geometry = Geometry(spheres)
-    exact = fitted.first_points(spheres, 400, noise=0.0, geometry=geometry)
-    noisy = fitted.first_points(spheres, 400, noise=0.5, geometry=geometry)
+    exact = export.first_points(spheres, 400, noise=0.0, geometry=geometry)
+    noisy = export.first_points(spheres, 400, noise=0.5, geometry=geometry)
     np.testing.assert_array_equal(exact.colors, noisy.colors)
     moved = np.linalg.norm(exact.points - noisy.points, axis=1)[:360]
     assert (moved > 0).all() and np.median(moved) < spheres.spec.cameras.radius
 
 
 def test_an_exported_scene_reads_back_as_it_is(spheres, tmp_path):
-    written = fitted.export(spheres, tmp_path, views=9, size=24, spp=1, points=50)
+    written = export.export(spheres, tmp_path, views=9, size=24, spp=1, points=50)
     read = read_dataset(tmp_path)
     assert read.splits == ["test", *["train"] * 7, "test"]
     assert len(read.points) == 50
@@ -94,7 +94,7 @@ def test_an_exported_scene_reads_back_as_it_is(spheres, tmp_path):
         np.testing.assert_allclose(theirs.world_to_camera, ours.world_to_camera, atol=1e-12)
         np.testing.assert_allclose(theirs.K, ours.K, rtol=1e-15)
         image = cv2.imread(str(path))[..., ::-1]
-        np.testing.assert_array_equal(image, fitted.picture(spheres, ours, 1))
+        np.testing.assert_array_equal(image, export.picture(spheres, ours, 1))
 
 
 def test_errors_of_a_picture_are_those_of_scikit_image():

@@ -1,0 +1,152 @@
+"""Commands that measure a person's own pictures, and list the encoders for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, progress
+
+
+def metrics(
+    renders: Annotated[
+        Path | None, typer.Option(help="Folder: renders of the edited scene.")
+    ] = None,
+    edited: Annotated[
+        Path | None, typer.Option(help="Folder: the edited pictures, named as the renders.")
+    ] = None,
+    originals: Annotated[
+        Path | None, typer.Option(help="Folder: the views before the edit, named alike.")
+    ] = None,
+    source_edit: Annotated[
+        Path | None, typer.Option(help="Picture: the edited source view.")
+    ] = None,
+    prompt: Annotated[str | None, typer.Option(help="What the edited scene should show.")] = None,
+    source_prompt: Annotated[str | None, typer.Option(help="What the scene showed before.")] = None,
+    clip: Annotated[
+        str | None,
+        typer.Option(
+            help="clip-small, clip:FOLDER or none; clip-small if left out.", metavar="NAME"
+        ),
+    ] = None,
+    dino: Annotated[
+        str | None,
+        typer.Option(
+            help="dino-small, dinov2:FOLDER or none; dino-small if left out.", metavar="NAME"
+        ),
+    ] = None,
+    perceptual: Annotated[
+        str | None,
+        typer.Option(
+            help="perceptual-small, lpips:FILE_OR_FOLDER or none; perceptual-small if left out.",
+            metavar="NAME",
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            help=(
+                "Folder: masks named as the renders; white counts for Edit PSNR and the perceptual"
+                " distance. The others "
+                "see whole pictures."
+            )
+        ),
+    ] = None,
+    background: Annotated[
+        str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
+    ] = "black",
+    device: Annotated[str, typer.Option(help="cpu or cuda, for real encoders.")] = "cpu",
+    out: Annotated[Path, typer.Option(help="Folder for metrics.json and metrics.md.")] = Path(
+        "runs/metrics"
+    ),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print metrics.json instead of a table.")
+    ] = False,
+) -> None:
+    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures. What is left out is said,
+    with the reason.
+    """
+    from rich.console import Console
+
+    with clear_errors():
+        from attnwarp_eval.user_images import measure, write
+
+        inputs = measure.Inputs(
+            renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
+        )
+        kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
+        with progress() as show:
+            measured = measure.measure(
+                inputs,
+                kinds,
+                device=device,
+                progress=show,
+            )
+        paths = write.write(measured, out)
+    if as_json:
+        typer.echo(write.to_json(measured), nl=False)
+    else:
+        Console().print(write.table(measured))
+        for kind, about in measured.encoders.items():
+            typer.echo(f"{kind}: {about.name}, weights {about.weights_sha256[:12]}")
+    for what, why in measured.missing.items():
+        typer.echo(f"not computed: {what}: {why}", err=True)
+    for line in (*measured.unpaired, *measured.notes):
+        typer.echo(line, err=True)
+    for path in paths:
+        typer.echo(path, err=as_json)
+    if not measured.any_value:
+        raise fail("every figure is undefined on these pictures; see the notes above", TOO_LITTLE)
+
+
+def _color(text: str) -> tuple[float, float, float]:
+    from attnwarp.errors import InputError
+
+    named = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+    if text in named:
+        return named[text]
+    try:
+        r, g, b = (float(part) for part in text.split(","))
+    except ValueError:
+        r = g = b = -1.0
+    if not all(0 <= value <= 1 for value in (r, g, b)):
+        raise InputError(
+            f"--background: got {text!r}, expected black, white or r,g,b in [0, 1] such as"
+            " 0.2,0.5,1"
+        )
+    return r, g, b
+
+
+def encoders(
+    name: Annotated[str | None, typer.Argument(help="Load this one and say what it is.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON.")] = False,
+) -> None:
+    """The encoders that metrics can use: what ships with the package, and what is read from a
+    folder of yours.
+    """
+    import json
+
+    with clear_errors():
+        from attnwarp import encoders as known
+
+        if name is not None:
+            about = known.load_encoder(name).about.to_dict()
+            lines = (
+                [json.dumps(about, indent=2)]
+                if as_json
+                else [f"{key:15} {value}" for key, value in about.items()]
+            )
+        elif as_json:
+            rows = [
+                {"name": n, "kind": kind, "about": line, "bundled": n in known.BUNDLED}
+                for n, (kind, line) in (known.BUNDLED | known.REAL).items()
+            ]
+            lines = [json.dumps(rows, indent=2)]
+        else:
+            lines = ["ships with the package:"]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.BUNDLED.items()]
+            lines += ["read from a place of yours (docs/encoders.md says which files go there):"]
+            lines += [f"  {n:22} {kind:11} {line}" for n, (kind, line) in known.REAL.items()]
+    typer.echo("\n".join(lines))

@@ -1,0 +1,164 @@
+"""Commands that run a study, check a run, and write its report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+
+if TYPE_CHECKING:
+    from attnwarp_eval.study.run import Plan, Summary
+    from attnwarp_eval.study.store import Store
+
+
+def run(
+    study: Annotated[
+        str, typer.Argument(help="A study that ships (quick) or the path of a study's YAML.")
+    ] = "quick",
+    out: Annotated[
+        Path | None, typer.Option(help="The run's folder; runs/<study> if left out.")
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")
+    ] = 1,
+    scenes: Annotated[
+        str | None, typer.Option(help="Only these scenes (comma-separated names or paths).")
+    ] = None,
+    size: Annotated[
+        int | None, typer.Option(min=16, max=4096, help="Image size in px, not the study's.")
+    ] = None,
+    keep_going: Annotated[
+        bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")
+    ] = True,
+) -> None:
+    """Run a study and write its report. Killed half-way and started again, it goes on where it
+    was."""
+    from attnwarp_eval.study import run as runner
+    from attnwarp_eval.study.store import Store
+    from attnwarp_eval.study.study import load_study
+
+    with clear_errors():
+        loaded = load_study(study, scenes=names(scenes), size=size)
+        store = Store(out or Path("runs") / loaded.name)
+        planned = runner.plan(loaded, store)
+        with store.lock():
+            if planned.other_code:
+                typer.echo(
+                    f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were"
+                    " computed by other code than this; they are kept, and the report says so."
+                    " Name another folder with --out to start afresh.",
+                    err=True,
+                )
+            with resumable(lambda: f"{len(store.done())} cells are kept"):
+                summary = _watch(planned, store, jobs, keep_going)
+            _write_report(store)
+            uncalibrated = _calibration_problems(store)
+    _print_failures(summary)
+    if not summary.complete:
+        missing = summary.expected - summary.reused - summary.computed
+        raise fail(
+            f"{missing} of {summary.expected} cells were not measured; run again to retry them",
+            TOO_LITTLE,
+        )
+    if uncalibrated:
+        raise fail("the instrument is not calibrated: " + "; ".join(uncalibrated), TOO_LITTLE)
+
+
+def _calibration_problems(store: Store) -> list[str]:
+    from attnwarp_eval.report.calibration import problems
+    from attnwarp_eval.report.results import Results
+
+    return problems(Results.of(store))
+
+
+def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
+    """Run with a progress bar on a terminal, or a line a cell where there is none."""
+    from attnwarp_eval.study import run as runner
+
+    total, finished = len(planned.cells), planned.reused
+    with progress(total, done=finished, lines=True) as show:
+        reused = f", {planned.reused} already done" if planned.reused else ""
+        show.line(f"study {planned.study.name}: {total} cells{reused} -> {store.root}")
+
+        def listen(event: str, info: dict[str, Any]) -> None:
+            nonlocal finished
+            if event == "start":
+                show.step(info["title"])
+                return
+            finished += 1
+            error = f" FAILED: {info['error']}" if event == "failed" else ""
+            show(finished, total, info["title"] + error)
+            if error and show.console.is_terminal:
+                show.line(info["title"] + error)
+
+        return runner.execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
+
+
+def _print_failures(summary: Summary) -> None:
+    if not summary.failures:
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("scene", "variant", "probe", "error", title="failed cells")
+    for failure in summary.failures:
+        table.add_row(failure["scene"], failure["variant"], failure["probe"], failure["error"])
+    Console(stderr=True).print(table)
+
+
+def _write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> None:
+    from attnwarp_eval.report import write_report
+
+    for path in write_report(store, timings=timings, pictures=pictures):
+        typer.echo(path)
+
+
+def report(
+    run: Annotated[Path, typer.Argument(help="The run's folder.")],
+    timings: Annotated[bool, typer.Option(help="Without: no seconds, to compare runs.")] = True,
+    pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
+) -> None:
+    """Make report.md, report.html and results.jsonl again from the cells of a run."""
+    from attnwarp_eval.study.store import Store
+
+    with clear_errors():
+        _write_report(Store(run), timings=timings, pictures=pictures)
+
+
+def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:
+    """Recompute the hashes of a run's cells and pictures and compare with the list of expected
+    cells.
+    """
+    from attnwarp_eval.study import run as runner
+    from attnwarp_eval.study.store import Store
+
+    with clear_errors():
+        problems = runner.verify(Store(run))
+    for what, items in (
+        ("damaged", problems.damaged),
+        ("failed", problems.failed),
+        ("missing", problems.missing),
+        ("not of this study (kept)", problems.unexpected),
+    ):
+        for item in items:
+            typer.echo(f"{what}: {item}")
+    if not problems.ok:
+        bad = len(problems.damaged) + len(problems.failed) + len(problems.missing)
+        raise fail(
+            f"{run}: {bad} problems in {problems.checked} cells; run the study again to recompute"
+            " them",
+            TOO_LITTLE,
+        )
+    typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
+
+
+def studies() -> None:
+    """List the studies that ship with the package."""
+    from attnwarp_eval.study.study import load_study, shipped_studies
+
+    for name in shipped_studies():
+        loaded = load_study(name)
+        typer.echo(f"{name:12} {loaded.title}")

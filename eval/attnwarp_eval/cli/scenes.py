@@ -1,0 +1,269 @@
+"""Commands about scenes whose truth is exact: list, show, render, export, effects, cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+
+app = typer.Typer(
+    help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
+)
+
+
+@app.command("list")
+def list_() -> None:
+    """The scenes that can be named."""
+    from attnwarp.errors import InputError
+    from attnwarp_eval.scene.file import list_scenes, load_scene
+
+    broken = []
+    for name in list_scenes():
+        try:
+            typer.echo(f"{name:12} {load_scene(name).title}")
+        except InputError as error:
+            broken.append(str(error))
+    if broken:
+        raise fail("; ".join(broken))
+
+
+@app.command()
+def show(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+) -> None:
+    """What a scene contains, and how its pictures are made."""
+    with clear_errors():
+        from attnwarp_eval.scene.file import load_scene
+        from attnwarp_eval.truth.show import describe
+
+        typer.echo(describe(load_scene(scene)))
+
+
+@app.command()
+def render(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the PNG files; runs/scenes/<scene> if left out.")
+    ] = None,
+    views: Annotated[
+        str | None, typer.Option(help="Only these cameras (comma-separated names).")
+    ] = None,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
+    spp: Annotated[
+        int | None, typer.Option(min=1, help="Samples a pixel, not the scene's.")
+    ] = None,
+) -> None:
+    """Render a scene's truth from its cameras: pictures, depth, normals, and one sheet of them
+    all."""
+    with clear_errors():
+        from attnwarp_eval.scene.file import load_scene
+        from attnwarp_eval.truth.show import render_views
+
+        loaded = load_scene(scene).with_size(size, size)
+        folder = out or Path("runs") / "scenes" / loaded.name
+        with progress() as show:
+            written = list(
+                render_views(loaded, folder, views=names(views), spp=spp, progress=show.step)
+            )
+    typer.echo(written[-1])
+
+
+@app.command()
+def export(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    out: Annotated[Path, typer.Argument(help="Folder; what is in it already is overwritten.")],
+    views: Annotated[
+        int, typer.Option(min=1, help="Views around the scene; every 8th is of the split 'test'.")
+    ] = 64,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Image size in px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 16,
+    points: Annotated[
+        int, typer.Option(min=10, help="Points scattered about the surfaces.")
+    ] = 5000,
+    noise: Annotated[
+        float, typer.Option(min=0, help="How far, in spacings between the points.")
+    ] = 0.5,
+    seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
+) -> None:
+    """Write a scene as transforms.json, images and points: what `attnwarp fit` and other programs
+    read.
+    """
+    with clear_errors():
+        from attnwarp_eval.scene.file import load_scene
+        from attnwarp_eval.splats.export import export as write_scene
+
+        loaded = load_scene(scene)
+        with progress() as show:
+            write_scene(
+                loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
+                progress=lambda text: show.step(f"{loaded.name}: {text}"),
+            )  # fmt: skip
+    typer.echo(out / "transforms.json")
+
+
+@app.command()
+def edits(
+    scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON, with the content hash of each result.")
+    ] = False,
+) -> None:
+    """The edits that a scene names, with what each one asks for and does."""
+    import json
+
+    with clear_errors():
+        from attnwarp_eval.scene.file import load_scene
+        from attnwarp_eval.truth import edits as known
+
+        loaded = load_scene(scene)
+        typer.echo(
+            json.dumps(known.to_dict(loaded), indent=2) if as_json else known.describe(loaded)
+        )
+
+
+@app.command()
+def effects(
+    scene: Annotated[
+        str | None, typer.Argument(help="A scene's name, or the path of its YAML.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON with the keys effects and plan.")
+    ] = False,
+    prove: Annotated[
+        bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
+    ] = False,
+    budget: Annotated[float, typer.Option(min=1, help="Seconds that a proof may render.")] = 60.0,
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--all", help="A table and pictures of every scene; goes on where it was left."
+        ),
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder of --all.")] = Path("runs/effects"),
+) -> None:
+    """Which light transport a scene needs, how it is rendered, what that saves, and a proof that
+    nothing is lost.
+    """
+    import json
+
+    if every == (scene is not None):
+        raise fail("name one scene, or say --all for a table of all of them")
+    if every:
+        if as_json:
+            raise fail("--json is of one scene; --all writes effects.json into --out")
+        _effects_of_all(out, prove, budget)
+        return
+    with clear_errors():
+        from attnwarp_eval.effects import detect as light
+        from attnwarp_eval.effects.proof import prove as hold
+        from attnwarp_eval.scene.file import load_scene
+
+        loaded = load_scene(str(scene))
+        about = light.report(loaded, cost=light.measure(loaded))
+        proof = hold(loaded, seconds=budget) if prove else None
+    if proof is not None:
+        about["proof"] = proof.to_dict()
+    lines = [json.dumps(about, indent=2)] if as_json else list(light.describe(loaded, about))
+    if proof is not None and not as_json:
+        lines += ["", *proof.lines()]
+    typer.echo("\n".join(lines))
+    if proof is not None and proof.verdict != "certified":
+        raise fail(f"{loaded.name}: the plan is not certified: {proof.words}", TOO_LITTLE)
+
+
+def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
+    with clear_errors():
+        from attnwarp_eval.effects.table import Settings, collect, proof_words
+        from attnwarp_eval.scene.file import list_scenes
+
+        scenes = list_scenes()
+        with (
+            progress(len(scenes), lines=True) as show,
+            resumable(lambda: "finished scenes are kept"),
+        ):
+
+            def watch(text: str, done: int) -> None:
+                show(done, len(scenes), text)
+
+            entries = collect(scenes, out, Settings(prove=prove, budget=budget), watch)
+    typer.echo(out / "effects.md")
+    doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
+                and e["proof"]["verdict"] != "certified"]  # fmt: skip
+    if doubtful:
+        raise fail(f"not every plan is certified: {'; '.join(doubtful)}", TOO_LITTLE)
+
+
+@app.command()
+def accuracy(
+    scenes: Annotated[
+        list[str] | None,
+        typer.Argument(help="Scenes' names or paths; a few telling ones if left out."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for accuracy.md, accuracy.json and the figures.")
+    ] = Path("runs/accuracy"),
+    rounds: Annotated[int, typer.Option(min=3, help="Of every timing.")] = 7,
+) -> None:
+    """Error of the truth itself against time: samples a pixel, Mitsuba's variant, float64
+    refinement, visibility.
+    """
+    with clear_errors():
+        from attnwarp_eval.experiments import accuracy as truth
+
+        with progress() as show:
+            panels = truth.measure(scenes or (), rounds=rounds, progress=show.step)
+        for path in truth.write(panels, out):
+            typer.echo(path)
+
+
+@app.command("time")
+def time_(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scenes' names or paths; all if left out.")
+    ] = None,
+    views: Annotated[int, typer.Option(min=1, help="Views of each scene, the source first.")] = 8,
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures, px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 64,
+    geometry_size: Annotated[
+        int, typer.Option(min=16, max=4096, help="Of depth and ids, px.")
+    ] = 512,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="JSON, with every scene's stages.")
+    ] = False,
+) -> None:
+    """How long the truth takes from nothing (an empty cache of its own): meshes, geometry,
+    pictures.
+    """
+    import json
+
+    from rich.console import Console
+    from rich.table import Table
+
+    with clear_errors():
+        from attnwarp_eval.experiments import suite
+        from attnwarp_eval.scene.file import list_scenes
+
+        times = []
+        with progress() as show:
+            for taken in suite.measure(
+                scenes or list_scenes(),
+                views=views,
+                size=size,
+                spp=spp,
+                geometry_size=geometry_size,
+                progress=show.step,
+            ):
+                times.append(taken)
+                # All of them take minutes, so each is printed as soon as it is measured.
+                show.line(f"{taken.scene}: {sum(taken.wall.values()):.1f} s")
+    if as_json:
+        typer.echo(json.dumps(suite.to_dict(times), indent=1))
+        return
+    columns, rows = suite.columns_and_rows(times)
+    table = Table(*columns, caption="wall, with CPU in brackets")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=160).print(table)

@@ -1,0 +1,129 @@
+"""What every command shares: exit codes, errors in one line, and one progress bar."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
+
+PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH, INTERRUPTED = 0, 1, 2, 3, 70, 130
+"""Exit codes. 1 is reserved for a regression; an unusable input is 2. A run that measured too
+little, or with an instrument that is not calibrated, is 3. A fault of this program is 70, as in
+sysexits; an interrupt is 130, as in shells."""
+
+
+def fail(message: str, code: int = USAGE) -> typer.Exit:
+    """Print an error on stderr; raise what this returns."""
+    typer.echo(f"attnwarp-eval: {message}", err=True)
+    return typer.Exit(code)
+
+
+@contextmanager
+def clear_errors() -> Iterator[None]:
+    """Turn errors about a person's input into one clear line and exit code 2."""
+    from attnwarp.errors import InputError
+
+    try:
+        yield
+    except InputError as error:
+        raise fail(str(error)) from None
+    except OSError as error:
+        path = f"{error.filename}: " if error.filename else ""
+        raise fail(
+            f"{path}{error.strerror or error}; check the path, the space on its disk and its"
+            " permissions"
+        ) from None
+
+
+@contextmanager
+def resumable(state: Callable[[], str]) -> Iterator[None]:
+    """Turn Ctrl-C into one clear line and exit code 130.
+
+    Args:
+        state: what is finished and stays, such as "3 cells are kept"; asked after the interrupt.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        message = f"interrupted; {state()}, the same command goes on from here"
+        raise fail(message, INTERRUPTED) from None
+
+
+def names(text: str | None) -> list[str] | None:
+    """The parts of a comma-separated option; None if the option was left out."""
+    return None if text is None else [part.strip() for part in text.split(",") if part.strip()]
+
+
+class Progress:
+    """Progress of one command on stderr: a bar on a terminal, else lines if they are asked for.
+
+    Attributes:
+        console: stderr.
+    """
+
+    def __init__(self, console: Console, bar: RichProgress, task: TaskID, lines: bool) -> None:
+        self.console = console
+        self._bar = bar
+        self._task = task
+        self._lines = lines and not console.is_terminal
+
+    def __call__(self, done: int, total: int, step: str) -> None:
+        """Show how far the work is.
+
+        Args:
+            done: steps finished.
+            total: steps in all; 0 while their number is unknown.
+            step: what is at work, or has just ended.
+        """
+        self._bar.update(self._task, description=step, completed=done, total=total or None)
+        if self._lines:
+            self.line(f"[{done}/{total}] {step}" if total else step)
+
+    def step(self, text: str) -> None:
+        """Name what is at work, without a count."""
+        self._bar.update(self._task, description=text)
+
+    def line(self, text: str) -> None:
+        """Print a line above the bar."""
+        self.console.print(text, markup=False, highlight=False)
+
+
+@contextmanager
+def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[Progress]:
+    """The progress bar of a command.
+
+    Args:
+        total: number of steps; 0 while it is unknown.
+        done: steps finished before.
+        lines: without a terminal, print a line for every call.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.progress import Progress as RichProgress
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with RichProgress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield Progress(
+            console, bar, bar.add_task("starting", total=total or None, completed=done), lines
+        )
