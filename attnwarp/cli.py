@@ -403,14 +403,11 @@ def _file_names(cameras: Any) -> list[str]:
 
 def _write_image(path: Path, rgb: Any) -> None:
     """(H, W, 3) sRGB in [0, 1] as an 8-bit PNG, atomically."""
-    import cv2
-    import numpy as np
-
     from attnwarp.io.file import write_atomically
+    from attnwarp.io.picture import encode_picture
 
-    pixels = np.round(255 * np.clip(rgb[..., ::-1], 0, 1)).astype(np.uint8)
-    _, data = cv2.imencode(".png", pixels)
-    write_atomically(path, lambda stream: stream.write(data.tobytes()))
+    data = encode_picture(rgb)
+    write_atomically(path, lambda stream: stream.write(data))
 
 
 def main() -> None:

@@ -16,5 +16,10 @@ class InputError(ValueError):
 
 def suggest(word: str, known: Sequence[str]) -> str:
     """The end of a message: the known word nearest to a misspelt one; empty where none is near."""
-    near = difflib.get_close_matches(word, known, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(word, known)
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
+def nearest(word: str, known: Sequence[str]) -> str | None:
+    """The known word nearest to a misspelt one; None where none is near."""
+    return next(iter(difflib.get_close_matches(word, known, n=1)), None)

@@ -8,20 +8,23 @@ on. docs/effects.md has the reasons.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.cost import AGAIN, in_turn
+from attnwarp_eval.files import without_nan
 from attnwarp_eval.scene import transport
 from attnwarp_eval.scene.materials import EFFECTS, NOT_SIMULATED, Effect
 from attnwarp_eval.scene.scene import Scene, SceneError
+from attnwarp_eval.statistics.equivalence import welch_interval
+from attnwarp_eval.statistics.intervals import time_ratio
 from attnwarp_eval.truth.llvm import LLVM, variant
 from attnwarp_eval.truth.mitsuba import graph, render_plan
-from attnwarp_eval.truth.plan import convex, everything_on, plan, sampler, small_lights
+from attnwarp_eval.truth.plan import Plan, convex, everything_on, plan, sampler, small_lights
 
 Array = npt.NDArray[np.float64]
 
@@ -272,6 +275,7 @@ class Cost:
     faster: float
     variance: tuple[float, float]
     interval: tuple[float, float] | None
+    again: tuple[float, float]
     cap: Cap | None = None
 
     @property
@@ -287,10 +291,8 @@ class Cost:
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON, where infinity is null."""
-        out = asdict(self) | {"at_equal_noise": _finite(self.at_equal_noise)}
-        if self.cap is not None:
-            out["cap"]["at_equal_error"] = _finite(self.cap.at_equal_error)
-        return out
+        fields: dict[str, Any] = without_nan(asdict(self) | {"at_equal_noise": self.at_equal_noise})
+        return fields
 
 
 def measure(
@@ -315,16 +317,14 @@ def measure(
     bounces = scene.spec.appearance.bounces
     if bounces != "unlimited":
         contestants.append(everything_on(small, spp))
-    pictures: list[list[Any]] = [[] for _ in contestants]
-    seconds: list[list[float]] = [[] for _ in contestants]
-    for turn in range(rounds + 1):
-        for step in range(len(contestants)):
-            k = (step + turn) % len(contestants)
-            start = time.perf_counter()
-            picture = render_plan(small, small.source, contestants[k], seed + turn)
-            if turn:
-                seconds[k].append(time.perf_counter() - start)
-                pictures[k].append(picture)
+
+    def rendered(made: Plan) -> Callable[[int], Any]:
+        # Both runs of the plan in a round have one seed: only their seconds are compared.
+        return lambda turn: render_plan(small, small.source, made, seed + turn % AGAIN)
+
+    turns = in_turn([rendered(made) for made in contestants], rounds, seed=seed)
+    pictures, seconds = turns.results, turns.seconds
+    again = time_ratio([turns.again], [seconds[0]])
     scale = float(np.mean(pictures[1])) ** 2
     taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
     variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
@@ -348,6 +348,7 @@ def measure(
         faster,
         (variance[0], variance[1]),
         interval,
+        (again.low, again.high),
         cap,
     )
 
@@ -363,22 +364,11 @@ def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | 
     """Relative difference of two means with its 95 % interval, from the means of independent
     pictures.
     """
-    from scipy import stats
-
     if min(ours.min(), full.min()) <= 0 or len(ours) < 2:
         return None, None
     # Logarithms, so that the noise of the reference counts as well.
-    a, b = np.log(ours), np.log(full)
-    middle, parts = float(a.mean() - b.mean()), [float(x.var(ddof=1)) / len(x) for x in (a, b)]
-    # Rounding aside: pictures without noise differ by exactly what they differ by.
-    if sum(parts) < 1e-20:
-        return float(np.expm1(middle)), (float(np.expm1(middle)), float(np.expm1(middle)))
-    freedom = sum(parts) ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(parts, (a, b), strict=True))
-    reach = float(stats.t.ppf(0.975, freedom)) * float(np.sqrt(sum(parts)))
-    return float(np.expm1(middle)), (
-        float(np.expm1(middle - reach)),
-        float(np.expm1(middle + reach)),
-    )
+    bias, low, high = np.expm1(welch_interval(np.log(full), np.log(ours))).tolist()
+    return bias, (low, high)
 
 
 def _ratio_interval(
@@ -429,10 +419,6 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
     return out
 
 
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
     """The lines of :func:`report` for a person."""
     yield f"{scene.name}: {scene.title}"
@@ -473,6 +459,8 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
                 else f"{equal:.1f} times{_span(cost['interval'])}"
             )
         )
+        low, high = cost["again"]
+        yield f"  the plan's time against itself: {low:.2f} to {high:.2f}"
         if cap := cost["cap"]:
             if cap["bias"] is not None:
                 low, high = cap["bias_interval"]

@@ -27,9 +27,9 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         The files written, the one a person opens first at the end.
     """
     from attnwarp_eval.document.write import markdown, page
+    from attnwarp_eval.files import write_atomic
     from attnwarp_eval.report.build import build
     from attnwarp_eval.report.results import Results
-    from attnwarp_eval.study.store import write_atomic
 
     results = Results.of(store)
     report = build(results, store.root, timings=timings, pictures=pictures)

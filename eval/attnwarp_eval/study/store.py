@@ -8,7 +8,6 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -16,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from attnwarp.errors import InputError
-from attnwarp_eval.files import digest
+from attnwarp.io.file import remove_abandoned
+from attnwarp_eval.files import digest, write_json
 
 FORMAT = 1
 """Version of the layout of a cell's file; a reader refuses others."""
@@ -24,24 +24,6 @@ FORMAT = 1
 
 class StoreError(InputError):
     """A run's folder that cannot be used; the message says which and what to do."""
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write so that ``path`` either keeps its old content or has all of ``data``, even after a
-    power cut.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 @dataclass
@@ -81,13 +63,19 @@ class Store:
                     f"{self.root}: another run is writing to this folder; wait for it, or name"
                     " another with --out"
                 ) from None
+            self._sweep()
             yield
+
+    def _sweep(self) -> None:
+        """Remove the temporary files of runs that were killed."""
+        for folder in (self.root, self.cells, self.failed, *self.pictures.glob("*/")):
+            remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
         """Keep the resolved study and its expected cells. Cells of a former study in this folder
         stay.
         """
-        self.write_json(self.root / "study.json", study)
+        write_json(self.root / "study.json", study)
 
     def read_study(self) -> dict[str, Any]:
         """The resolved study.
@@ -111,13 +99,6 @@ class Store:
             f"{path}: damaged; run the study again with --out {self.root}, which writes it anew"
         )
 
-    @staticmethod
-    def write_json(path: Path, value: Any) -> None:
-        """Atomic, readable JSON."""
-        write_atomic(
-            path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
-        )
-
     def path(self, cell_id: str) -> Path:
         """Where the record of a cell lies."""
         return self.cells / f"{cell_id}.json"
@@ -132,12 +113,12 @@ class Store:
         """
         sealed = {**record, "format": FORMAT}
         sealed["sha256"] = digest(sealed)
-        self.write_json(self.path(record["id"]), sealed)
+        write_json(self.path(record["id"]), sealed)
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
         """Keep why a cell failed; it is tried again by the next run."""
-        self.write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
+        write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
 
     def failures(self) -> list[dict[str, Any]]:
         """Failures of cells that have no record."""

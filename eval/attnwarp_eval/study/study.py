@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +10,7 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from attnwarp.encoders import Kind
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, suggest
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.parts import Ablation, Fits, Front, Part, Pictures, Splats, Variant, Yaw
 
@@ -402,8 +401,7 @@ class Study(Part):
 
 
 def _did_you_mean(name: str, known: Any) -> str:
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(map(repr, known))}"
+    return suggest(name, list(known)) or f"; there are {', '.join(map(repr, known))}"
 
 
 def shipped_studies() -> dict[str, Path]:

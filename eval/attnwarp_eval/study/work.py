@@ -32,10 +32,9 @@ from attnwarp.warp.view import (
 from attnwarp_eval import metrics
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.effects.table import said_by
-from attnwarp_eval.files import digest
+from attnwarp_eval.files import digest, write_atomic
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.store import write_atomic
 from attnwarp_eval.truth import TwoView
 from attnwarp_eval.world import World, splats, world
 

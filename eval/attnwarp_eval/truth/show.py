@@ -63,11 +63,11 @@ def render_views(
         The files, as they are written; the sheet, ``sheet.png``, last.
     """
     from attnwarp_eval.colors import to_srgb
+    from attnwarp_eval.files import write_picture
     from attnwarp_eval.truth import Geometry, appearance
 
     cameras = scene.cameras if views is None else [scene.camera(name) for name in views]
     geometry = Geometry(scene)
-    out.mkdir(parents=True, exist_ok=True)
     rows = []
     for camera in cameras:
         if progress:
@@ -80,9 +80,9 @@ def render_views(
             "normal": normal_picture(hits.normal, camera),
         }
         for what, picture in pictures.items():
-            yield _write(out / f"{camera.name}-{what}.png", picture)
+            yield write_picture(out / f"{camera.name}-{what}.png", picture)
         rows.append(np.concatenate(list(pictures.values()), axis=1))
-    yield _write(out / "sheet.png", np.concatenate(rows))
+    yield write_picture(out / "sheet.png", np.concatenate(rows))
 
 
 def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
@@ -106,12 +106,3 @@ def normal_picture(normal: npt.NDArray[np.float64], camera: Camera) -> Image:
     """
     local = normal @ camera.rotation.T * np.array([1, -1, -1])
     return np.where(np.isfinite(local), 0.5 + 0.5 * np.nan_to_num(local), 0.5)
-
-
-def _write(path: Path, image: Image) -> Path:
-    import cv2
-
-    pixels = np.clip(np.rint(np.asarray(image) * 255), 0, 255).astype(np.uint8)
-    if not cv2.imwrite(str(path), pixels[..., ::-1]):
-        raise OSError(f"{path}: could not be written")
-    return path

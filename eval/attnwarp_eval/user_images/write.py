@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
-from attnwarp_eval.study.store import write_atomic
 from attnwarp_eval.user_images.measure import Measured, Row, natural
 
 if TYPE_CHECKING:

@@ -12,12 +12,15 @@ from effect_scenes import FLOOR, SKY, SUN, ball, make
 from scipy import stats
 from typer.testing import CliRunner
 
+from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.colors import to_linear
 from attnwarp_eval.effects import detect, table
 from attnwarp_eval.effects.table import Settings, collect, plan_words, said_by, side_by_side
 from attnwarp_eval.report.effects import effects as section
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.truth import mitsuba
 from attnwarp_eval.truth.plan import plan
 
 
@@ -77,7 +80,7 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     free = detect.everything_on(scene.with_size(8, 8), 4, capped=False)
     full = detect.everything_on(scene.with_size(8, 8), 4)
     clock = [0.0]
-    monkeypatch.setattr(detect.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
 
     def render(scene, camera, made, seed):
         mean, noise, seconds = (
@@ -91,29 +94,29 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
         return mean + noise * np.random.default_rng((seed, int(seconds))).standard_normal((8, 8, 3))
 
     monkeypatch.setattr(detect, "render_plan", render)
-    cost = detect.measure(scene, size=8, spp=4, rounds=40)
-    low, high = cost.cap.bias_interval
+    measured = detect.measure(scene, size=8, spp=4, rounds=40)
+    low, high = measured.cap.bias_interval
     # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192)
     # = 0.054 %.
     assert (
-        cost.cap.bias == pytest.approx(-0.2, abs=0.0025)
+        measured.cap.bias == pytest.approx(-0.2, abs=0.0025)
         and low < -0.2 < high
         and high - low < 0.003
     )
-    assert cost.faster == pytest.approx(3) and cost.cap.faster == pytest.approx(2)
-    assert cost.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
-    assert cost.interval[0] < cost.at_equal_noise < cost.interval[1]
+    assert measured.faster == pytest.approx(3) and measured.cap.faster == pytest.approx(2)
+    assert measured.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
+    assert measured.interval[0] < measured.at_equal_noise < measured.interval[1]
     assert (
-        cost.cap.at_equal_error == pytest.approx(2 * 2.25, rel=0.1)
-        and cost.cap.interval[0] < 4.5 < cost.cap.interval[1]
+        measured.cap.at_equal_error == pytest.approx(2 * 2.25, rel=0.1)
+        and measured.cap.interval[0] < 4.5 < measured.cap.interval[1]
     )
-    about = detect.report(scene, cost=cost) | {"cost": cost.to_dict()}
+    about = detect.report(scene, cost=measured) | {"cost": measured.to_dict()}
     text = "\n".join(detect.describe(scene, about))
     assert (
         "not for the same error: the scene's cap of 1 bounces changes the picture's light by -20"
         in text
     )
-    row = table._times(json.loads(json.dumps(cost.to_dict())))
+    row = table._times(json.loads(json.dumps(measured.to_dict())))
     assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
     endless = detect.measure(
         make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3
@@ -195,5 +198,16 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for():
     assert plan_words(plan(load_scene("lens")).to_dict()) == "direct, thin lens"
 
 
-def test_differences_are_shown_about_grey():
-    assert np.isclose(0.5 + table.AMPLIFIED / 2 * 0.125, 1.0)
+def test_differences_are_drawn_about_grey_and_eight_times_stronger(small, monkeypatch, tmp_path):
+    # sRGB 0.50 and 0.47 on the two sides, planted as the linear values that they are made from.
+    values = iter([0.50, 0.47])
+
+    def planted(scene, camera, made, seed, made_by):
+        return to_linear(np.full((16, 16, 3), next(values)))
+
+    monkeypatch.setattr(mitsuba, "render_plan", planted)
+    about = side_by_side(load_scene("spheres"), tmp_path / "planted.jpg")
+    assert about["largest_difference"] == pytest.approx(0.03, abs=1e-12)
+    panels = cv2.imread(str(tmp_path / "planted.jpg"))[:, [8, 28, 48]].mean((0, 2)) / 255
+    # 0.03, eight times stronger, half of it to either side of grey. JPEG keeps flat areas to 2/255.
+    assert panels == pytest.approx([0.50, 0.47, 0.5 + 8 * 0.03 / 2], abs=2.5 / 255)
