@@ -39,11 +39,11 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     collect(["spheres", "glass"], tmp_path, quick)
     collect(["spheres", "glass", "mirror"], tmp_path, quick)
     assert made == ["spheres", "glass", "mirror"]
-    data = json.loads((tmp_path / "detect.json").read_text())
+    data = json.loads((tmp_path / "effects.json").read_text())
     by_name = {entry["scene"]: entry for entry in data["scenes"]}
     assert "refraction" in by_name["glass"]["needed"] and "specular" in by_name["mirror"]["needed"]
     assert by_name["spheres"]["left_out"] == ["interreflection"]
-    text = (tmp_path / "detect.md").read_text()
+    text = (tmp_path / "effects.md").read_text()
     assert (
         "| mirror | interreflection, specular, environment | " in text
         and " | path | not asked | " in text
@@ -158,7 +158,7 @@ def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, 
 
 
 def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_for(tmp_path):
-    (tmp_path / "detect.json").write_text("{}")
+    (tmp_path / "effects.json").write_text("{}")
     runner = CliRunner()
     for arguments, words in (
         (["--all", "--out", str(tmp_path)], "it is not a table of effects"),
