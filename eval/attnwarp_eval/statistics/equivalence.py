@@ -43,8 +43,10 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
     Student's problem when several different population variances are involved", Biometrika 34).
 
     Args:
-        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Where neither varies, p is 1 for
-            equal values (within ``ROUNDING``) and 0 for others.
+        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Values that do not vary at all
+            have p = 1 where they are equal within ``ROUNDING`` and 0 elsewhere. Values that vary by
+            less than ``ROUNDING``, such as those of a smooth sky, are tested as all others are, but
+            for a part of their difference that may be rounding.
 
     Raises:
         ValueError: fewer than two samples on a side.
@@ -57,17 +59,25 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
 
     first, second = _samples(a, b)
     difference, variance, freedom = _difference(first, second)
-    floor = (ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))) ** 2
-    still = variance <= floor
-    freedom = np.where(still, np.inf, freedom)
+    rounding = ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))
+    error = np.sqrt(variance)
+    freedom = np.where(variance > 0, freedom, np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.abs(difference) / np.sqrt(variance)
         p = np.where(
-            still,
-            np.where(difference**2 <= floor, 1.0, 0.0),
-            2 * stats.t.sf(t, np.minimum(freedom, 1e9)),
+            variance > 0,
+            2 * stats.t.sf(_beyond(difference, error, rounding) / error, np.minimum(freedom, 1e9)),
+            np.where(np.abs(difference) <= rounding, 1.0, 0.0),
         )
-    return Welch(difference, np.sqrt(variance), freedom, p)
+    return Welch(difference, error, freedom, p)
+
+
+def _beyond(difference: Array, error: Array, rounding: Array) -> Array:
+    """What of a difference noise must explain: all of it, or only what is beyond the rounding where
+    the noise is below that.
+    """
+    return np.where(
+        error > rounding, np.abs(difference), np.maximum(np.abs(difference) - rounding, 0.0)
+    )
 
 
 def welch_interval(
@@ -196,11 +206,11 @@ def paired_test(a: npt.ArrayLike, b: npt.ArrayLike) -> PairedTest:
     d = (second - first) / scale
     error = float(d.std(ddof=1) / math.sqrt(len(d)))
     mean = float(d.mean())
-    p = (
-        float(2 * stats.t.sf(abs(mean) / error, len(d) - 1))
-        if error > ROUNDING
-        else float(abs(mean) <= ROUNDING)
-    )
+    if error > 0:
+        beyond = float(_beyond(np.array(mean), np.array(error), np.array(ROUNDING)))
+        p = float(2 * stats.t.sf(beyond / error, len(d) - 1))
+    else:
+        p = float(abs(mean) <= ROUNDING)
     return PairedTest(mean, error, p, len(d))
 
 
