@@ -8,7 +8,7 @@ import contextlib
 import fcntl
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -148,6 +148,34 @@ class Store:
         if problem:
             raise StoreError(f"{path}: {problem}; delete it and run again")
         return record
+
+    def resumed(
+        self, spec: dict[str, Any], compute: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """The record of a cell: read where it is finished and whole, else computed and written.
+
+        Args:
+            spec: everything that decides the result, and nothing else; its hash is the cell's id.
+            compute: makes the rest of the record, as JSON.
+
+        Returns:
+            The record, as it is read back, so that a resumed run cannot differ from a whole one.
+        """
+        cell_id = digest(spec)
+        if self.path(cell_id).is_file():
+            with contextlib.suppress(StoreError):  # a damaged record is computed again
+                record = self.read(cell_id)
+                if not self._damaged_pictures(record):
+                    return record
+        self.write({"id": cell_id, "spec": spec, **compute()})
+        return self.read(cell_id)
+
+    def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
+        """What a record says of a picture that was written below the folder: ``about``, its path
+        and its SHA-256.
+        """
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 
     def _problem(self, cell_id: str, record: dict[str, Any]) -> str | None:
         if record.get("format") != FORMAT:

@@ -16,7 +16,9 @@ from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.effects import detect, saving, table
-from attnwarp_eval.effects.table import Settings, collect, plan_words, said_by, side_by_side
+from attnwarp_eval.effects.table import Settings, plan_words, said_by, side_by_side
+from attnwarp_eval.experiments import effects
+from attnwarp_eval.experiments.effects import collect
 from attnwarp_eval.report.effects import effects as section
 from attnwarp_eval.report.results import Results
 from attnwarp_eval.scene.file import load_scene
@@ -34,9 +36,9 @@ def small(monkeypatch):
 
 def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, tmp_path):
     made = []
-    real = table._entry
+    real = effects.measure_entry
     monkeypatch.setattr(
-        table, "_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
+        effects, "measure_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
     )
     quick = Settings(prove=False, rounds=2)
     collect(["spheres", "glass"], tmp_path, quick)
@@ -54,9 +56,33 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert text.count(".jpg)") == 3 and "3 scenes, 0 of their plans certified" in text
     # Another setting is another entry; a picture that is gone is drawn again.
     collect(["glass"], tmp_path, Settings(prove=False, rounds=3))
+    picture = (tmp_path / "mirror.jpg").read_bytes()
     (tmp_path / "mirror.jpg").unlink()
     collect(["mirror"], tmp_path, quick)
-    assert made[3:] == ["glass", "mirror"] and (tmp_path / "mirror.jpg").is_file()
+    assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
+
+
+def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monkeypatch, tmp_path):
+    real, made = effects.measure_entry, []
+
+    def interrupted(scene, *more):
+        made.append(scene.name)
+        if made == ["spheres", "glass"]:
+            raise KeyboardInterrupt
+        return real(scene, *more)
+
+    monkeypatch.setattr(effects, "measure_entry", interrupted)
+    quick = Settings(prove=False, rounds=2, pictures=False)
+    with pytest.raises(KeyboardInterrupt):
+        collect(["spheres", "glass"], tmp_path, quick)
+    (first,) = json.loads((tmp_path / "effects.json").read_text())["scenes"]
+    entries = collect(["spheres", "glass"], tmp_path, quick)
+    # Seconds are among the entry's figures: measured again they would differ.
+    assert entries[0] == first and made == ["spheres", "glass", "glass"]
+    (cell,) = (c for c in (tmp_path / "cells").iterdir() if '"name": "glass"' in c.read_text())
+    cell.write_bytes(cell.read_bytes()[:-9])
+    assert collect(["spheres", "glass"], tmp_path, quick)[0] == first
+    assert made[3:] == ["glass"]
 
 
 def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
