@@ -227,6 +227,7 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
 
 
 def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
+    """The table as Markdown, with the pictures side by side; ``about`` is the environment."""
     from attnwarp_eval.document.model import Gallery, Picture, Report, Section
     from attnwarp_eval.document.write import markdown
 
