@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
 
 if TYPE_CHECKING:
+    from attnwarp_eval.study.cell import Cell
+    from attnwarp_eval.study.record import Failure
     from attnwarp_eval.study.run import Plan, Summary
     from attnwarp_eval.study.store import Store
 
@@ -36,6 +38,7 @@ def run(
 ) -> None:
     """Run a study and write its report. Killed half-way and started again, it goes on where it
     was."""
+    from attnwarp_eval.report import problems, read_results
     from attnwarp_eval.study import run as runner
     from attnwarp_eval.study.store import Store
     from attnwarp_eval.study.study import load_study
@@ -55,7 +58,7 @@ def run(
             with resumable(lambda: f"{len(store.done())} cells are kept"):
                 summary = _watch(planned, store, jobs, keep_going)
             _write_report(store)
-            uncalibrated = _calibration_problems(store)
+            uncalibrated = problems(read_results(store))
     _print_failures(summary)
     if not summary.complete:
         missing = summary.expected - summary.reused - summary.computed
@@ -67,13 +70,6 @@ def run(
         raise fail("the instrument is not calibrated: " + "; ".join(uncalibrated), TOO_LITTLE)
 
 
-def _calibration_problems(store: Store) -> list[str]:
-    from attnwarp_eval.report.calibration import problems
-    from attnwarp_eval.report.results import Results
-
-    return problems(Results.of(store))
-
-
 def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
     """Run with a progress bar on a terminal, or a line a cell where there is none."""
     from attnwarp_eval.study import run as runner
@@ -83,16 +79,16 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
         reused = f", {planned.reused} already done" if planned.reused else ""
         show.line(f"study {planned.study.name}: {total} cells{reused} -> {store.root}")
 
-        def listen(event: str, info: dict[str, Any]) -> None:
+        def listen(cell: Cell, event: str, failure: Failure | None) -> None:
             nonlocal finished
             if event == "start":
-                show.step(info["title"])
+                show.step(cell.title)
                 return
             finished += 1
-            error = f" FAILED: {info['error']}" if event == "failed" else ""
-            show(finished, total, info["title"] + error)
+            error = "" if failure is None else f" FAILED: {failure.error}"
+            show(finished, total, cell.title + error)
             if error and show.console.is_terminal:
-                show.line(info["title"] + error)
+                show.line(cell.title + error)
 
         return runner.execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
 
@@ -105,7 +101,7 @@ def _print_failures(summary: Summary) -> None:
 
     table = Table("scene", "variant", "probe", "error", title="failed cells")
     for failure in summary.failures:
-        table.add_row(failure["scene"], failure["variant"], failure["probe"], failure["error"])
+        table.add_row(failure.scene, failure.variant, failure.probe, failure.error)
     Console(stderr=True).print(table)
 
 

@@ -199,7 +199,7 @@ def _smallest(proof: Mapping[str, Any] | None) -> str:
 
 
 def _times(cost: Mapping[str, Any] | None) -> list[str]:
-    from attnwarp_eval.report.words import number
+    from attnwarp_eval.document.numbers import number
 
     if cost is None:
         return ["–"] * len(TIMED)

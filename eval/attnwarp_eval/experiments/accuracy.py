@@ -659,7 +659,7 @@ TITLES = {
 
 def _sections(panels: Sequence[Panel]) -> list[Any]:
     from attnwarp_eval.document.model import Section, Table
-    from attnwarp_eval.report.words import number
+    from attnwarp_eval.document.numbers import number
 
     def ratio(value: Ratio) -> str:
         return f"{number(value.ratio)} [{number(value.low)}, {number(value.high)}]"

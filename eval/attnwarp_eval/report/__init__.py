@@ -5,12 +5,14 @@ alone.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from attnwarp_eval.study.store import Store
+from attnwarp_eval.document.write import markdown, page
+from attnwarp_eval.files import write_atomic
+from attnwarp_eval.report.build import build, problems
+from attnwarp_eval.report.results import lines, read_results
+from attnwarp_eval.study.store import Store
 
-__all__ = ["write_report"]
+__all__ = ["problems", "read_results", "write_report"]
 
 
 def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -> list[Path]:
@@ -20,21 +22,16 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
         store: the run.
         timings: False leaves out everything measured in seconds or memory, so that two runs of the
             same study on the same code give the same bytes.
-        pictures: False leaves out the views' pictures, for a report that is kept beside the code or
+        pictures: False leaves out the views' pictures, for a report that lies beside the code or
             in a CI summary.
 
     Returns:
         The files written, the one a person opens first at the end.
     """
-    from attnwarp_eval.document.write import markdown, page
-    from attnwarp_eval.files import write_atomic
-    from attnwarp_eval.report.build import build
-    from attnwarp_eval.report.results import Results
-
-    results = Results.of(store)
+    results = read_results(store)
     report = build(results, store.root, timings=timings, pictures=pictures)
     files = {
-        "results.jsonl": "".join(f"{line}\n" for line in results.lines(timings)),
+        "results.jsonl": "".join(f"{line}\n" for line in lines(results, timings)),
         "report.md": markdown(report),
         "report.html": page(report, store.root),
     }

@@ -1,4 +1,4 @@
-"""What one expects to see, tested: the claims of claims.yaml against a run's results."""
+"""Expectations tested: the claims of claims.yaml against a run's results."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 import yaml
 
-from attnwarp_eval.report.results import Results
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.statistics.intervals import (
     ByView,
     Interval,
@@ -18,13 +19,16 @@ from attnwarp_eval.statistics.intervals import (
     interval,
     paired,
 )
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.study import parse_variant
 
 Verdict = Literal["holds", "does not hold", "can't tell"]
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One entry of claims.yaml; see there for what the keys mean."""
+    """One entry of claims.yaml, whose head explains the keys."""
 
     id: str
     text: str
@@ -43,10 +47,10 @@ class Claim:
         return 1 if self.expect == "higher" else -1
 
     def measure(self, results: Results) -> Measured | None:
-        """What the claim speaks of; None where the run has no variant of that content."""
+        """The sides of the claim; None where the run has no variant of that content."""
         metric = self.metric.replace("{layer}", str(results.layer))
-        a = results.variant_like(self.a, self.probe)
-        b = None if self.b is None else results.variant_like(self.b, self.probe)
+        a = variant_like(results, self.a, self.probe)
+        b = None if self.b is None else variant_like(results, self.b, self.probe)
         if a is None or (self.b is not None and b is None):
             return None
         if self.compare_yaw is not None:
@@ -72,7 +76,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Measured:
-    """The sides of a claim by name, and the two tables whose difference it speaks of."""
+    """The sides of a claim by name, and the two tables whose difference it predicts."""
 
     metric: str
     sides: dict[str, Interval]
@@ -86,7 +90,7 @@ def _interval(table: ByView) -> Interval:
 
 @dataclass(frozen=True)
 class Finding:
-    """A claim, what was measured, and what follows."""
+    """A claim, the measurement, and the verdict."""
 
     claim: Claim
     metric: str
@@ -111,12 +115,12 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def judge(results: Results, claims: list[Claim]) -> list[Finding]:
-    """Every claim that something was measured for, with its verdict.
+    """Every claim that the run has measurements for, with its verdict.
 
     p-values are adjusted over the claims (Benjamini-Hochberg).
     """
-    measured = [(claim, m) for claim in claims if (m := claim.measure(results)) is not None]
-    contrasts = [paired(m.a, m.b) for _, m in measured]
+    measurements = [(claim, m) for claim in claims if (m := claim.measure(results)) is not None]
+    contrasts = [paired(m.a, m.b) for _, m in measurements]
     adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
     return [
         Finding(
@@ -128,7 +132,7 @@ def judge(results: Results, claims: list[Claim]) -> list[Finding]:
             _here(claim, m),
             _in_general(claim, contrast, p),
         )
-        for (claim, m), contrast, p in zip(measured, contrasts, adjusted, strict=True)
+        for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views
     ]
 
@@ -144,3 +148,63 @@ def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
     if not contrast.known or not adjusted_p <= 0.05:
         return "can't tell"
     return "holds" if claim.sign * contrast.mean > 0 else "does not hold"
+
+
+def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | None:
+    """The name of the measured variant that means what ``data`` means.
+
+    Args:
+        results: of the run.
+        data: a variant as a study's YAML has it.
+        name: of the probe whose records are needed.
+    """
+    own, study = probe(name), results.study
+    meaning = own.meaning(study, parse_variant(dict(data)))
+    for label, variant in study.variants.items():
+        if own.meaning(study, variant) == meaning and results.records(name, label):
+            return label
+    return None
+
+
+def claims(results: Results) -> Section:
+    """The section of the report."""
+    rows = []
+    for finding in judge(results, load_claims()):
+        claim = finding.claim
+        sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
+        contrast = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
+        agree, views = finding.agreement
+        rows.append(
+            [
+                claim.text,
+                finding.here,
+                finding.verdict,
+                f"{agree} of {views}",
+                contrast,
+                sides,
+                finding.metric,
+            ]
+        )
+    section = Section("What was expected, and what was seen")
+    if not rows:
+        section.text = ["Nothing that a claim speaks of was measured."]
+        return section
+    section.text = [
+        (
+            "A claim that does not hold on these scenes is a result, not an error. **Here** speaks"
+            " of these scenes alone: `seen` when the difference has the expected sign in every"
+            " scene, with the views that agree beside it. **In general** speaks of scenes like"
+            " these, of which a few were drawn, and says `can't tell` when so few cannot settle it."
+        ),
+    ]
+    columns = [
+        "claim",
+        "here",
+        "in general",
+        "views that agree",
+        "difference",
+        "measured",
+        "metric",
+    ]
+    section.tables = [Table(columns, rows)]
+    return section

@@ -1,101 +1,110 @@
-"""What accuracy costs in time: error against seconds, taken in turn where the study asked for
-that."""
+"""What accuracy costs in time: error against seconds, taken in turn where a probe has done so."""
 
 from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from attnwarp_eval.document import figures
 from attnwarp_eval.document.model import Picture, Section, Table
-from attnwarp_eval.metrics.registry import metric as metric_of
-from attnwarp_eval.report.results import Results
-from attnwarp_eval.report.words import number, spread
+from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, Ratio, interval, time_ratio
+from attnwarp_eval.study.parts import Front
+from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probes.base import InTurn, Layout
+from attnwarp_eval.study.results import Results
 
-STAGES = {"depth": "render", "warp": "pair"}
-"""Which of the timing probe's stages is the cost of which probe's figures."""
 
-
-def fronts(results: Results, root: Path) -> list[Section]:
-    """The section of fronts, with its figures written below ``root``; nothing where the study names
-    none.
+def fronts(results: Results, layout: Layout) -> list[Section]:
+    """The section of fronts, with its figures; none where the study names no front.
 
     Args:
         results: of the run.
-        root: the run's folder.
+        layout: of the report.
     """
+    turns = [
+        turn
+        for cell in results.cells
+        if cell.record is not None
+        and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None
+    ]
     section = Section("What accuracy costs in time")
-    section.text = _text(results)
-    for index, wanted in enumerate(results.study["fronts"]):
-        metric = wanted["metric"].format(layer=results.layer)
-        points, rows = _points(results, wanted, metric)
+    section.text = _text(turns)
+    for index, front in enumerate(results.study.fronts):
+        metric = front.metric.format(layer=results.layer)
+        points, rows = _points(results, turns, front, metric)
         if not points:
             continue
-        path = root / "figures" / f"front-{index}.svg"
-        label = f"{metric} ({metric_of(metric).unit})"
+        path = layout.figure(f"front-{index}.svg")
+        label = f"{metric} ({probe(front.probe).metric(metric).unit})"
         with figures.drawing(path) as (axes,):
-            kept = figures.cost_front(
-                axes, points, x="seconds a view", y=label, title=wanted["title"]
+            on_front = figures.cost_front(
+                axes, points, x="seconds a view", y=label, title=front.title
             )
-        section.figures.append(Picture(f"figures/{path.name}", wanted["title"]))
+        section.figures.append(Picture(f"figures/{path.name}", front.title))
         columns = ["variant", label, "ms a view", "time, ratio", "verdict", "on the front"]
         marked = [
-            [*row, ("yes" if row[0] in kept else "no") if row[0] in points else "–"] for row in rows
+            [*row, ("yes" if row[0] in on_front else "no") if row[0] in points else "–"]
+            for row in rows
         ]
-        section.tables.append(Table(columns, marked, wanted["title"]))
+        section.tables.append(Table(columns, marked, front.title))
     return [section] if section.tables else []
 
 
-def _text(results: Results) -> list[str]:
-    what = (
+def _text(turns: list[InTurn]) -> list[str]:
+    text = (
         "Seconds are those of the method alone: a render of the target for depth; render,"
         " correspondence, mask and feature grids for a warp. The source's render serves all targets"
         " and is not in them, nor are set-up and checks. A point is on the front when nothing"
         " cheaper is as good, by the means: look at the intervals before believing a close one."
     )
-    timed = next(
-        (c["record"] for c in results.cells if c["probe"] == "timing" and c["record"]), None
-    )
-    if timed is None:
+    if not turns:
+        names = " or ".join(f"`{p.name}`" for p in probes() if p.times_in_turn)
         return [
-            what,
+            text,
             (
                 "These seconds come from one pass over the views, each variant at another time, and"
-                " are for orientation: a study with a `timing` probe takes them in turn."
+                f" are for orientation: a study with a {names} probe takes them in turn."
             ),
         ]
-    spec, threads = timed["spec"], timed["cost"]["threads"]
+    first = turns[0]
     return [
-        what,
+        text,
         (
-            f"All contestants ran in turn in one process, {spec['rounds']} rounds in an order drawn"
-            f" anew each round, on view {spec['views'][0]} of each scene with {threads} renderer"
-            f" thread{'s' if threads != 1 else ''}; a ratio is the median over rounds of the ratio"
-            " to the first contestant within a round, with a bootstrap interval over rounds. The"
-            " row `again` is the first contestant against itself: what noise alone does on this"
+            f"All contestants ran in turn in one process, {first.rounds} rounds in an order drawn"
+            f" anew each round, on view {first.view} of each scene with {first.threads} renderer"
+            f" thread{'s' if first.threads != 1 else ''}; a ratio is the median over rounds of the"
+            " ratio to the first contestant within a round, with a bootstrap interval over rounds."
+            " The row `again` is the first contestant against itself: what noise alone does on this"
             " machine. Inside that band nothing is called faster or slower."
         ),
     ]
 
 
+def _rounds(turns: list[InTurn], stage: str, name: str | None) -> list[list[float]]:
+    """Seconds of a contestant: a list of rounds for each cell that has it; the baseline's second
+    run for None.
+    """
+    return [
+        turn.seconds[stage][-1 if name is None else turn.names.index(name)]
+        for turn in turns
+        if name is None or name in turn.names
+    ]
+
+
 def _points(
-    results: Results, wanted: dict[str, Any], metric: str
+    results: Results, turns: list[InTurn], front: Front, metric: str
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
     """Seconds and quality of each variant, and the rows of the table but for their last column."""
-    probe, stage = wanted["probe"], STAGES.get(wanted["probe"], "")
-    baseline = results.timing_baseline
-    first = results.rounds(stage, baseline) if baseline and stage else []
-    noise = time_ratio(results.rounds(stage, None), first) if first else None
+    stage = probe(front.probe).stage
+    baseline = turns[0].names[0] if turns else None
+    first = _rounds(turns, stage, baseline) if baseline and stage else []
+    noise = time_ratio(_rounds(turns, stage, None), first) if first else None
     base = float(np.median(np.concatenate(first))) if first else float("nan")
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
-    for name in wanted["variants"]:
-        values = results.views(probe, name, metric)
-        quality = interval({scene: list(views.values()) for scene, views in values.items()})
-        taken = results.rounds(stage, name) if first else []
+    for name in front.variants:
+        quality = results.mean(front.probe, name, metric)
+        taken = _rounds(turns, stage, name) if first else []
         if noise and not taken:
             # Seconds of another kind have no place on the same axis.
             rows.append([name, spread(quality), "–", "not timed", "–"])
@@ -106,7 +115,7 @@ def _points(
             text = "1" if name == baseline else _ratio(ratio)
             judged = "baseline" if name == baseline else _judge(ratio, noise)
         else:
-            once = results.cost(probe, name, "steady")
+            once = results.seconds(front.probe, name, "steady")
             if not once:
                 continue
             seconds, text, judged = (

@@ -3,7 +3,8 @@ interruption.
 """
 
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.parts import Study, StudyError
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.study import Study, StudyError, load_study
+from attnwarp_eval.study.study import cells_of, load_study, parse_study
 
-__all__ = ["Cell", "Store", "Study", "StudyError", "load_study"]
+__all__ = ["Cell", "Store", "Study", "StudyError", "cells_of", "load_study", "parse_study"]

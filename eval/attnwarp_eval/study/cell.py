@@ -1,10 +1,9 @@
-"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of what it computes,
-never of its name.
-"""
+"""A cell: one scene, one variant, one seed, one probe. Its id is the hash of what it computes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,13 +16,11 @@ class Cell:
 
     Attributes:
         spec: everything that decides the result, and nothing else: scene content, variant content,
-            seed, views, image size, protocol versions. The names that people gave to the variant
-            are not in it.
+            seed, views, image size, protocol versions. Names that people gave are not in it.
         scene, variant, probe, seed: labels for tables and error messages.
         labels: every variant name that leads to this same content.
-        pictures: views of which pictures are kept.
-        encoders: by kind, the names that encoders are loaded by; which weights they are is in
-            ``spec``.
+        pictures: views of which pictures are wanted.
+        sources: where the computation finds what ``spec`` names by content, such as encoders.
     """
 
     spec: dict[str, Any]
@@ -33,7 +30,7 @@ class Cell:
     seed: int
     labels: tuple[str, ...] = field(default=())
     pictures: tuple[str, ...] = field(default=())
-    encoders: dict[str, str] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def id(self) -> str:
@@ -46,3 +43,20 @@ class Cell:
         return f"{self.scene} / {self.variant} / {self.probe}" + (
             f" / seed {self.seed}" if self.seed else ""
         )
+
+
+def merged(cells: Iterable[Cell]) -> list[Cell]:
+    """The cells in their order, those of the same content as one with the labels of all."""
+    by_id: dict[str, Cell] = {}
+    for cell in cells:
+        first = by_id.get(cell.id)
+        by_id[cell.id] = (
+            cell
+            if first is None
+            else replace(
+                first,
+                labels=(*first.labels, *cell.labels),
+                pictures=first.pictures or cell.pictures,
+            )
+        )
+    return list(by_id.values())

@@ -1,19 +1,44 @@
-"""The parts of a study's YAML: what its variants are made of, and what its report shows."""
+"""The parts of a study's YAML that every probe shares.
+
+What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study.study` joins them.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from attnwarp import check
+from attnwarp.errors import InputError, suggest
+from attnwarp.warp.settings import PRESETS, WarpSettings
 
 if TYPE_CHECKING:
-    from attnwarp.warp.settings import WarpSettings
+    from attnwarp_eval.scene.scene import Scene
+
+P = TypeVar("P", bound="Part")
+
+
+class StudyError(InputError):
+    """A study that cannot be run; the message names the file, what came and what to do."""
 
 
 class Part(BaseModel):
-    """What a study's YAML may say; an unknown key is an error."""
+    """Keys of a study's YAML; an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def part(self, kind: type[P]) -> P:
+        """The same object as one of the parts that it was joined from.
+
+        Raises:
+            TypeError: it was not; only a study that was read through
+                :mod:`attnwarp_eval.study.study` has the parts of every probe.
+        """
+        if not isinstance(self, kind):
+            raise TypeError(f"{type(self).__name__} has no part {kind.__name__}")
+        return self
 
 
 class Splats(Part):
@@ -30,72 +55,150 @@ class Splats(Part):
         return value.lower() if isinstance(value, str) else value
 
 
-class Fits(Part):
-    """Splats fitted to true pictures from all around the scene; the ``fit`` probe measures them on
-    views held out.
-    """
-
-    views: Annotated[int, Field(ge=9, le=10_000)] = 64
-    points: Annotated[int, Field(ge=10, le=5_000_000)] = 5000
-    noise: Annotated[float, Field(ge=0)] = 0.5
-    settings: dict[str, Any] = Field(
-        default_factory=dict, description="fields of attnwarp.fit.FitSettings"
-    )
-
-
 class Variant(Part):
-    """One row of a table: where depth comes from, and how the warp is made.
-
-    ``fit`` changes fields of the study's fit settings; only the ``fit`` probe reads it.
-    """
+    """One row of a table: where depth comes from, and how the warp is made."""
 
     preset: str = "corrected"
     set: dict[str, Any] = Field(default_factory=dict)
     geometry: Literal["splats", "truth"] = "splats"
     splats: dict[str, Any] = Field(default_factory=dict)
-    fit: dict[str, Any] = Field(default_factory=dict)
 
     def settings(self) -> WarpSettings:
         """The preset with this variant's own fields."""
-        from attnwarp import check
-        from attnwarp.warp.settings import PRESETS, WarpSettings
-
         check.one_of(self.preset, list(PRESETS), "preset")
         return WarpSettings.from_dict({**PRESETS[self.preset].to_dict(), **self.set})
 
 
 class Ablation(Part):
-    """A table of the report: variants against a baseline, paired on scene and view."""
+    """A table of the report: variants against a baseline, paired on scene and view.
+
+    ``probe`` is empty until the study fills in the main probe.
+    """
 
     title: str
-    probe: Literal["depth", "warp", "fit"] = "warp"
+    probe: str = ""
     baseline: str
     variants: list[str]
     note: str = ""
 
 
 class Front(Part):
-    """A figure of the report: a metric (lower is better) against the seconds of the method, for
-    these variants.
+    """A figure of the report: a metric (lower is better) against the seconds of the method.
 
-    Seconds come from the ``timing`` probe where it has all of them, taken in turn; else from the
-    cells themselves.
+    Seconds taken in turn are used where a probe has them for all variants, else those of the cells
+    themselves. ``probe`` is empty until the study fills in the main probe.
     """
 
     title: str
-    probe: Literal["depth", "warp", "fit"] = "warp"
+    probe: str = ""
     metric: str
     variants: list[str]
 
 
-class Yaw(Part):
-    """The variants whose masks the report shows by yaw."""
-
-    variants: list[str] = Field(default_factory=list)
-
-
 class Pictures(Part):
-    """Which variants and views are kept as pictures."""
+    """Variants and views of which pictures are saved."""
 
     variants: list[str] = Field(default_factory=list)
     views: list[str] = Field(default_factory=list)
+
+
+class Study(Part):
+    """Scenes x variants x seeds x probes, and what the report shows of them."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    title: str = ""
+    description: str = ""
+    size: Annotated[int, Field(ge=16, le=4096)] = 512
+    scenes: Annotated[list[str], Field(min_length=1)]
+    views: list[str] = Field(
+        default_factory=list, description="target views by name; all of them if empty"
+    )
+    seeds: Annotated[list[int], Field(min_length=1)] = Field(default_factory=lambda: [0])
+    spp: Annotated[int, Field(ge=1)] = 16
+    feature_sizes: list[int] = Field(
+        default_factory=list, description="image size, 1/8 and 1/16 of it if left out"
+    )
+    feature_channels: Annotated[int, Field(ge=1, le=4096)] = 8
+    timing_rounds: Annotated[int, Field(ge=3)] = 15
+    splats: Splats = Splats()
+    variants: dict[str, Variant] = Field(default_factory=dict)
+    probes: Annotated[dict[str, list[str]], Field(min_length=1)]
+    ablations: list[Ablation] = Field(default_factory=list)
+    fronts: list[Front] = Field(default_factory=list)
+    pictures: Pictures = Pictures()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _feature_sizes_follow_the_image(cls, data: Any) -> Any:
+        size = data.get("size", 512) if isinstance(data, dict) else None
+        if isinstance(size, int) and not data.get("feature_sizes"):
+            # The latent sizes of a diffusion UNet's first two levels of attention.
+            return {
+                **data,
+                "feature_sizes": sorted(
+                    {size, max(1, size // 8), max(1, size // 16)}, reverse=True
+                ),
+            }
+        return data
+
+    @model_validator(mode="after")
+    def _check_values(self) -> Study:
+        for size in self.feature_sizes:
+            if not 1 <= size <= self.size:
+                raise ValueError(
+                    f"feature_sizes: got {size}, expected 1 to {self.size}, the image size"
+                )
+        for key in ("scenes", "seeds", "views"):
+            check_distinct(getattr(self, key), key)
+        return self
+
+    def check_variants(self, names: Iterable[str], key: str, probe: str = "") -> None:
+        """Raise ValueError unless every name is a variant's, and ``probe`` measures it.
+
+        Args:
+            names: of variants.
+            key: of the YAML, for the message.
+            probe: whose table needs them; any if empty.
+        """
+        for name in names:
+            if name not in self.variants:
+                raise ValueError(f"{key}: no variant {name!r}{did_you_mean(name, self.variants)}")
+            # A row that is never measured would be missing from its table without a word.
+            if probe and name not in self.probes.get(probe, []):
+                raise ValueError(f"{key}: {name!r} is not measured; add it to probes.{probe}")
+
+    def splats_of(self, variant: Variant) -> Splats:
+        """The study's splats with the variant's own fields."""
+        return Splats.model_validate({**self.splats.model_dump(), **variant.splats})
+
+    def views_of(self, scene: Scene) -> list[str]:
+        """Names of the scene's targets that the study measures, in the scene's order.
+
+        Raises:
+            StudyError: the study names a view that the scene lacks.
+        """
+        available = [camera.name for camera in scene.targets]
+        for name in self.views:
+            if name not in available:
+                raise StudyError(
+                    f"views: scene {scene.name!r} has no view"
+                    f" {name!r}{did_you_mean(name, available)}"
+                )
+        return [name for name in available if not self.views or name in self.views]
+
+    def pictures_of(self, views: Iterable[str]) -> tuple[str, ...]:
+        """Those of the views that the study wants pictures of, in its own order."""
+        available = set(views)
+        return tuple(view for view in self.pictures.views if view in available)
+
+
+def check_distinct(values: list[Any], key: str) -> None:
+    """Raise ValueError if a value of the YAML's ``key`` is named twice."""
+    if len(set(values)) != len(values):
+        raise ValueError(f"{key}: something is named twice in {values}")
+
+
+def did_you_mean(name: str, available: Iterable[str]) -> str:
+    """The end of an error message: the nearest available name, or all of them."""
+    names = list(available)
+    return suggest(name, names) or f"; there are {', '.join(map(repr, names))}"

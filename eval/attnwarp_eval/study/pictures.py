@@ -1,4 +1,4 @@
-"""Pictures of one cell and view: what a person looks at beside the numbers."""
+"""Pictures of one cell and view, for people; no number is taken from them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 Image = npt.NDArray[np.float32]
 
 WIDTH = 256
-"""Pictures are reduced to this width: enough to see where a mask errs, and a report that can be
-mailed.
-"""
+"""Pictures are reduced to this width: a mask's errors stay visible, and a report small."""
 
 CLASSES: dict[str, tuple[str, str]] = {
     "visible, accepted": ("#2ca25f", "right"),
@@ -41,58 +39,68 @@ DEPTH_RANGE = 0.02
 """Relative depth error at the ends of the blue-white-red map: blue is too near, red too far."""
 
 
-def of(
-    at: World,
-    name: str,
-    *,
-    truth: TwoView,
-    spp: int | None = None,
-    view: WarpedView | None = None,
-    surface: Surface | None = None,
+ORDER = ("warped", "mask", "endpoint-error", "render", "depth-error")
+"""How pictures of one row stand side by side; others follow."""
+
+SHARED = ("source", "target")
+"""Pictures that are the same for every variant, and stand once above their rows."""
+
+
+def of_warp(
+    world: World, name: str, spp: int, truth: TwoView, view: WarpedView
 ) -> dict[str, bytes]:
-    """JPEG files by what they show.
+    """JPEG files of a warp: the two true views, the warped source, mask and endpoint error.
 
     Args:
-        at: the scene.
+        world: of the scene.
         name: the target view.
-        truth: of the pair, at image size.
-        spp: samples a pixel of the truth images.
-        view: the warp to show, or
-        surface: the depth to show.
+        spp: samples a pixel of the true views.
+        truth: of the pair, at image size (H, W).
+        view: the warp to show, (H, W).
     """
-    found: dict[str, Image] = {}
-    if view is not None and spp is not None:
-        source, target = at.image(at.source.name, spp), at.image(name, spp)
-        found = {
+    source, target = world.image(world.source.name, spp), world.image(name, spp)
+    return _jpegs(
+        {
             "source": source,
             "target": target,
             "warped": warped(source, view),
             "mask": mask_against_truth(view.mask.numpy(), truth, target),
             "endpoint-error": endpoint_map(view.correspondence.xy.numpy(), truth),
         }
-    if surface is not None:
-        found["depth-error"] = depth_map(np.asarray(surface.depth, dtype=np.float64), truth.hits)
-    return {what: jpeg(image) for what, image in found.items()}
+    )
 
 
-def of_fit(*, fitted: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
-    """JPEG files of a view held out from a fit: its truth, what the splats show there, and their
-    depth's error.
+def of_depth(surface: Surface, hits: Hits) -> dict[str, bytes]:
+    """JPEG file of a depth map's error against the true hits."""
+    depth = np.asarray(surface.depth, dtype=np.float64)
+    return _jpegs({"depth-error": depth_map(depth, hits)})
+
+
+def of_fit(surface: Surface, hits: Hits, image: npt.NDArray[np.uint8]) -> dict[str, bytes]:
+    """JPEG files of a view held out from a fit.
+
+    Args:
+        surface: what the splats show, with its image.
+        hits: truth of the view.
+        image: (H, W, 3) sRGB, its true picture.
     """
-    depth = np.asarray(fitted.depth, dtype=np.float64)
-    found: dict[str, Image] = {
-        "target": (image / 255).astype(np.float32),
-        "render": np.asarray(fitted.image, dtype=np.float32),
-        "depth-error": depth_map(depth, hits),
-    }
-    return {what: jpeg(picture) for what, picture in found.items()}
+    return _jpegs(
+        {
+            "target": (image / 255).astype(np.float32),
+            "render": np.asarray(surface.image, dtype=np.float32),
+            "depth-error": depth_map(np.asarray(surface.depth, dtype=np.float64), hits),
+        }
+    )
+
+
+def _jpegs(images: dict[str, Image]) -> dict[str, bytes]:
+    return {name: jpeg(image) for name, image in images.items()}
 
 
 def jpeg(image: Image) -> bytes:
     """An sRGB image in [0, 1], reduced to :data:`WIDTH`, as JPEG without chroma subsampling.
 
-    These pictures are for people; every number is taken from the arrays. As PNG a report of them
-    has three times the size.
+    As PNG a report of them has three times the size.
     """
     import cv2
 
@@ -109,13 +117,13 @@ def rgb(color: str) -> npt.NDArray[np.float32]:
 
 
 def checkered(shape: tuple[int, int], step: int = 16) -> Image:
-    """(H, W, 3) light grey squares: "nothing is here"."""
+    """(H, W, 3) light grey squares, which mean "nothing"."""
     y, x = np.indices(shape) // step
     return np.repeat((0.78 + 0.1 * ((x + y) % 2))[..., None], 3, axis=2).astype(np.float32)
 
 
 def warped(source: Image, view: WarpedView) -> Image:
-    """The source image as the warp carries it to the target; squares where the mask rejects."""
+    """(H, W, 3) the source image warped to the target; squares where the mask rejects."""
     image, _ = sample(
         torch.from_numpy(np.ascontiguousarray(source.transpose(2, 0, 1))), view.correspondence
     )
@@ -126,7 +134,7 @@ def warped(source: Image, view: WarpedView) -> Image:
 
 
 def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Image) -> Image:
-    """The mask in the colours of :data:`CLASSES` over the darkened target."""
+    """(H, W, 3) the mask in the colours of :data:`CLASSES` over the darkened target."""
     label, surface = truth.label, truth.hits.valid
     outside = (label == NONE) & surface
     classes: dict[str, Any] = {
@@ -140,8 +148,8 @@ def mask_against_truth(mask: npt.NDArray[np.bool_], truth: TwoView, target: Imag
     }
     grey = target.mean(axis=2, keepdims=True).repeat(3, axis=2)
     image = 0.35 * grey
-    for name, where in classes.items():
-        image = np.where(where[..., None], 0.35 * grey + 0.65 * rgb(CLASSES[name][0]), image)
+    for name, pixels in classes.items():
+        image = np.where(pixels[..., None], 0.35 * grey + 0.65 * rgb(CLASSES[name][0]), image)
     return np.asarray(image, dtype=np.float32)
 
 

@@ -1,6 +1,4 @@
-"""A run's folder. The truth is one JSON file a cell, written to a temporary file, flushed to disk,
-then renamed.
-"""
+"""A run's folder: one JSON file a cell, written beside its name, flushed to disk, then renamed."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ class StoreError(InputError):
 
 @dataclass
 class Problems:
-    """What :meth:`Store.verify` found."""
+    """What is wrong with a run; see :meth:`Store.verify`."""
 
     missing: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
@@ -38,7 +36,7 @@ class Problems:
 
     @property
     def ok(self) -> bool:
-        """Whether every expected cell is there and whole."""
+        """Whether every expected cell has a whole record."""
         return not (self.missing or self.failed or self.damaged)
 
 
@@ -72,9 +70,7 @@ class Store:
             remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
-        """Keep the resolved study and its expected cells. Cells of a former study in this folder
-        stay.
-        """
+        """Write the resolved study and its expected cells. Cells of a former study stay."""
         write_json(self.root / "study.json", study)
 
     def read_study(self) -> dict[str, Any]:
@@ -100,16 +96,18 @@ class Store:
         )
 
     def path(self, cell_id: str) -> Path:
-        """Where the record of a cell lies."""
+        """The path of a cell's record."""
         return self.cells / f"{cell_id}.json"
 
     def done(self) -> set[str]:
-        """Ids of the cells whose records are there (a file is only ever there whole)."""
+        """Ids of the cells that have a record; a record's file is always whole."""
         return {p.stem for p in self.cells.glob("*.json")} if self.cells.is_dir() else set()
 
     def write(self, record: dict[str, Any]) -> None:
-        """Keep a finished cell; ``record`` has at least ``id`` and ``spec``. A former failure of it
-        is forgotten.
+        """Write the record of a finished cell, and remove a former failure of it.
+
+        Args:
+            record: with at least ``id`` and ``spec``.
         """
         sealed = {**record, "format": FORMAT}
         sealed["sha256"] = digest(sealed)
@@ -117,19 +115,19 @@ class Store:
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
-        """Keep why a cell failed; it is tried again by the next run."""
+        """Write why a cell failed; the next run tries it again."""
         write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
 
     def failures(self) -> list[dict[str, Any]]:
         """Failures of cells that have no record."""
         done = self.done()
         paths = sorted(self.failed.glob("*.json")) if self.failed.is_dir() else []
-        found = []
+        failures = []
         for path in paths:
             if path.stem not in done:
                 with contextlib.suppress(ValueError):
-                    found.append(json.loads(path.read_text()))
-        return found
+                    failures.append(json.loads(path.read_text()))
+        return failures
 
     def read(self, cell_id: str) -> dict[str, Any]:
         """The record of a finished cell.

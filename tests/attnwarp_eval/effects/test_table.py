@@ -16,11 +16,9 @@ from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.effects import detect, saving, table
-from attnwarp_eval.effects.table import Settings, plan_words, said_by, side_by_side
+from attnwarp_eval.effects.table import Settings, side_by_side
 from attnwarp_eval.experiments import effects
 from attnwarp_eval.experiments.effects import collect
-from attnwarp_eval.report.effects import effects as section
-from attnwarp_eval.report.results import Results
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import mitsuba
 from attnwarp_eval.truth.plan import plan
@@ -197,31 +195,6 @@ def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_
     ):
         result = runner.invoke(app, ["scenes", "effects", *arguments])
         assert result.exit_code == 2 and words in " ".join(result.output.split())
-
-
-def test_the_report_says_which_effects_the_studys_scenes_call_for():
-    def cell(name, said):
-        record = (
-            {"views": [], "pictures": [], "effects": said_by(load_scene(said))}
-            if said
-            else {"views": []}
-        )
-        return {
-            "id": name,
-            "title": name,
-            "scene": name,
-            "variants": [],
-            "probe": "calibration",
-            "seed": 0,
-            "record": record,
-        }
-
-    (found,) = section(Results({}, [cell("fog", "fog"), cell("old", None)], []))
-    ((scene, usual, beyond, missing, planned, full, why),) = found.tables[0].rows
-    assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
-    assert planned == full == "volpath" and "medium" in why
-    assert section(Results({}, [cell("old", None)], [])) == []
-    assert plan_words(plan(load_scene("lens")).to_dict()) == "direct, thin lens"
 
 
 def test_differences_are_drawn_about_grey_and_eight_times_stronger(small, monkeypatch, tmp_path):

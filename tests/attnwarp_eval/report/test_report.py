@@ -1,81 +1,61 @@
 """Hand-made records with known numbers; the expected tables, verdicts and warnings follow by
 hand."""
 
-import copy
-
 import pytest
+import runs
 
+from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
-from attnwarp_eval.report import calibration
 from attnwarp_eval.report.ablations import ablations
-from attnwarp_eval.report.build import build
+from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, judge
 from attnwarp_eval.report.fronts import fronts
-from attnwarp_eval.report.results import Results
-from attnwarp_eval.report.words import number, spread
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.study import Study
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import Layout
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
 
 
 def study(**changes):
-    return Study.model_validate(
-        {
-            "name": "hand-made",
-            "scenes": list(SCENES),
-            "variants": {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
-            "probes": {"warp": ["good", "slipped"]},
-            "ablations": [{"title": "Slip", "baseline": "good", "variants": ["slipped"]}],
-            **changes,
-        }
-    ).model_dump(mode="json")
-
-
-ENVIRONMENT = {
-    "versions": {"python": "3"},
-    "machine": {"system": "Linux", "arch": "x", "cores": 2},
-    "git": {"sha": "a" * 40, "dirty": False},
-}
-
-
-def record(values, counters=None, **cost):
-    """A warp cell whose views show ``values`` of the slip's metric (None: undefined)."""
     return {
-        "views": [
-            {"view": f"v{i}", "yaw": 30.0 * i, "metrics": {SLIP: v}} for i, v in enumerate(values)
-        ],
-        "pictures": [],
-        "cost": {
-            "seconds": {"steady": 0.1},
-            "counters": counters or {"pairs": 2_000_000},
-            "peak_memory_mb": 1.0,
-            **cost,
-        },
-        "environment": copy.deepcopy(ENVIRONMENT),
+        "name": "hand-made",
+        "scenes": list(SCENES),
+        "variants": {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}},
+        "probes": {"warp": ["good", "slipped"]},
+        "ablations": [{"title": "Slip", "baseline": "good", "variants": ["slipped"]}],
+        **changes,
     }
 
 
-def results(table, **changes):
+def record(values, environment=runs.ENVIRONMENT):
+    """A warp cell whose views show ``values`` of the slip's metric (None: undefined)."""
+    counts = {f"occlusion.{name}": 0 for name in COUNTS}
+    return runs.record(
+        [(f"v{i}", 30.0 * i, {SLIP: value, **counts}) for i, value in enumerate(values)],
+        cost={"seconds": {"steady": 0.1}, "counters": {"pairs": 2_000_000}},
+        environment=environment,
+    )
+
+
+def results(table, more=(), **changes):
     """``table``: variant -> one list of view values a scene, or None where the cell was not
     measured.
     """
     cells = [
-        {
-            "id": f"{variant}-{scene}",
-            "title": variant,
-            "scene": scene,
-            "variants": [variant],
-            "probe": "warp",
-            "seed": 0,
-            "record": None if values is None else record(values),
-        }
+        runs.outcome(
+            "warp",
+            scene,
+            [variant],
+            None if values is None else record(values),
+            f"{variant}-{scene}",
+        )
         for variant, rows in table.items()
         for scene, values in zip(SCENES, rows, strict=True)
     ]
-    return Results(study(**changes), cells, [])
+    return runs.results(study(**changes), [*cells, *more])
 
 
 CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]]}
@@ -197,14 +177,12 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees():
 
 
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
-    mixed = results(CLEAR, ablations=[])
-    for cell in mixed.cells:
-        for view in cell["record"]["views"]:
-            view["metrics"].update({f"occlusion.{name}": 0 for name in COUNTS})
-    mixed.cells[0]["record"]["environment"]["git"] = {"sha": "b" * 40, "dirty": True}
+    other = {**runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
+    changed = runs.outcome("warp", "one", ["good"], record([0.1], other))
+    mixed = results(CLEAR, [changed], ablations=[])
     text = markdown(build(mixed, tmp_path))
     assert "more than one state of code" in text
-    assert "5 cells with revision `aaaaaaaaaaaa`" in text
+    assert "6 cells with revision `aaaaaaaaaaaa`" in text
     assert "1 cells with revision `bbbbbbbbbbbb` with local changes" in text
 
 
@@ -215,24 +193,8 @@ def calibrated(**changes):
         "calibration.mitsuba_agrees": 0.999,
         **changes,
     }
-    cell = {
-        "id": "c",
-        "title": "c",
-        "scene": "one",
-        "variants": ["calibration"],
-        "probe": "calibration",
-        "seed": 0,
-    }
-    return Results(
-        study(),
-        [
-            {
-                **cell,
-                "record": {**record([]), "views": [{"view": "v", "yaw": 0.0, "metrics": figures}]},
-            }
-        ],
-        [],
-    )
+    data = runs.record([("v", 0.0, figures)])
+    return runs.results(study(), [runs.outcome("calibration", "one", ["calibration"], data)])
 
 
 @pytest.mark.parametrize(
@@ -244,38 +206,27 @@ def calibrated(**changes):
         ({"occlusion.f1.exact": None}, "undefined in every view"),
     ],
 )
-def test_an_instrument_that_is_off_is_said_to_be(changes, says):
-    assert calibration.problems(calibrated()) == []
-    (problem,) = calibration.problems(calibrated(**changes))
+def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
+    assert problems(calibrated()) == []
+    (problem,) = problems(calibrated(**changes))
     assert says in problem
-    section = calibration.calibration(calibrated(**changes))
+    ((_, section),) = probe("calibration").sections(calibrated(**changes), Layout(tmp_path))
     assert section.tables[0].rows[0][1] == "FAILED"
     assert "not calibrated" in section.text[0]
 
 
 def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     front = [{"title": "Cost", "metric": SLIP, "variants": ["good", "slipped"]}]
-    timed = results(CLEAR, fronts=front)
-    spec = {"rounds": 3, "views": ["v0"]}
     rounds = {"render": [[1.0] * 3] * 2, "pair": [[1.0, 2.0, 4.0], [1.0, 2.0, 4.0]]}
-    timed.cells.append(
-        {
-            "id": "t",
-            "title": "t",
-            "scene": "one",
-            "variants": ["good"],
-            "probe": "timing",
-            "seed": 0,
-            "record": {**record([], rounds=rounds, threads=1), "spec": spec},
-        }
-    )
-    (section,) = fronts(timed, tmp_path)
+    data = runs.record([], spec={"rounds": 3, "views": ["v0"]}, cost={"rounds": rounds})
+    timed = results(CLEAR, [runs.outcome("timing", "one", ["good"], data)], fronts=front)
+    (section,) = fronts(timed, Layout(tmp_path))
     rows = {row[0]: row for row in section.tables[0].rows}
     assert rows["good"][2:] == ["2000", "1", "baseline", "yes"]
     assert rows["slipped"][2:] == ["–", "not timed", "–", "–"]
     assert rows["again"][3] == "1.00 [1.00, 1.00]"
     once = results(CLEAR, fronts=front)
-    (section,) = fronts(once, tmp_path)
+    (section,) = fronts(once, Layout(tmp_path))
     assert "one pass" in section.text[1]
     assert {row[3] for row in section.tables[0].rows} == {"one pass"}
 

@@ -6,69 +6,50 @@ import json
 import math
 
 import pytest
+import runs
 
 from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.build import build
-from attnwarp_eval.report.results import Results
-from attnwarp_eval.report.sensitivity import FLAWS, ROWS, beats, curve, power, sensitivity, share
+from attnwarp_eval.report.results import lines
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.probes.sensitivity import CONDITIONS, RIGHT
-from attnwarp_eval.study.study import Study
+from attnwarp_eval.study.flaws import CONDITIONS, RIGHT
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.sensitivity import FLAWS, ROWS, beats, curve, power, share
 
-ENVIRONMENT = {
-    "versions": {"python": "3"}, "machine": {"system": "Linux", "arch": "x", "cores": 2},
-    "git": {"sha": "a" * 40, "dirty": False},
-}  # fmt: skip
 MSE, CLIP = "fidelity.mse", "embedding.clip_similarity"
+SPEC = {"size": 32, "rounds": 3, "encoders": {"clip": {"weights_sha256": "c" * 64}}}
 
 
 def record(views, key=MSE, rounds=None):
     """A cell whose views have ``key`` in each condition: a dict of condition -> value, 1 where none
     is given.
     """
-    return {
-        "spec": {"size": 32, "rounds": 3, "encoders": {"clip": {"weights_sha256": "c" * 64}}},
-        "views": [
-            {
-                "view": f"e/v{i}",
-                "yaw": 0.0,
-                "metrics": {f"{key}.{c.name}": v.get(c.name, 1.0) for c in CONDITIONS},
-            }
+    return runs.record(
+        [
+            (f"e/v{i}", 0.0, {f"{key}.{c.name}": v.get(c.name, 1.0) for c in CONDITIONS})
             for i, v in enumerate(views)
         ],
-        "pictures": [],
-        "cost": {
-            "seconds": {},
-            "counters": {},
-            "peak_memory_mb": 1.0,
-            "rounds": rounds or {key: [0.2, 0.1, 0.3]},
-        },
-        "environment": ENVIRONMENT,
-    }
+        spec=SPEC,
+        cost={"rounds": rounds or {key: [0.2, 0.1, 0.3]}},
+    )
 
 
 def results(records):
-    study = Study.model_validate(
-        {
-            "name": "by-hand",
-            "scenes": list(records),
-            "encoders": {"clip": "clip-small"},
-            "probes": {"sensitivity": []},
-        }
+    study = {
+        "name": "by-hand",
+        "scenes": list(records),
+        "encoders": {"clip": "clip-small"},
+        "probes": {"sensitivity": []},
+    }
+    return runs.results(
+        study,
+        [runs.outcome("sensitivity", scene, ["metrics"], one) for scene, one in records.items()],
     )
-    cells = [
-        {
-            "id": scene,
-            "title": scene,
-            "scene": scene,
-            "variants": ["metrics"],
-            "probe": "sensitivity",
-            "seed": 0,
-            "record": one,
-        }
-        for scene, one in records.items()
-    ]
-    return Results(study.model_dump(mode="json"), cells, [])
+
+
+def read(data):
+    return probe("sensitivity").read(data)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +76,7 @@ def test_a_share_is_the_mean_over_scenes_of_the_mean_over_views_with_ties_as_hal
         [{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.2, "blurred": 0.1}, {RIGHT: 0.1, "blurred": None}]
     )
     two = record([{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.1, "blurred": 0.1}])
-    found = share([("one", one), ("two", two)], MSE, "blurred")
+    found = share([("one", read(one)), ("two", read(two))], MSE, "blurred")
     assert found == interval({"one": [1.0, 0.0, float("nan")], "two": [1.0, 0.5]})
     assert found.mean == pytest.approx((0.5 + 0.75) / 2)
     assert found.undefined == 1
@@ -103,7 +84,10 @@ def test_a_share_is_the_mean_over_scenes_of_the_mean_over_views_with_ties_as_hal
 
 def steps(*values, key=MSE):
     names = [c.name for c in CONDITIONS[:5]]
-    return {f"{key}.{name}": value for name, value in zip(names, values, strict=True)}
+    return {
+        f"{key}.{name}": math.nan if value is None else value
+        for name, value in zip(names, values, strict=True)
+    }
 
 
 @pytest.mark.parametrize(
@@ -138,7 +122,7 @@ def test_power_is_the_mean_over_the_flaws_a_metric_is_meant_for():
 def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wrong_way(tmp_path):
     views = [{RIGHT: 0.5, "blurred": 0.2, "strength_000": 0.9}]
     made = results({"one": record(views), "two": record(views)})
-    sections = sensitivity(made, tmp_path)
+    sections = [s for _, s in probe("sensitivity").sections(made, Layout(tmp_path))]
     assert [s.title for s in sections] == [
         "Which metric can see what",
         "Metrics against the strength of an edit",
@@ -172,11 +156,12 @@ def test_without_timings_two_reports_of_other_seconds_are_the_same_bytes(tmp_pat
 
 def test_results_keep_every_figure_with_what_is_undefined(tmp_path):
     made = results({"one": record([{RIGHT: 0.0, "blurred": None}, {RIGHT: 0.0, "blurred": 0.3}])})
-    rows = {row["metric"]: row for row in map(json.loads, made.lines())}
+    rows = {row["metric"]: row for row in map(json.loads, lines(made))}
     assert rows["fidelity.mse.blurred"]["undefined"] == 1
     assert rows["fidelity.mse.blurred"]["views"] == {"e/v0": None, "e/v1": 0.3}
     assert rows["fidelity.mse.blurred"]["value"] == 0.3
 
 
 def test_a_study_without_the_probe_has_no_such_section(tmp_path):
-    assert sensitivity(Results({"scenes": [], "encoders": {}}, [], []), tmp_path) == []
+    made = results({"one": None})
+    assert list(probe("sensitivity").sections(made, Layout(tmp_path))) == []

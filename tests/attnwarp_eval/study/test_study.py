@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, load_study
+from attnwarp_eval.study import StudyError, cells_of, load_study
 from attnwarp_eval.study.probes import sensitivity
 from attnwarp_eval.study.study import shipped_studies
 
@@ -35,7 +35,7 @@ def write(folder, **changes):
 
 
 def cells(study):
-    return study.cells({name: load_scene(name) for name in study.scenes})
+    return cells_of(study, {name: load_scene(name) for name in study.scenes})
 
 
 @pytest.mark.parametrize("name", list(shipped_studies()))

@@ -1,268 +1,41 @@
-"""Which metric can see what: every metric on true results of an edit and on results with one known
-flaw.
+"""Which metric can see what: every metric on right results of an edit and on flawed ones.
 
-A scene's edit has a true result, so the pictures that a method should have made are known, and so
-are pictures that it should not have made: an edit too weak, of a wrong colour, of a wrong thing,
-another in each view, blurred, noisy or out of place. A metric that ranks the right one above the
-flawed one can see that flaw; one that ranks them as a coin does is blind to it; and one that
-prefers the flaw moves the wrong way.
+A metric that ranks the right result above the flawed one can see that flaw; one that ranks them as
+a coin does is blind to it; and one that prefers the flaw moves the wrong way.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from pydantic import Field, model_validator
+from scipy import stats
 
-from attnwarp.encoders import Kind, load_encoder
+from attnwarp.encoders import Kind, kind_of, load_encoder
 from attnwarp.errors import InputError
+from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.metrics.arrays import Array, Mask
-
-if TYPE_CHECKING:
-    from attnwarp_eval.cost import Meter
-    from attnwarp_eval.scene.scene import Scene
-    from attnwarp_eval.scene.spec import AnswerSpec, EditSpec
-    from attnwarp_eval.truth import TwoView
-    from attnwarp_eval.world import World
-
-ANSWERS = 3
-"""Of an edit with several right answers, the first that are rendered: one right, one wrong, and a
-third for views that do not agree."""
-
-RIGHT_ANSWERS = 2
-"""Of these, how many are the right one in turn: more would only repeat what these show."""
-
-STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of the edit, as a blend of the pictures before and after in linear light."""
-
-UNEVEN = (0.5, 0.75)
-"""Strengths that the views of an inconsistent result take in turn, where the edit has one answer
-alone.
-"""
-
-SATURATION = 0.75
-"""Of a wrong colour (HSV): enough to be one on white marble too."""
-
-BLUR = 2.0 / 256
-"""Standard deviation of the blur, of the picture's side."""
-
-NOISE = 0.05
-"""Standard deviation of the noise, in sRGB of 1."""
-
-SHIFT = 2
-"""Pixels to the right by which a misplaced result lies off."""
-
-
-@dataclass(frozen=True)
-class Task:
-    """One right result of one edit, and the other results that are wrong in its place.
-
-    Attributes:
-        edit, answer: which; ``answer`` is None for an edit with one result.
-        source, target: the prompts, before and after.
-        content: hash of the scene after the edit.
-        others: (answer, hash) of other answers of the same edit.
-        elsewhere: (edit, answer, hash) of an edit of other objects; None where the scene has none.
-    """
-
-    edit: str
-    answer: str | None
-    source: str
-    target: str
-    content: str
-    others: tuple[tuple[str, str], ...] = ()
-    elsewhere: tuple[str, str | None, str] | None = None
-
-    @property
-    def name(self) -> str:
-        """``edit`` or ``edit-answer``."""
-        return self.edit if self.answer is None else f"{self.edit}-{self.answer}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            **asdict(self),
-            "others": [list(o) for o in self.others],
-            "elsewhere": self.elsewhere and [*self.elsewhere],
-        }
-
-    @classmethod
-    def from_dict(cls, said: Mapping[str, Any]) -> Task:
-        """From what :meth:`to_dict` gave."""
-        others = tuple((name, content) for name, content in said["others"])
-        return cls(
-            **{
-                **said,
-                "others": others,
-                "elsewhere": said["elsewhere"] and tuple(said["elsewhere"]),
-            }
-        )
-
-
-def tasks(scene: Scene, names: Sequence[str] = ()) -> list[Task]:
-    """What is asked of a scene: each right result of each edit.
-
-    Args:
-        scene: with its edits.
-        names: of the edits; all of the scene's if empty. Names that the scene lacks are passed
-            over.
-    """
-    from attnwarp_eval.truth.edits import touched
-
-    found = []
-    for place, edit in enumerate(scene.edits):
-        if names and edit.name not in names:
-            continue
-        answers: list[AnswerSpec | None] = list(edit.answers[:ANSWERS]) or [None]
-        for answer in answers[:RIGHT_ANSWERS]:
-            own = set(touched(scene, edit.name, answer.name if answer else None))
-            others = [o.name for o in answers if o is not None and o is not answer]
-            elsewhere = next(
-                (
-                    other.name
-                    for other in (*scene.edits[place + 1 :], *scene.edits[:place])
-                    if _objects(scene, other) and not own & _objects(scene, other)
-                ),
-                None,
-            )
-            found.append(
-                Task(
-                    edit.name,
-                    answer.name if answer else None,
-                    edit.source,
-                    answer.target if answer else edit.target,
-                    _content(scene, edit.name, answer.name if answer else None),
-                    tuple((name, _content(scene, edit.name, name)) for name in others),
-                    (
-                        None
-                        if elsewhere is None
-                        else (elsewhere, None, _content(scene, elsewhere, None))
-                    ),
-                )
-            )
-    return found
-
-
-def _objects(scene: Scene, edit: EditSpec) -> set[int]:
-    """Objects whose surfaces an edit (its first answer) changes; none for an edit of the light."""
-    from attnwarp_eval.scene.edits import pick
-    from attnwarp_eval.truth.edits import touched
-
-    return set() if (pick(edit) or edit).lights is not None else set(touched(scene, edit.name))
-
-
-def _content(scene: Scene, edit: str, answer: str | None) -> str:
-    return scene.edited(edit, answer).content_hash
-
-
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """What one view shows before the edit, after it, and after what would be wrong.
-
-    Attributes:
-        index: 0 for the source view, then the targets by their order.
-        before, after: (H, W, 3) linear light in [0, 1].
-        mask: (H, W) bool, the edited objects.
-        hue: (3,) RGB of the wrong colour, its largest channel 1 and its smallest 0; the same in all
-            views of a task.
-        others: (H, W, 3) the results of other answers.
-        elsewhere: (H, W, 3) the result of an edit of other objects.
-    """
-
-    index: int
-    before: Array
-    after: Array
-    mask: Mask
-    hue: Array
-    others: tuple[Array, ...] = ()
-    elsewhere: Array | None = None
-
-    def blend(self, strength: float) -> Array:
-        """(H, W, 3) linear light: the edit at part of its strength."""
-        return (1 - strength) * self.before + strength * self.after
-
-    def wrong_colour(self) -> Array:
-        """Another answer, where the edit has several; else the edited object in the opposite hue,
-        as light as it is.
-        """
-        if self.others:
-            return self.others[0]
-        value = self.after.max(axis=-1, keepdims=True)
-        return np.where(self.mask[..., None], value * (1 - SATURATION * (1 - self.hue)), self.after)
-
-    def inconsistent(self) -> Array:
-        """Another answer in each view, or another strength."""
-        if self.others:
-            return self.others[self.index % len(self.others)]
-        return self.blend(UNEVEN[self.index % len(UNEVEN)])
-
-    def blurred(self) -> Array:
-        """The right result out of focus."""
-        from scipy.ndimage import gaussian_filter
-
-        sigma = BLUR * self.after.shape[0]
-        return np.asarray(gaussian_filter(self.after, (sigma, sigma, 0), mode="nearest"))
-
-    def misplaced(self) -> Array:
-        """The right result moved to the right; the left border is repeated."""
-        return np.concatenate(
-            [np.repeat(self.after[:, :1], SHIFT, axis=1), self.after[:, :-SHIFT]], axis=1
-        )
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What a method may have given for a view.
-
-    Attributes:
-        name: the last part of a figure's key.
-        title: for people, short.
-        make: the picture in linear light; None where the edit has no such flaw.
-        source: whether the source view has the flaw as well. Where it has, all views have it alike,
-            and a metric that compares views with one another has nothing to find.
-        noise: standard deviation of noise that is added to sRGB values, of its own in each view.
-    """
-
-    name: str
-    title: str
-    make: Callable[[Shot], Array | None]
-    source: bool = True
-    noise: float = 0.0
-
-    def picture(self, shot: Shot, seed: int) -> Array | None:
-        """(H, W, 3) sRGB of a view in [0, 1]."""
-        linear = shot.after if shot.index == 0 and not self.source else self.make(shot)
-        if linear is None or not self.noise:
-            return None if linear is None else to_srgb(linear)
-        rng = np.random.default_rng([seed, shot.index])
-        return np.clip(to_srgb(linear) + rng.normal(0, self.noise, linear.shape), 0, 1)
-
-
-def _strength(strength: float) -> Condition:
-    return Condition(
-        f"strength_{100 * strength:03.0f}",
-        f"strength {strength:g}",
-        lambda shot: shot.blend(strength),
-    )
-
-
-CONDITIONS = (
-    *map(_strength, STRENGTHS),
-    Condition("wrong_colour", "wrong colour", Shot.wrong_colour),
-    Condition("wrong_object", "wrong object", lambda shot: shot.elsewhere),
-    Condition("inconsistent", "inconsistent views", Shot.inconsistent, source=False),
-    Condition("blurred", "blurred", Shot.blurred),
-    Condition("noisy", "noisy", lambda shot: shot.after, noise=NOISE),
-    Condition("misplaced", f"misplaced by {SHIFT} px", Shot.misplaced, source=False),
-)
-"""Every condition; the right result is that of full strength."""
-
-RIGHT = f"strength_{100 * STRENGTHS[-1]:03.0f}"
+from attnwarp_eval.cost import in_turn
+from attnwarp_eval.document import figures
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics.arrays import Array
+from attnwarp_eval.metrics.registry import metric as metric_of
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.flaws import CONDITIONS, RIGHT, STRENGTHS, Shot, Task, shots_of, tasks
+from attnwarp_eval.study.parts import Part, Study, StudyError, check_distinct, did_you_mean
+from attnwarp_eval.study.probes import register
+from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.record import Json, Record
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.twoview import TwoView
 
 FIDELITY = (
     *(
@@ -280,9 +53,250 @@ source view.
 """
 
 
+STEPS = tuple(c.name for c in CONDITIONS[: len(STRENGTHS)])
+"""Conditions of rising strength; the last is the right result."""
+
+FLAWS = tuple(c for c in CONDITIONS if c.name != RIGHT)
+
+_EDIT = (*STEPS[:-1], "wrong_colour", "wrong_object")
+_ALL = tuple(c.name for c in FLAWS)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A metric as the figure shows it.
+
+    Attributes:
+        key: what ranks. A PSNR ranks by its MSE, which is finite where pictures are equal.
+        title: for people.
+        meant: flaws that it is there to see; its discriminating power is the mean over them.
+        cost: whose seconds are its own.
+    """
+
+    key: str
+    title: str
+    meant: tuple[str, ...]
+    cost: str
+
+
+_CHANGED = ("wrong_object", "blurred", "noisy", "misplaced")
+
+ROWS = (
+    Row("embedding.clip_similarity", "CLIP, prompt", _EDIT, "embedding.clip_similarity"),
+    Row("embedding.clip_directional", "CLIP, direction", _EDIT, "embedding.clip_directional"),
+    Row(
+        "embedding.clip_image",
+        "CLIP, source edit",
+        (*_EDIT, "inconsistent"),
+        "embedding.clip_image",
+    ),
+    Row(
+        "embedding.dino_image",
+        "DINO, source edit",
+        (*_EDIT, "inconsistent"),
+        "embedding.dino_image",
+    ),
+    Row(
+        "consistency.delta_e",
+        "consistency, dE00",
+        ("inconsistent", "noisy", "misplaced"),
+        "consistency.delta_e",
+    ),
+    Row("fidelity.preserved_mse", "rest unchanged, PSNR", _CHANGED, "fidelity.mse"),
+    Row("fidelity.preserved_ssim", "rest unchanged, SSIM", _CHANGED, "fidelity.ssim"),
+    Row("fidelity.mse", "truth, PSNR", _ALL, "fidelity.mse"),
+    Row("fidelity.ssim", "truth, SSIM", _ALL, "fidelity.ssim"),
+    Row("fidelity.distance", "truth, perceptual", _ALL, "fidelity.distance"),
+    Row("fidelity.mse.inside", "truth inside, PSNR", _ALL, "fidelity.mse"),
+    Row("fidelity.ssim.inside", "truth inside, SSIM", _ALL, "fidelity.ssim"),
+    Row("fidelity.distance.inside", "truth inside, perceptual", _ALL, "fidelity.distance"),
+)
+"""The metrics, those that need no truth first."""
+
+Values = Mapping[str, float]
+"""A view's figures by key; NaN where undefined."""
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads."""
+
+    encoders: dict[Kind, str] = Field(
+        default_factory=dict, description="by kind, as load_encoder takes them"
+    )
+    edits: list[str] = Field(
+        default_factory=list, description="edits by name; all of a scene's if empty"
+    )
+
+    @model_validator(mode="after")
+    def _check_encoders_and_edits(self) -> StudyPart:
+        for kind, name in self.encoders.items():
+            try:
+                actual = kind_of(name)
+            except InputError as error:
+                raise ValueError(f"encoders.{kind}: {error}") from None
+            if actual != kind:
+                raise ValueError(f"encoders.{kind}: {name!r} is of kind {actual!r}")
+        check_distinct(self.edits, "edits")
+        return self
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Seconds of one picture by metric and round, taken in turn."""
+
+    seconds: Mapping[str, list[float]]
+
+    def to_json(self) -> Json:
+        """The entry ``rounds`` of the record's cost."""
+        return {"cost": {"rounds": dict(self.seconds)}} if self.seconds else {}
+
+
+Records = Sequence[tuple[str, Record[Seconds]]]
+"""(scene, record) of a run's finished cells."""
+
+
+@register
+class Sensitivity(Probe[Seconds]):
+    """One cell for all metrics of a scene: they judge the same pictures, and run in turn.
+
+    A view of a record is named ``task/target``, a figure ``metric.condition``.
+    """
+
+    name = "sensitivity"
+    study_part = StudyPart
+    metrics = metrics_of("fidelity.", "consistency.", "embedding.")
+    judges_variants = False
+
+    def check(self, study: Study) -> None:
+        """Variants change no metric."""
+        if study.probes.get(self.name):
+            raise ValueError(
+                "probes.sensitivity: got variants, expected []; it judges metrics, which no variant"
+                " changes"
+            )
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene and seed."""
+        part = study.part(StudyPart)
+        identities = _identities(part)
+        available = dict.fromkeys(edit.name for scene in scenes.values() for edit in scene.edits)
+        for edit in part.edits:
+            if edit not in available:
+                raise StudyError(
+                    f"edits: no scene has an edit {edit!r}{did_you_mean(edit, available)}"
+                )
+        for name, scene in scenes.items():
+            for seed in study.seeds:
+                spec = {
+                    **self.common_spec(study, scene, seed),
+                    "spp": study.spp,
+                    "rounds": study.timing_rounds,
+                    "encoders": identities,
+                    "tasks": [task.to_dict() for task in _tasks_of(scene, part.edits)],
+                }
+                sources = {str(kind): part.encoders[kind] for kind in sorted(part.encoders)}
+                yield Cell(spec, name, "metrics", self.name, seed, ("metrics",), sources=sources)
+
+    def compute(self, work: Work) -> Seconds:
+        """Every metric on every condition of every task; metrics without an encoder are left
+        out.
+        """
+        spec, world, meter = work.spec, work.world, work.meter
+        with meter.stage("setup"):
+            encoders = loaded(work.cell.sources, spec["encoders"])
+        seconds: dict[str, list[float]] = {}
+        for index, task in enumerate(map(Task.from_dict, spec["tasks"])):
+            with meter.stage("truth"):
+                shots = shots_of(world, task, spec)
+                source_shot = shots[world.source.name]
+                source = {c.name: c.picture(source_shot, spec["seed"]) for c in CONDITIONS}
+            prompts = _Prompts(task, source[RIGHT], encoders)
+            for name in spec["views"]:
+                with meter.stage("truth"):
+                    pair = world.pair(name, spec["size"])
+                    shot = shots[name]
+                    pictures = {c.name: c.picture(shot, spec["seed"]) for c in CONDITIONS}
+                    view = _View(pair, shot, source_shot)
+                with meter.stage("checks"):
+                    measured: dict[str, float] = {}
+                    for condition, picture in pictures.items():
+                        if picture is not None:
+                            values = view.figures(
+                                source[condition], picture, encoders.get("perceptual")
+                            )
+                            measured |= {f"{key}.{condition}": v for key, v in values.items()}
+                    measured |= prompts.figures(view.original, pictures)
+                    keys = {key.rpartition(".")[0] for key in measured}
+                    for condition, picture in pictures.items():
+                        if picture is None:  # undefined, and counted as such
+                            measured |= {f"{key}.{condition}": math.nan for key in keys}
+                meter.count(pictures=len(pictures))
+                if index == 0 and name == spec["views"][0]:
+                    with meter.stage("rounds"):
+                        seconds = _rounds(
+                            view, prompts, source["noisy"], pictures["noisy"], encoders, spec
+                        )
+                work.add(f"{task.name}/{name}", measured)
+        return Seconds(seconds)
+
+    def read_extra(self, data: Json) -> Seconds:
+        """From the record's cost."""
+        rounds = data["cost"].get("rounds", {})
+        return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """What each metric sees, how it follows the strength of an edit, and what it costs."""
+        records = [(cell.scene, record) for cell, record in results.finished(self.name)]
+        if not records:
+            return
+        rows = [
+            row for row in ROWS if any(_has(values, row.key) for _, _, values in _views(records))
+        ]
+        shares = {row.key: {c.name: share(records, row.key, c.name) for c in FLAWS} for row in rows}
+        yield Place.INSTRUMENT, _flaws(results, records, rows, shares, layout)
+        yield Place.INSTRUMENT, _strengths(records, rows, layout)
+        if layout.timings:
+            yield Place.INSTRUMENT, _costs(records, rows, shares, layout)
+
+
+def _identities(part: StudyPart) -> dict[str, dict[str, Any]]:
+    """Encoders by their weights: other weights give other cells, another folder does not."""
+    identities = {}
+    for kind, name in part.encoders.items():
+        try:
+            identities[kind] = identity(name, kind)
+        except InputError as error:
+            raise StudyError(f"encoders.{kind}: {error}") from None
+    return {str(kind): identities[kind] for kind in sorted(identities)}
+
+
+def _tasks_of(scene: Scene, edits: Sequence[str]) -> list[Task]:
+    available = [edit.name for edit in scene.edits]
+    if not available:
+        raise StudyError(
+            f"probes.sensitivity: scene {scene.name!r} names no edits, so there is no right"
+            " result; leave it out, or give it some (docs/edits.md)"
+        )
+    selected = tasks(scene, edits)
+    if not selected:
+        raise StudyError(
+            f"edits: scene {scene.name!r} has none of {', '.join(edits)}; there are"
+            f" {', '.join(available)}"
+        )
+    return selected
+
+
+def _views(records: Records) -> Iterator[tuple[str, str, Values]]:
+    """(scene, task/view, figures)."""
+    for scene, record in records:
+        for view in record.views:
+            yield scene, view.name, view.metrics
+
+
 def identity(name: str, kind: Kind) -> dict[str, Any]:
-    """What of an encoder decides its figures: its weights and what happens to a picture before,
-    wherever it lies.
+    """What of an encoder decides its figures: its weights and its preprocessing, not its path.
 
     Raises:
         InputError: see :func:`attnwarp.encoders.load_encoder`.
@@ -306,130 +320,33 @@ def loaded(names: Mapping[str, str], expected: Mapping[str, Mapping[str, Any]]) 
     Raises:
         InputError: one cannot be loaded, or is another one by now.
     """
-    found = {}
-    for kind, wanted in expected.items():
-        found[kind] = load_encoder(names[kind])
-        if identity_of(found[kind]) != wanted:
+    encoders = {}
+    for kind, planned in expected.items():
+        encoders[kind] = load_encoder(names[kind])
+        if identity_of(encoders[kind]) != planned:
             raise InputError(
                 f"encoder {names[kind]!r}: its weights have changed since the run was planned;"
                 " start the run again"
             )
-    return found
-
-
-def measure(
-    at: World,
-    spec: Mapping[str, Any],
-    encoders: Mapping[str, Any],
-    meter: Meter,
-    seconds: dict[str, list[float]],
-) -> Iterator[tuple[str, dict[str, float], dict[str, Any]]]:
-    """Every metric on every condition of every task.
-
-    Args:
-        at: the scene.
-        spec: of the cell: ``views``, ``tasks``, ``spp``, ``seed``, ``rounds``.
-        encoders: loaded, by kind; metrics whose encoder is not there are left out.
-        meter: takes the seconds of truth and checks.
-        seconds: filled with the seconds that a picture costs each metric, taken in turn: a list of
-            rounds each.
-
-    Yields:
-        ``task/view``, its figures as ``metric.condition``, and {}.
-    """
-    for number, task in enumerate(map(Task.from_dict, spec["tasks"])):
-        with meter.stage("truth"):
-            shots = _shots(at, task, spec)
-            source = {c.name: c.picture(shots[at.source.name], spec["seed"]) for c in CONDITIONS}
-        prompts = _Prompts(task, source[RIGHT], encoders)
-        for name in spec["views"]:
-            with meter.stage("truth"):
-                pair = at.pair(name, spec["size"])
-                shot = shots[name]
-                pictures = {c.name: c.picture(shot, spec["seed"]) for c in CONDITIONS}
-                view = _View(pair, shot, shots[at.source.name])
-            with meter.stage("checks"):
-                figures: dict[str, float] = {}
-                for condition, picture in pictures.items():
-                    if picture is not None:
-                        found = view.figures(source[condition], picture, encoders.get("perceptual"))
-                        figures |= {f"{key}.{condition}": value for key, value in found.items()}
-                figures |= prompts.figures(view.original, pictures)
-                known = {key.rpartition(".")[0] for key in figures}
-                for condition, picture in pictures.items():
-                    if picture is None:  # said to be undefined, and so counted
-                        figures |= {f"{key}.{condition}": math.nan for key in known}
-            meter.count(pictures=len(pictures))
-            if number == 0 and name == spec["views"][0]:
-                with meter.stage("rounds"):
-                    seconds |= _rounds(
-                        view, prompts, source["noisy"], pictures["noisy"], encoders, spec
-                    )
-            yield f"{task.name}/{name}", figures, {}
-
-
-def _shots(at: World, task: Task, spec: Mapping[str, Any]) -> dict[str, Shot]:
-    """The source and every target by name."""
-    from attnwarp_eval.truth import appearance
-    from attnwarp_eval.truth.edits import edit_mask
-
-    names = [at.source.name, *spec["views"]]
-    scenes = [at.scene, at.scene.edited(task.edit, task.answer)]
-    scenes += [at.scene.edited(task.edit, answer) for answer, _ in task.others]
-    if task.elsewhere is not None:
-        scenes.append(at.scene.edited(*task.elsewhere[:2]))
-    # Scene by scene: Mitsuba keeps the last one, and to load one costs more than to render it.
-    seen: dict[str, list[Array]] = {name: [] for name in names}
-    for scene in scenes:
-        for name in names:
-            seen[name].append(
-                np.clip(appearance(scene, at.camera(name), spp=spec["spp"], seed=0), 0, 1)
-            )
-    masks = {
-        name: edit_mask(at.scene, task.edit, at.geometry.trace(at.camera(name)), task.answer)
-        for name in names
-    }
-    total = np.sum(
-        [seen[name][1][masks[name]].sum(axis=0, dtype=np.float64) for name in names], axis=0
-    )
-    hue = opposite_hue(total)
-    last = 2 + len(task.others)
-    return {
-        name: Shot(
-            index, seen[name][0], seen[name][1], masks[name], hue, tuple(seen[name][2:last]),
-            seen[name][last] if task.elsewhere is not None else None,
-        )
-        for index, name in enumerate(names)
-    }  # fmt: skip
-
-
-def opposite_hue(color: Array) -> Array:
-    """(3,) RGB of the hue half a circle from that of a colour, fully saturated (HSV); red for
-    grey."""
-    spread = color.max() - color.min()
-    return np.array([1.0, 0, 0]) if spread <= 1e-9 * color.max() else (color.max() - color) / spread
+    return encoders
 
 
 class _View:
-    """A view with all that metrics of pictures need to judge one that somebody made of it."""
+    """A view with what metrics need to judge a picture of it."""
 
     def __init__(self, pair: TwoView, shot: Shot, source: Shot) -> None:
-        from attnwarp_eval.metrics import view_dependent
-
         self.pair = pair
         self.mask = shot.mask
         self.original, self.truth = to_srgb(shot.before), to_srgb(shot.after)
         # What rightly differs between two views, before the edit or after it: highlights and
         # reflections.
-        self.exclude = view_dependent(to_srgb(source.before), self.original, pair)
-        self.exclude |= view_dependent(to_srgb(source.after), self.truth, pair)
+        self.exclude = metrics.view_dependent(to_srgb(source.before), self.original, pair)
+        self.exclude |= metrics.view_dependent(to_srgb(source.after), self.truth, pair)
 
     def figures(self, source: Array | None, picture: Array, perceptual: Any) -> dict[str, float]:
-        """The figures of pictures that are kept."""
-        from attnwarp_eval.metrics import fidelity
-
+        """Fidelity and consistency of a picture."""
         distance = None if perceptual is None else _distance(perceptual)
-        against = fidelity(
+        against = metrics.fidelity(
             picture, self.truth, self.mask, original_srgb=self.original, distance=distance
         )
         between = self.consistency(source, picture)
@@ -440,9 +357,7 @@ class _View:
 
     def consistency(self, source: Array | None, picture: Array) -> dict[str, float]:
         """Of the edited object in the picture and in the source view of the same result."""
-        from attnwarp_eval.metrics import cross_view
-
-        return cross_view(
+        return metrics.cross_view(
             source, picture, self.pair, mask=self.mask, exclude=self.exclude
         ).figures()
 
@@ -452,9 +367,7 @@ def _distance(perceptual: Any) -> Callable[[Array, Array], float]:
 
 
 class _Prompts:
-    """A task's prompts and its edited source view as encoders see them: made once, for all
-    pictures.
-    """
+    """Embeddings of a task's prompts and of its edited source view, computed once."""
 
     def __init__(self, task: Task, source_edit: Array | None, encoders: Mapping[str, Any]) -> None:
         self.clip, self.dino = encoders.get("clip"), encoders.get("dino")
@@ -465,30 +378,28 @@ class _Prompts:
             self.dino_source = self.dino.images([source_edit])
 
     def figures(self, original: Array, pictures: Mapping[str, Array | None]) -> dict[str, float]:
-        """``embedding.*.condition`` of all conditions that there are."""
-        from attnwarp_eval.metrics import clip_similarity, directional_similarity, image_similarity
-
-        there = {
+        """``embedding.*.condition`` of all conditions that have a picture."""
+        available = {
             condition: picture for condition, picture in pictures.items() if picture is not None
         }
-        found: dict[str, Array] = {}
+        similarities: dict[str, Array] = {}
         if self.clip is not None:
-            *images, unedited = self.clip.images([*there.values(), original])
+            *images, unedited = self.clip.images([*available.values(), original])
             images = np.stack(images)
-            found["clip_similarity"] = clip_similarity(images, self.after).values
+            similarities["clip_similarity"] = metrics.clip_similarity(images, self.after).values
             befores = np.broadcast_to(unedited, images.shape)
-            found["clip_directional"] = directional_similarity(
+            similarities["clip_directional"] = metrics.directional_similarity(
                 befores, images, self.before, self.after
             ).values
-            found["clip_image"] = image_similarity(self.clip_source, images).values
+            similarities["clip_image"] = metrics.image_similarity(self.clip_source, images).values
         if self.dino is not None:
-            found["dino_image"] = image_similarity(
-                self.dino_source, self.dino.images(list(there.values()))
+            similarities["dino_image"] = metrics.image_similarity(
+                self.dino_source, self.dino.images(list(available.values()))
             ).values
         return {
             f"embedding.{name}.{condition}": float(value)
-            for name, values in found.items()
-            for condition, value in zip(there, values, strict=True)
+            for name, values in similarities.items()
+            for condition, value in zip(available, values, strict=True)
         }
 
 
@@ -506,8 +417,6 @@ def _rounds(
     What is made once for all pictures is in none of them: truth, correspondences, and the
     embeddings of the prompts, of the edited source view and of the view before the edit.
     """
-    from attnwarp_eval import metrics
-
     contestants: dict[str, Callable[[], Any]] = {
         "fidelity.mse": lambda: metrics.mse(picture, view.truth),
         "fidelity.ssim": lambda: metrics.ssim(picture, view.truth),
@@ -530,13 +439,276 @@ def _rounds(
         contestants["embedding.dino_image"] = lambda: metrics.image_similarity(
             prompts.dino_source, dino.images([picture])
         )
-    names = list(contestants)
-    taken: dict[str, list[float]] = {name: [] for name in names}
-    rng = np.random.default_rng(spec["seed"])
-    for turn in range(spec["rounds"] + 1):
-        for index in rng.permutation(len(names)):
-            start = time.perf_counter()
-            contestants[names[index]]()
-            if turn:
-                taken[names[index]].append(time.perf_counter() - start)
-    return taken
+    works = [lambda _, work=work: work() for work in contestants.values()]
+    turns = in_turn(works, spec["rounds"], seed=spec["seed"])
+    return dict(zip(contestants, turns.seconds, strict=True))
+
+
+def _has(values: Values, key: str) -> bool:
+    return f"{key}.{RIGHT}" in values
+
+
+def _value(values: Values, key: str, condition: str) -> float:
+    return float(values.get(f"{key}.{condition}", math.nan))
+
+
+def beats(key: str, right: float, flawed: float) -> float:
+    """1 where a metric ranks the right result above the flawed one, 0 below, 0.5 where it cannot
+    tell them apart.
+
+    Values that differ by no more than two runs of the metric may (its ``atol`` and ``rtol``) are
+    told apart by nothing but the machine. NaN where either is undefined.
+    """
+    if not (math.isfinite(right) and math.isfinite(flawed)):
+        return math.nan
+    specification = metric_of(key)
+    gain = flawed - right if specification.direction == "lower" else right - flawed
+    if abs(gain) <= specification.atol + specification.rtol * max(abs(right), abs(flawed)):
+        return 0.5
+    return float(gain > 0)
+
+
+def share(records: Records, key: str, condition: str) -> Interval:
+    """Of the edits and views, those in which a metric ranks the right result above one with a flaw;
+    ties are half.
+
+    A mean over scenes with its interval. 1: it sees the flaw every time; 0.5: blind; below: it
+    prefers the flaw.
+    """
+    table: dict[str, list[float]] = {}
+    for scene, _, values in _views(records):
+        won = beats(key, _value(values, key, RIGHT), _value(values, key, condition))
+        table.setdefault(scene, []).append(won)
+    return interval(table)
+
+
+def curve(values: Values, key: str) -> tuple[float, float]:
+    """How a metric follows the strength of an edit in one view.
+
+    Returns:
+        Spearman's rank correlation of strength and metric, signed so that 1 is the right way, 0 for
+        a metric that does not change; and 1 or 0: whether each step up in strength moves it the
+        right way by more than its tolerance. NaN with fewer than three strengths that are defined.
+    """
+    pairs = [(s, _value(values, key, name)) for s, name in zip(STRENGTHS, STEPS, strict=True)]
+    pairs = [(s, v) for s, v in pairs if math.isfinite(v)]
+    if len(pairs) < 3:
+        return math.nan, math.nan
+    strengths, measured = np.array(pairs).T
+    sign = -1 if metric_of(key).direction == "lower" else 1
+    rises = [beats(key, high, low) == 1 for low, high in itertools.pairwise(measured)]
+    if np.ptp(measured) == 0:
+        return 0.0, 0.0
+    return sign * float(stats.spearmanr(strengths, measured).statistic), float(all(rises))
+
+
+def power(row: Row, shares: Mapping[str, Interval]) -> float:
+    """Mean share over the flaws that a metric is meant for; NaN where none is defined."""
+    means = [shares[name].mean for name in row.meant if math.isfinite(shares[name].mean)]
+    return float(np.mean(means)) if means else math.nan
+
+
+def _flaws(
+    results: Results,
+    records: Records,
+    rows: list[Row],
+    shares: Mapping[str, Mapping[str, Interval]],
+    layout: Layout,
+) -> Section:
+    spec = records[0][1].spec
+    edits = {(scene, name.rpartition("/")[0]) for scene, name, _ in _views(records)}
+    views = sum(len(record.views) for _, record in records)
+    text = [
+        (
+            f"{len(edits)} right results of edits in {len(records)} scenes, {views} pairs of a"
+            " result and a view. Each is compared with results that a method may have given in its"
+            " place, each with one flaw. The figure: the share in which a metric ranks the right"
+            " result above the flawed one. **1: it sees the flaw. 0.5: blind to it. Below 0.5: it"
+            " prefers the flaw.** Differences within a metric's tolerance count as half."
+        ),
+        (
+            "Framed: what a metric is meant to see. Metrics against the truth compare with the"
+            " right result itself and lose only where nothing of a view shows the flaw; of the"
+            " others, which a person has without a truth, a figure is news. Wrong colours, weak"
+            " edits and blur are alike in all views, the source included: a metric of consistency"
+            " should be blind to them."
+        ),
+        "Encoders: " + _encoders(results, spec) + ".",
+    ]
+    if len(records) < len(results.study.scenes):
+        text.insert(0, f"**Measured on {len(records)} of {len(results.study.scenes)} scenes.**")
+    means = np.array([[shares[row.key][c.name].mean for c in FLAWS] for row in rows])
+    framed = np.array([[c.name in row.meant for c in FLAWS] for row in rows])
+    path = layout.figure("sensitivity.svg")
+    with figures.drawing(path, height=0.8 + 0.34 * len(rows), width=9.6) as (axes,):
+        figures.heatmap(
+            axes,
+            means,
+            rows=[row.title for row in rows],
+            columns=[c.title for c in FLAWS],
+            framed=framed,
+            title="share in which the right result is ranked above the flawed one",
+        )
+    drawn = Picture(
+        "figures/sensitivity.svg",
+        "Which metric can see what: 1 sees the flaw, 0.5 is blind, below 0.5 prefers it.",
+    )
+    count = len(records)
+    table = [[row.title, *(spread(shares[row.key][c.name], count) for c in FLAWS)] for row in rows]
+    columns = ["metric", *(c.title for c in FLAWS)]
+    return Section(
+        "Which metric can see what",
+        text,
+        [Table(columns, table, "Shares with intervals", folded=True)],
+        [drawn],
+    )
+
+
+def _encoders(results: Results, spec: Mapping[str, Any]) -> str:
+    names = results.study.part(StudyPart).encoders
+    encoders = [
+        f"{kind} `{names[kind]}` ({identity['weights_sha256'][:12]})"
+        for kind, identity in spec["encoders"].items()
+    ]
+    return ", ".join(encoders) or "none, so what needs one is left out"
+
+
+def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
+    table, drawn = [], []
+    for row in rows:
+        by_scene: dict[str, list[tuple[float, float]]] = {}
+        for scene, _, values in _views(records):
+            by_scene.setdefault(scene, []).append(curve(values, row.key))
+        rank, steps = (
+            interval({s: [pair[i] for pair in v] for s, v in by_scene.items()}) for i in (0, 1)
+        )
+        table.append([row.title, spread(rank, len(records)), spread(steps, len(records))])
+        if ".inside" not in row.key:
+            drawn.append((row, [_mean(records, row.key, name) for name in STEPS]))
+    columns = 3
+    path = layout.figure("sensitivity-strength.svg")
+    lines = -(-len(drawn) // columns)
+    with figures.drawing(path, columns, 1.9 * lines, rows=lines, width=3.0 * columns) as axes:
+        for panel, (row, means) in zip(axes, drawn, strict=False):
+            unit = metric_of(row.key).unit
+            line = figures.Line(row.title, STRENGTHS, means)
+            better = (
+                "less is better" if metric_of(row.key).direction == "lower" else "more is better"
+            )
+            label = row.title.replace("PSNR", "MSE")
+            figures.lines(
+                panel, [line], x="strength", y=unit, title=f"{label} ({better})", legend=False
+            )
+        for panel in axes[len(drawn) :]:
+            panel.axis("off")
+    text = [
+        (
+            "The right result at part of its strength, blended with the view before the edit in"
+            " linear light. Rank correlation: Spearman's, between strength and metric, 1 when every"
+            " step moves it the right way, 0 for none. The share beside it: edits and views in"
+            " which each of the four steps is seen, beyond the metric's tolerance. At strength 0"
+            " nothing has changed, and a direction of change is undefined."
+        ),
+    ]
+    headings = ["metric", "rank correlation with strength", "share with every step seen"]
+    caption = "Means over scenes against the strength of the edit, with 95 % intervals over scenes."
+    picture = Picture("figures/sensitivity-strength.svg", caption)
+    return Section(
+        "Metrics against the strength of an edit", text, [Table(headings, table)], [picture]
+    )
+
+
+def _mean(records: Records, key: str, condition: str) -> Interval:
+    table: dict[str, list[float]] = {}
+    for scene, _, values in _views(records):
+        table.setdefault(scene, []).append(_value(values, key, condition))
+    return interval(table)
+
+
+def _costs(
+    records: Records,
+    rows: list[Row],
+    shares: Mapping[str, Mapping[str, Interval]],
+    layout: Layout,
+) -> Section:
+    spec = records[0][1].spec
+    points: dict[str, tuple[Interval, Interval]] = {}
+    powers = {}
+    for row in rows:
+        taken = {
+            scene: [float(np.median(record.extra.seconds[row.cost]))]
+            for scene, record in records
+            if record.extra.seconds.get(row.cost)
+        }
+        if not taken:
+            continue
+        seconds = interval(taken)
+        powers[row.title] = power(row, shares[row.key])
+        missed = _point(1 - powers[row.title])
+        points[row.title] = (seconds, missed)
+    path = layout.figure("sensitivity-cost.svg")
+    # The truth is what a metric is judged by here; those that know it are on a front of their own.
+    apart = [
+        (
+            "without the truth",
+            {
+                row.title: points[row.title]
+                for row in rows
+                if row.title in points and row.meant != _ALL
+            },
+        ),
+        (
+            "against the truth",
+            {
+                row.title: points[row.title]
+                for row in rows
+                if row.title in points and row.meant == _ALL
+            },
+        ),
+    ]
+    on_front: list[str] = []
+    with figures.drawing(path, columns=2, height=4.2, width=11.5) as axes:
+        for panel, (title, some) in zip(axes, apart, strict=True):
+            on_front += figures.cost_front(
+                panel,
+                some,
+                x="seconds a picture",
+                y="missed: 1 - discriminating power",
+                title=title,
+                log=False,
+            )
+    table = [
+        [
+            row.title,
+            number(1000 * points[row.title][0].mean),
+            number(powers[row.title]),
+            "yes" if row.title in on_front else "no",
+            (
+                ", ".join(c.title for c in FLAWS if c.name in row.meant)
+                if row.meant != _ALL
+                else "all"
+            ),
+        ]
+        for row in rows
+        if row.title in points
+    ]
+    text = [
+        (
+            f"Milliseconds of one {spec['size']} x {spec['size']} px picture: median of"
+            f" {spec['rounds']} rounds in which all metrics took turns in one process, on one"
+            " thread, in an order drawn anew; mean over scenes. What is made once for all pictures"
+            " is in none of them: truth, correspondences, the embeddings of the prompts, of the"
+            " edited source view and of the view before the edit. Discriminating power: the mean"
+            " share over the flaws that a metric is meant for. A metric is on the front when"
+            " nothing cheaper of its kind sees as much."
+        ),
+    ]
+    columns = ["metric", "ms a picture", "discriminating power", "on the front", "meant for"]
+    drawn = Picture("figures/sensitivity-cost.svg", "What a metric misses against what it costs.")
+    return Section(
+        "What a metric costs and what it can see", text, [Table(columns, table)], [drawn]
+    )
+
+
+def _point(value: float) -> Interval:
+    return Interval(value, math.nan, math.nan, 1, 1, 0, math.nan, math.nan)

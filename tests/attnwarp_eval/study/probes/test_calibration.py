@@ -5,15 +5,20 @@ import math
 
 import numpy as np
 import pytest
+import runs
 import torch
 
 from attnwarp.warp.correspondence import TAP_SPREAD
 from attnwarp.warp.settings import PRESETS, preset
 from attnwarp.warp.view import EXACT_DEPTH_TOLERANCE, Surface, warp_surfaces
 from attnwarp_eval import metrics
+from attnwarp_eval.effects.table import plan_words, said_by
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import Layout, Place
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.truth.features import SolidField
+from attnwarp_eval.truth.plan import plan
 
 SIZE = 128
 EXACT = preset("corrected", depth_relative=EXACT_DEPTH_TOLERANCE, depth_spread=TAP_SPREAD)
@@ -129,3 +134,21 @@ def test_the_presets_run_on_the_truths_own_surfaces(pairs):
         )
         assert view.mask.any(), name
         assert view.at((16, 16)).mask.shape == (16, 16)
+
+
+def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
+    def sections(**scenes):
+        study = {"name": "s", "scenes": list(scenes), "probes": {"calibration": []}}
+        cells = [
+            runs.outcome("calibration", name, ["calibration"], runs.record([], **extra))
+            for name, extra in scenes.items()
+        ]
+        made = probe("calibration").sections(runs.results(study, cells), Layout(tmp_path))
+        return [section for place, section in made if place == Place.APPENDIX]
+
+    (section,) = sections(fog={"effects": said_by(load_scene("fog"))}, old={})
+    ((scene, usual, beyond, missing, planned, full, why),) = section.tables[0].rows
+    assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
+    assert planned == full == "volpath" and "medium" in why
+    assert sections(old={}) == []
+    assert plan_words(plan(load_scene("lens")).to_dict()) == "direct, thin lens"

@@ -15,9 +15,9 @@ from attnwarp.encoders import EncoderInfo
 from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, load_study
-from attnwarp_eval.study.probes import sensitivity
-from attnwarp_eval.study.probes.sensitivity import CONDITIONS, RIGHT, Shot, opposite_hue, tasks
+from attnwarp_eval.study import StudyError, cells_of, load_study
+from attnwarp_eval.study.flaws import CONDITIONS, RIGHT, Shot, Task, opposite_hue, tasks
+from attnwarp_eval.study.probes import probe, sensitivity
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import appearance
 
@@ -162,7 +162,7 @@ def study(scene, folder, **changes):
 
 def cell_of(scene, folder, **changes):
     made = study(scene, folder, **changes)
-    cells = made.cells({name: load_scene(name) for name in made.scenes})
+    cells = cells_of(made, {name: load_scene(name) for name in made.scenes})
     assert [c.probe for c in cells] == ["calibration", "sensitivity"]
     return cells[1]
 
@@ -280,7 +280,7 @@ def test_every_edit_is_asked_and_ambiguous_ones_two_answers_at_most(scene):
     assert elsewhere["dusk"] == "green"
     assert found["green"].content == load_scene(str(scene)).edited("green").content_hash
     for task in found.values():
-        assert sensitivity.Task.from_dict(task.to_dict()) == task
+        assert Task.from_dict(task.to_dict()) == task
 
 
 def test_where_all_edits_change_one_object_nothing_is_a_wrong_object(tmp_path):
@@ -296,7 +296,7 @@ def test_the_cells_id_follows_the_weights_and_not_where_they_lie(scene, tmp_path
         tmp_path,
         encoders={"clip": "clip:/elsewhere", "dino": "dino-small", "perceptual": "lpips:/l"},
     )
-    assert first.encoders != renamed.encoders
+    assert first.sources != renamed.sources
     assert {k: v["weights_sha256"] for k, v in first.spec["encoders"].items()} == {
         "clip": "clip-w", "dino": "dino-w", "perceptual": "perceptual-w"
     }  # fmt: skip
@@ -311,7 +311,7 @@ def test_weights_that_change_under_a_run_are_refused(scene, tmp_path, encoders):
     with pytest.raises(
         InputError, match="'clip-small': its weights have changed since the run was planned"
     ):
-        compute(cell, str(scene), tmp_path, threads=1)
+        compute(probe("sensitivity"), cell, tmp_path, threads=1)
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,8 @@ def test_what_cannot_be_asked_says_why(scene, tmp_path, changes, message, reques
 
 @pytest.fixture
 def record(scene, tmp_path, encoders):
-    return compute(cell_of(scene, tmp_path), str(scene), tmp_path, threads=1)
+    cell = cell_of(scene, tmp_path)
+    return compute(probe("sensitivity"), cell, tmp_path, threads=1).to_json()
 
 
 def cosine(a, b):
@@ -419,7 +420,8 @@ def test_without_encoders_their_metrics_are_left_out_and_a_missing_flaw_is_undef
     path = tmp_path / "one.yaml"
     path.write_text(yaml.safe_dump({**SCENE, "edits": SCENE["edits"][:1]}))
     cell = cell_of(path, tmp_path, encoders={}, edits=[])
-    found = compute(cell, str(path), tmp_path, threads=1)["views"][0]["metrics"]
+    record = compute(probe("sensitivity"), cell, tmp_path, threads=1).to_json()
+    found = record["views"][0]["metrics"]
     assert not any(key.startswith(("embedding", "fidelity.distance")) for key in found)
     assert found["fidelity.mse.wrong_object"] is None
     assert found["fidelity.mse.wrong_colour"] > 0

@@ -1,15 +1,18 @@
-"""How numbers are written in a report."""
+"""How numbers are written in a document."""
 
 from __future__ import annotations
 
 import math
 
-from attnwarp_eval.report.results import Results
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number to ``digits`` significant digits; a dash where it is undefined."""
+    """A number to ``digits`` significant digits; a dash where it is undefined.
+
+    >>> number(0.0123456), number(12345.6), number(None)
+    ('0.0123', '12346', '–')
+    """
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -25,8 +28,11 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def spread(value: Interval, scenes: int | None = None) -> str:
-    """Mean ± half of the 95 % interval, with what was undefined, and the scenes measured where they
-    are not all.
+    """Mean ± half of the 95 % interval, with the number of undefined values.
+
+    Args:
+        value: the interval.
+        scenes: of the study; where fewer were measured, the text says how many.
     """
     if not math.isfinite(value.mean):
         return "–"
@@ -37,9 +43,3 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     if not value.known:
         return number(value.mean) + note
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"
-
-
-def mean_of(results: Results, probe: str, variant: str, metric: str) -> Interval:
-    """Mean over scenes of a variant's metric, with its interval."""
-    table = results.views(probe, variant, metric)
-    return interval({scene: list(values.values()) for scene, values in table.items()})

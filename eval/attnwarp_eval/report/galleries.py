@@ -1,0 +1,41 @@
+"""Pictures of views, a row for each variant."""
+
+from __future__ import annotations
+
+from attnwarp_eval.document.model import Gallery, Picture, Section
+from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.record import PictureFile
+from attnwarp_eval.study.results import Results
+
+
+def galleries(results: Results) -> list[Section]:
+    """The section of pictures, none if no cell has any."""
+    by_view: dict[tuple[str, str], list[tuple[str, PictureFile]]] = {}
+    for cell in results.cells:
+        for picture in cell.record.pictures if cell.record else ():
+            label = probe(cell.probe).picture_label or cell.variants[0]
+            by_view.setdefault((cell.scene, picture.view), []).append((label, picture))
+    if not by_view:
+        return []
+    rows: list[tuple[str, list[Picture]]] = []
+    for (scene, view), labelled in by_view.items():
+        shared = [
+            next((p for _, p in labelled if p.content == content), None) for content in SHARED
+        ]
+        rows.append((f"**{scene}, {view}**", [Picture(p.path, p.content) for p in shared if p]))
+        for label in dict.fromkeys(label for label, _ in labelled):
+            own = {p.content: p for other, p in labelled if other == label}
+            others = [content for content in own if content not in (*ORDER, *SHARED)]
+            contents = [content for content in (*ORDER, *others) if content in own]
+            rows.append((label, [Picture(own[c].path, c.replace("-", " ")) for c in contents]))
+    legend = "; ".join(f"`{colour}` {name}" for name, (colour, _) in CLASSES.items())
+    text = [
+        (
+            "Warped: the source's own colours as the warp carries them, squares where the mask"
+            f" rejects. Mask against truth: {legend}. Endpoint error: dark {EPE_RANGE[0]:g} px to"
+            f" bright {EPE_RANGE[1]:g} px, logarithmic, truly visible pixels only. Depth error:"
+            f" blue too near, red too far, full colour at {100 * DEPTH_RANGE:g} %."
+        ),
+    ]
+    return [Section("Pictures", text, gallery=Gallery(rows))]

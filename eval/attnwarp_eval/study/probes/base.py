@@ -1,0 +1,268 @@
+"""What a probe is: everything that a study, its runner, its store and its report ask of one."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from attnwarp_eval.cost import Meter
+from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.numbers import spread
+from attnwarp_eval.files import write_atomic
+from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.parts import Part, Study, Variant
+from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
+from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.world import World
+
+E = TypeVar("E", bound=Extra)
+
+
+class Place(IntEnum):
+    """Where in the report a probe's section stands; probes of one place stand in their order."""
+
+    INSTRUMENT = 0
+    """Before the tables of variants: whether the instrument can be trusted."""
+
+    RESULT = 1
+    """After the tables of variants."""
+
+    APPENDIX = 2
+    """After everything that was measured."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a report is made with.
+
+    Attributes:
+        root: the run's folder; figures go below it.
+        timings: whether anything measured in seconds or bytes of memory is shown.
+    """
+
+    root: Path
+    timings: bool = True
+
+    def figure(self, name: str) -> Path:
+        """Where a figure is drawn; its link is ``figures/name``."""
+        return self.root / "figures" / name
+
+
+@dataclass(frozen=True)
+class InTurn:
+    """Seconds of contestants that ran in turn in one process.
+
+    Attributes:
+        names: of the contestants; the first is the baseline.
+        seconds: stage -> contestant -> round; the baseline's second run comes last.
+        rounds, threads, view: how they were taken.
+    """
+
+    names: tuple[str, ...]
+    seconds: Mapping[str, list[list[float]]]
+    rounds: int
+    threads: int
+    view: str
+
+
+@dataclass
+class Work:
+    """One cell at work: what a probe computes with, and where its figures go.
+
+    Attributes:
+        cell: what is computed.
+        root: the run's folder.
+        world: of the scene at the study's size.
+        meter: of seconds and counters.
+        views, pictures: results so far.
+    """
+
+    cell: Cell
+    root: Path
+    world: World
+    meter: Meter
+    views: list[View] = field(default_factory=list)
+    pictures: list[PictureFile] = field(default_factory=list)
+
+    @property
+    def spec(self) -> Json:
+        """Of the cell."""
+        return self.cell.spec
+
+    def add(
+        self,
+        view: str,
+        metrics: Mapping[str, float],
+        draw: Callable[[], Mapping[str, bytes]] | None = None,
+    ) -> None:
+        """Add the figures of a view, and its pictures where the study wants them.
+
+        Args:
+            view: name of the target; an edit or another task may stand before it and a slash.
+            metrics: figures by name; NaN or infinite where undefined.
+            draw: the pictures as JPEG files, by what they show.
+        """
+        yaw = self.world.yaw[view.rpartition("/")[2]]
+        self.views.append(View(view, yaw, dict(metrics)))
+        if draw is None or view not in self.cell.pictures:
+            return
+        with self.meter.stage("pictures"):
+            for content, data in draw().items():
+                path = Path("pictures") / self.cell.id[:16] / f"{view}-{content}.jpg"
+                write_atomic(self.root / path, data)
+                sha256 = hashlib.sha256(data).hexdigest()
+                self.pictures.append(PictureFile(view, content, str(path), sha256))
+
+
+class Probe(ABC, Generic[E]):
+    """One kind of measurement, from a study's YAML to the report.
+
+    A probe is a module of this folder with one class that
+    :func:`attnwarp_eval.study.probes.register` decorates. Nothing else names it.
+
+    Attributes:
+        name: in a study's ``probes`` and in every record.
+        protocol: raise it when the figures change meaning; all cells then get new ids.
+        study_part: keys of a study's YAML that only this probe reads.
+        variant_part: keys of a variant that only this probe reads.
+        metrics: specification of every figure of its records.
+        judges_variants: whether it has cells for each variant.
+        always: whether every run has its cells, with or without the study's asking.
+        main: whether tables of a report speak of it where they name no probe.
+        columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
+            Without any, no table of variants can be made of its figures.
+        contrasts: metrics in which a variant is tested against a baseline.
+        times_in_turn: whether its records have seconds of :class:`InTurn`.
+        stage: of :class:`InTurn`, the one whose seconds its figures cost.
+        picture_label: title of its pictures; the variant's name if empty.
+    """
+
+    name: ClassVar[str]
+    protocol: ClassVar[int] = 1
+    study_part: ClassVar[type[Part] | None] = None
+    variant_part: ClassVar[type[Part] | None] = None
+    metrics: ClassVar[Registry] = Registry({})
+    judges_variants: ClassVar[bool] = True
+    always: ClassVar[bool] = False
+    main: ClassVar[bool] = False
+    columns: ClassVar[Mapping[str, str]] = {}
+    contrasts: ClassVar[Sequence[str]] = ()
+    times_in_turn: ClassVar[bool] = False
+    stage: ClassVar[str] = ""
+    picture_label: ClassVar[str] = ""
+
+    # From a study to cells
+
+    def check(self, study: Study) -> None:
+        """Raise ValueError if the study asks for what this probe cannot measure.
+
+        Called for every study, with or without this probe; the message begins with the YAML's key.
+        """
+
+    def check_variant(self, study: Study, variant: Variant) -> None:
+        """Raise ValueError if a variant cannot be measured; its name is put before the message."""
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """The cells of a study: here, one for each scene, variant and seed.
+
+        Args:
+            study: with this probe.
+            names: of the variants that the study names for it.
+            scenes: by the names that the study gives them.
+
+        Raises:
+            StudyError: the study and a scene do not fit.
+        """
+        for name, scene in scenes.items():
+            for label in names:
+                variant = study.variants[label]
+                for seed in study.seeds:
+                    spec = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, variant, seed),
+                    }
+                    wanted = label in study.pictures.variants
+                    pictures = study.pictures_of(spec["views"]) if wanted else ()
+                    yield Cell(spec, name, label, self.name, seed, (label,), pictures)
+
+    def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:
+        """What the spec of every cell of this probe has."""
+        return {
+            "probe": self.name,
+            "protocol": self.protocol,
+            "scene": scene.content_hash,
+            "size": study.size,
+            "views": study.views_of(scene),
+            "seed": seed,
+        }
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """What of a study and a variant decides the figures of this probe, and nothing else: two
+        variants that differ elsewhere share a cell.
+        """
+        return {}
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """What two variants must share to mean the same to a claim about this probe."""
+        return variant.settings(), variant.geometry, study.splats_of(variant)
+
+    # From a cell to its record
+
+    @abstractmethod
+    def compute(self, work: Work) -> E:
+        """Compute a cell: figures and pictures go to ``work.add``, the rest is returned."""
+
+    def read_extra(self, data: Json) -> E:
+        """The extra of a record, from the record's JSON."""
+        return NoExtra()  # type: ignore[return-value]
+
+    def read(self, data: Json) -> Record[E]:
+        """A record of this probe from its JSON."""
+        return Record.from_json(data, self.read_extra(data))
+
+    def metric(self, key: str) -> Metric:
+        """The specification of a figure. KeyError: this probe gives no such figure."""
+        return self.metrics[key]
+
+    # From records to the report
+
+    def problems(self, results: Results) -> list[str]:
+        """What is wrong with the instrument by this probe's records, one line each."""
+        return []
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """Sections of the report; none where the run has no record of this probe."""
+        return iter(())
+
+    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
+        """Folded tables below a table of variants.
+
+        Args:
+            results: of the run.
+            names: of the variants, the baseline first.
+        """
+        return []
+
+    def in_turn(self, cell: Outcome, record: Record[E]) -> InTurn | None:
+        """Seconds of contestants, where this probe times them."""
+        return None
+
+
+def metrics_of(*prefixes: str) -> Registry:
+    """The registered metrics whose names begin with one of the prefixes."""
+    return Registry({k: m for k, m in METRICS.items() if k.startswith(prefixes)})
+
+
+def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
+    """Cells of a table: the means over scenes of a variant's metrics, with their intervals."""
+    scenes = len(results.study.scenes)
+    return [spread(results.mean(probe, name, metric), scenes) for metric in metrics]

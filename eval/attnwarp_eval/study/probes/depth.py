@@ -1,0 +1,108 @@
+"""Depth and normals of sampled splats against exact truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import ClassVar
+
+from attnwarp.warp.settings import WarpSettings
+from attnwarp.warp.view import render_surface
+from attnwarp_eval import metrics
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.study import pictures
+from attnwarp_eval.study.parts import Study, Variant
+from attnwarp_eval.study.probes import register
+from attnwarp_eval.study.probes.base import Probe, Work, mean_values, metrics_of
+from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.world import splats
+
+PLACES = (
+    "depth.abs_rel",
+    "depth.rmse",
+    "depth.bias_relative",
+    "depth.delta_1_01",
+    "depth.delta_1_25",
+    "depth.normal_median",
+)
+"""Metrics that are shown inside surfaces and at edges apart."""
+
+
+@register
+class Depth(Probe[NoExtra]):
+    """One render of splats for each view, and its error."""
+
+    name = "depth"
+    metrics = metrics_of("depth.")
+    columns: ClassVar[Mapping[str, str]] = {
+        "AbsRel": "depth.abs_rel",
+        "RMSE": "depth.rmse",
+        "bias": "depth.bias_relative",
+        "median bias inside": "depth.bias_median.interior",
+        "delta < 1.01": "depth.delta_1_01",
+        "delta < 1.25": "depth.delta_1_25",
+        "normal, deg": "depth.normal_median",
+    }
+    contrasts = (
+        "depth.abs_rel",
+        "depth.abs_rel.interior",
+        "depth.bias_median.interior",
+        "depth.normal_median",
+    )
+    stage = "render"
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """Splats, and how depth is read off them."""
+        settings = variant.settings()
+        return {
+            **surface_spec(study, variant),
+            "depth": settings.depth,
+            "depth_statistic": settings.depth_statistic,
+        }
+
+    def compute(self, work: Work) -> NoExtra:
+        """Render and measure, view by view."""
+        spec, world, meter = work.spec, work.world, work.meter
+        size = spec["size"]
+        with meter.stage("splats"):
+            model = splats(work.cell.scene, size, spec["seed"], **spec["splats"])
+        settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
+        for name in spec["views"]:
+            with meter.stage("truth"):
+                hits = world.pair(name, size).hits
+            with meter.view():
+                surface = render_surface(model, world.targets[name], settings)
+            meter.count(pixels=size * size, **surface.counters)
+            with meter.stage("checks"):
+                figures = metrics.depth_error(
+                    surface.depth,
+                    hits.depth,
+                    normal=surface.normal,
+                    true_normal=hits.normal,
+                    edge=world.edge(name),
+                )
+            work.add(name, figures, partial(pictures.of_depth, surface, hits))
+        return NoExtra()
+
+    def details(self, results: Results, names: Sequence[str]) -> list[Table]:
+        """Inside surfaces and at edges apart."""
+        regions = {"inside surfaces": "interior", "at edges": "edge"}
+        columns = ["variant", "where", *(metric.removeprefix("depth.") for metric in PLACES)]
+        rows = [
+            [
+                name,
+                title,
+                *mean_values(results, self.name, name, [f"{metric}.{region}" for metric in PLACES]),
+            ]
+            for name in names
+            for title, region in regions.items()
+        ]
+        return [Table(columns, rows, "Inside surfaces and at edges apart", folded=True)]
+
+
+def surface_spec(study: Study, variant: Variant) -> Json:
+    """Where a variant's depth comes from."""
+    if variant.geometry == "truth":
+        return {"geometry": "truth"}
+    return {"splats": study.splats_of(variant).model_dump()}

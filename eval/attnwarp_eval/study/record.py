@@ -1,0 +1,230 @@
+"""What a cell gives, typed from the probe to the report. JSON appears only in ``to_json`` and
+``from_json``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+from attnwarp_eval.files import without_nan
+
+Json = dict[str, Any]
+
+
+class Extra(Protocol):
+    """What the records of one probe hold beside figures."""
+
+    def to_json(self) -> Json:
+        """Entries of the record; those of the key ``cost`` go into the record's own cost."""
+        ...
+
+
+E = TypeVar("E", bound=Extra)
+
+
+@dataclass(frozen=True)
+class NoExtra:
+    """Of a record that holds figures alone."""
+
+    def to_json(self) -> Json:
+        """No entry."""
+        return {}
+
+
+@dataclass(frozen=True)
+class View:
+    """Figures of one target view.
+
+    Attributes:
+        name: the target's; an edit or another task may stand before it, as ``task/target``.
+        yaw: degrees from the source, in [0, 180].
+        metrics: figures by name; NaN where undefined.
+    """
+
+    name: str
+    yaw: float
+    metrics: Mapping[str, float]
+
+    def to_json(self) -> Json:
+        """As a record's file has it: null where undefined, integers as integers."""
+        return {"view": self.name, "yaw": self.yaw, "metrics": finite(self.metrics)}
+
+    @classmethod
+    def from_json(cls, data: Json) -> View:
+        """From :meth:`to_json`."""
+        return cls(data["view"], float(data["yaw"]), with_nan(data["metrics"]))
+
+
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture of one view in the run's folder.
+
+    Attributes:
+        view: its name.
+        content: what it shows, such as ``mask``.
+        path: relative to the run's folder.
+        sha256: of the file.
+    """
+
+    view: str
+    content: str
+    path: str
+    sha256: str
+
+    def to_json(self) -> Json:
+        """As a record's file has it."""
+        return {
+            "view": self.view,
+            "what": self.content,
+            "path": self.path,
+            "sha256": self.sha256,
+        }
+
+    @classmethod
+    def from_json(cls, data: Json) -> PictureFile:
+        """From :meth:`to_json`."""
+        return cls(data["view"], data["what"], data["path"], data["sha256"])
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a cell cost.
+
+    Attributes:
+        seconds: by stage; None where there was nothing to time.
+        counters: of work, such as pixels or pairs.
+        peak_memory_mb: of the process so far, MiB.
+        threads: of the renderer.
+    """
+
+    seconds: Mapping[str, float | None]
+    counters: Mapping[str, int]
+    peak_memory_mb: float
+    threads: int
+
+    def to_json(self) -> Json:
+        """As a record's file has it."""
+        return {
+            "seconds": dict(self.seconds),
+            "counters": dict(self.counters),
+            "peak_memory_mb": self.peak_memory_mb,
+            "threads": self.threads,
+        }
+
+    @classmethod
+    def from_json(cls, data: Json) -> Cost:
+        """From :meth:`to_json`; entries of a probe's own beside it are left alone."""
+        return cls(data["seconds"], data["counters"], data["peak_memory_mb"], data["threads"])
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Where a cell was computed.
+
+    Attributes:
+        versions: of Python and packages.
+        machine: ``system``, ``arch`` and ``cores``.
+        revision: of the source; None for an installed copy.
+        dirty: whether the source had local changes.
+    """
+
+    versions: Mapping[str, str]
+    machine: Mapping[str, Any]
+    revision: str | None
+    dirty: bool | None
+
+    def to_json(self) -> Json:
+        """As a record's file has it, and as :func:`attnwarp_eval.cost.environment` gives it."""
+        return {
+            "versions": dict(self.versions),
+            "machine": dict(self.machine),
+            "git": {"sha": self.revision, "dirty": self.dirty},
+        }
+
+    @classmethod
+    def from_json(cls, data: Json) -> Environment:
+        """From :meth:`to_json`."""
+        return cls(data["versions"], data["machine"], data["git"]["sha"], data["git"]["dirty"])
+
+    def same_code(self, other: Environment) -> bool:
+        """Whether both were computed by the same state of the source."""
+        return (self.revision, self.dirty) == (other.revision, other.dirty)
+
+
+@dataclass(frozen=True)
+class Record(Generic[E]):
+    """The result of one cell.
+
+    Attributes:
+        id, spec: of the cell; see :class:`attnwarp_eval.study.cell.Cell`.
+        views: figures by view.
+        pictures: files of the run's folder.
+        cost, environment: what it took, and where.
+        extra: what only this probe's records hold.
+    """
+
+    id: str
+    spec: Json
+    views: tuple[View, ...]
+    pictures: tuple[PictureFile, ...]
+    cost: Cost
+    environment: Environment
+    extra: E
+
+    def to_json(self) -> Json:
+        """For :meth:`attnwarp_eval.study.store.Store.write`."""
+        own = self.extra.to_json()
+        cost = {**self.cost.to_json(), **own.pop("cost", {})}
+        return {
+            "id": self.id,
+            "spec": self.spec,
+            "views": [view.to_json() for view in self.views],
+            "pictures": [picture.to_json() for picture in self.pictures],
+            **own,
+            "cost": cost,
+            "environment": self.environment.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Json, extra: E) -> Record[E]:
+        """From :meth:`to_json`, with the extra that its probe has read."""
+        return cls(
+            data["id"],
+            data["spec"],
+            tuple(map(View.from_json, data["views"])),
+            tuple(map(PictureFile.from_json, data.get("pictures", []))),
+            Cost.from_json(data["cost"]),
+            Environment.from_json(data["environment"]),
+            extra,
+        )
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a cell has no record."""
+
+    scene: str
+    variant: str
+    probe: str
+    error: str
+    title: str = ""
+    traceback: str = field(default="", repr=False)
+
+    @classmethod
+    def from_json(cls, data: Json) -> Failure:
+        """From a failure's file."""
+        names = ("scene", "variant", "probe", "error", "title", "traceback")
+        return cls(**{name: str(data.get(name, "")) for name in names})
+
+
+def finite(figures: Mapping[str, float]) -> dict[str, float | int | None]:
+    """Numbers that JSON has: null for NaN and infinities."""
+    return dict(without_nan(figures))
+
+
+def with_nan(figures: Mapping[str, float | int | None]) -> dict[str, float]:
+    """The figures of :func:`finite` again: NaN for null."""
+    return {name: math.nan if value is None else value for name, value in figures.items()}

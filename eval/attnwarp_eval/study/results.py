@@ -1,0 +1,122 @@
+"""A run's records as tables of numbers: variant x scene x view -> value."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.study.parts import Study
+from attnwarp_eval.study.record import Failure, Record
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """An expected cell of a run.
+
+    Attributes:
+        id, title, scene, probe, seed: of the cell.
+        variants: every name that the study gives to its content.
+        record: None where the cell is not done.
+    """
+
+    id: str
+    title: str
+    scene: str
+    variants: tuple[str, ...]
+    probe: str
+    seed: int
+    record: Record[Any] | None
+
+
+@dataclass(frozen=True)
+class Results:
+    """The finished cells of a run.
+
+    Attributes:
+        study: the resolved study.
+        cells: one entry an expected cell, in the study's order.
+        failures: the table of failed cells.
+    """
+
+    study: Study
+    cells: list[Outcome]
+    failures: list[Failure]
+
+    @property
+    def layer(self) -> int:
+        """The feature grid that tables show: an eighth of the image, as in a diffusion UNet, or the
+        next smaller one.
+        """
+        size, sizes = self.study.size, self.study.feature_sizes
+        return (
+            size // 8
+            if size // 8 in sizes
+            else max((s for s in sizes if s < size), default=max(sizes))
+        )
+
+    @property
+    def measured(self) -> int:
+        """How many of the expected cells are done."""
+        return len(self.all_records())
+
+    def all_records(self) -> list[Record[Any]]:
+        """Records of the finished cells, in the study's order."""
+        return [cell.record for cell in self.cells if cell.record is not None]
+
+    def finished(self, probe: str) -> list[tuple[Outcome, Record[Any]]]:
+        """The finished cells of a probe with their records, in the study's order."""
+        return [
+            (cell, cell.record)
+            for cell in self.cells
+            if cell.probe == probe and cell.record is not None
+        ]
+
+    def records(self, probe: str, variant: str) -> list[tuple[str, int, Record[Any]]]:
+        """(scene, seed, record) of the finished cells of a variant, in the study's order."""
+        return [
+            (cell.scene, cell.seed, record)
+            for cell, record in self.finished(probe)
+            if variant in cell.variants
+        ]
+
+    def views(
+        self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None
+    ) -> dict[str, dict[str, float]]:
+        """Scene -> view (and seed) -> value; NaN where undefined.
+
+        Args:
+            probe, variant: whose records.
+            metric: the figure's name.
+            yaw: closed range of degrees that a view's yaw from the source must lie in; any if None.
+        """
+        table: dict[str, dict[str, float]] = {}
+        for scene, seed, record in self.records(probe, variant):
+            for view in record.views:
+                if yaw is None or yaw[0] <= view.yaw <= yaw[1]:
+                    value = view.metrics.get(metric, math.nan)
+                    table.setdefault(scene, {})[f"{view.name}/{seed}"] = float(value)
+        return table
+
+    def mean(self, probe: str, variant: str, metric: str) -> Interval:
+        """Mean over scenes of a variant's metric, with its interval."""
+        table = self.views(probe, variant, metric)
+        return interval({scene: list(values.values()) for scene, values in table.items()})
+
+    def seconds(self, probe: str, variant: str, stage: str) -> dict[str, float]:
+        """Scene -> seconds of a stage ("steady", "warm", ...), mean over seeds."""
+        by_scene: dict[str, list[float]] = {}
+        for scene, _, record in self.records(probe, variant):
+            value = record.cost.seconds.get(stage)
+            if value is not None:
+                by_scene.setdefault(scene, []).append(float(value))
+        return {scene: sum(v) / len(v) for scene, v in by_scene.items()}
+
+    def counters(self, probe: str, variant: str) -> Counter[str]:
+        """Work counters summed over a variant's cells."""
+        total: Counter[str] = Counter()
+        for _, _, record in self.records(probe, variant):
+            total.update(record.cost.counters)
+        return total
