@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -209,11 +209,12 @@ def accuracy(
     refinement, visibility.
     """
     with clear_errors():
-        from attnwarp_eval.experiments import accuracy as truth
+        from attnwarp_eval.experiments.accuracy import measure
+        from attnwarp_eval.experiments.accuracy.write import write
 
-        with progress() as show:
-            panels = truth.measure(scenes or (), rounds=rounds, progress=show.step)
-        for path in truth.write(panels, out):
+        with progress() as show, resumable(lambda: "finished panels are kept"):
+            panels = list(measure(scenes or (), out=out, rounds=rounds, progress=show))
+        for path in write(panels, out):
             typer.echo(path)
 
 
@@ -235,17 +236,15 @@ def flow(
 ) -> None:
     """How far consistency along optical flow is from that at exact correspondences."""
     with clear_errors():
-        from attnwarp.check import one_of
         from attnwarp.errors import InputError
         from attnwarp_eval.experiments import flow as study
         from attnwarp_eval.experiments import flow_report
 
         try:
             angles = [float(yaw) for yaw in names(yaws) or []]
-            one_of(method, ("dis", "farneback"), "--method")
         except ValueError as error:
-            raise InputError(f"{error}; see attnwarp-eval scenes flow --help") from None
-        options = study.Options(size, spp, method, pictures)
+            raise InputError(f"--yaws: {error}; expected degrees such as 5,20") from None
+        options = study.Options(size, spp, cast(study.Method, method), pictures)
         with (
             progress(lines=True) as show,
             resumable(lambda: "finished pairs are kept"),

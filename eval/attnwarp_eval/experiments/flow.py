@@ -13,7 +13,7 @@ from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,8 @@ from attnwarp_eval.files import without_nan, write_picture
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.store import Store
+
+Method = Literal["dis", "farneback"]
 
 PROTOCOL = 1
 """Raised whenever the same inputs would give other rows."""
@@ -96,7 +98,7 @@ class Options:
 
     size: int = 256
     spp: int = 32
-    method: str = "dis"
+    method: Method = "dis"
     pictures: bool = True
 
 
@@ -122,6 +124,10 @@ def measure(
     Raises:
         InputError: another scene than :data:`SCENES`; another run is writing to ``out``.
     """
+    if options.method not in get_args(Method):
+        raise InputError(
+            f"--method: got {options.method!r}, expected one of {', '.join(get_args(Method))}"
+        )
     for name in scenes:
         if name not in SCENES:
             raise InputError(f"scene {name!r}: expected one of {', '.join(SCENES)}")

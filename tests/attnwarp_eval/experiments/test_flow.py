@@ -97,7 +97,7 @@ def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_p
     [
         (["--yaws", "x"], "could not convert string to float: 'x'"),
         (["--yaws", ","], "--yaws: got none"),
-        (["--method", "diss"], "--method: got 'diss', expected one of 'dis', 'farneback'"),
+        (["--method", "diss"], "--method: got 'diss', expected one of dis, farneback"),
         (["fog"], "scene 'fog': expected one of bear, dinosaur, person"),
     ],
 )
