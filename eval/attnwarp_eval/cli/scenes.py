@@ -159,10 +159,11 @@ def effects(
     with clear_errors():
         from attnwarp_eval.effects import detect as light
         from attnwarp_eval.effects.proof import prove as hold
+        from attnwarp_eval.effects.saving import measure
         from attnwarp_eval.scene.file import load_scene
 
         loaded = load_scene(str(scene))
-        about = light.report(loaded, cost=light.measure(loaded))
+        about = light.report(loaded, cost=measure(loaded))
         proof = hold(loaded, seconds=budget) if prove else None
     if proof is not None:
         about["proof"] = proof.to_dict()

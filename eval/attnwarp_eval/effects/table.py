@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.cache import content_key
-from attnwarp_eval.effects.detect import detect, measure
+from attnwarp_eval.effects.detect import detect
+from attnwarp_eval.effects.saving import measure
 from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for

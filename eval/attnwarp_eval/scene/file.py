@@ -12,7 +12,8 @@ from pydantic import BaseModel, ValidationError
 
 from attnwarp.camera import Camera
 from attnwarp.errors import suggest
-from attnwarp_eval.scene import edits, shapes
+from attnwarp_eval.scene import edits
+from attnwarp_eval.scene.meshes import MESH_SUFFIXES
 from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, view_name
 from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec, SkySpec
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
@@ -243,11 +244,11 @@ def _check(scene: Scene, root: yaml.Node) -> None:
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
             where = ("objects", k, "shape", "file")
-            if path.suffix.lower() not in shapes.MESH_SUFFIXES:
-                near = suggest(path.suffix.lower(), shapes.MESH_SUFFIXES)
+            if path.suffix.lower() not in MESH_SUFFIXES:
+                near = suggest(path.suffix.lower(), MESH_SUFFIXES)
                 refuse(
                     f"objects[{k}].shape.file: {item.shape.file!r} is not of a known mesh"
-                    f" format{near}; one of {', '.join(shapes.MESH_SUFFIXES)}",
+                    f" format{near}; one of {', '.join(MESH_SUFFIXES)}",
                     *where,
                 )
             if not path.is_file():

@@ -15,11 +15,12 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError, suggest
 from attnwarp_eval.cache import content_key
-from attnwarp_eval.scene import shapes
+from attnwarp_eval.scene.base import Vector
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.edits import apply, pick
-from attnwarp_eval.scene.materials import Vector
-from attnwarp_eval.scene.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.meshes import read_mesh
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.solids import MESHING_PROTOCOL
 from attnwarp_eval.scene.spec import (
     BoxSpec,
     CamerasSpec,
@@ -203,7 +204,7 @@ class Scene:
             case MeshSpec():
                 path = self.mesh_path(spec)
                 try:
-                    mesh = shapes.read_mesh(path)
+                    mesh = read_mesh(path)
                 except ValueError as error:
                     raise SceneError(str(error), self.path) from error
                 upright = (

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from attnwarp_eval.scene.base import LATER, Color, Direction, Positive, Spec, Vector
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.materials import (
     TEXTURED,
@@ -20,12 +21,10 @@ from attnwarp_eval.scene.materials import (
     Material,
     MediumSpec,
     PointSpec,
-    Positive,
     SpotSpec,
-    Vector,
 )
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
-from attnwarp_eval.scene.textures import LATER, Color, Direction, Plain, Spec, Texture
+from attnwarp_eval.scene.textures import Plain, Texture
 
 
 class SphereSpec(Spec):

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from attnwarp_eval.scene.base import Color, Positive, Spec, linear_rgb
 from attnwarp_eval.scene.shapes import Mesh
-from attnwarp_eval.scene.textures import Color, Spec, fractal_noise, lattice_noise, linear_rgb
+from attnwarp_eval.scene.textures import fractal_noise, lattice_noise
 
 Array = npt.NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0)]
 Height = Callable[[Array], Array]
 """(N, 2) places to (N,) heights."""
 

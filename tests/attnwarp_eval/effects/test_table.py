@@ -13,7 +13,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.effects import detect, table
+from attnwarp_eval.effects import detect, saving, table
 from attnwarp_eval.effects.table import Settings, collect, side_by_side
 from attnwarp_eval.truth.plan import plan
 
@@ -23,7 +23,7 @@ def small(monkeypatch):
     monkeypatch.setattr(table, "PICTURE_SIZE", 16)
     monkeypatch.setattr(table, "PLAN_SAMPLES", 16)
     monkeypatch.setattr(table, "FULL_SAMPLES", 16)
-    monkeypatch.setattr(table, "measure", functools.partial(detect.measure, size=16, spp=4))
+    monkeypatch.setattr(table, "measure", functools.partial(saving.measure, size=16, spp=4))
 
 
 def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, tmp_path):
@@ -71,10 +71,10 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     # Synthetic renderings: the capped ones have mean 0.8, those without a cap 1; noise and time are
     # planted.
     scene = make([FLOOR, ball()], [SKY], 1, size=8)
-    free = detect.everything_on(scene.with_size(8, 8), 4, capped=False)
-    full = detect.everything_on(scene.with_size(8, 8), 4)
+    free = saving.everything_on(scene.with_size(8, 8), 4, capped=False)
+    full = saving.everything_on(scene.with_size(8, 8), 4)
     clock = [0.0]
-    monkeypatch.setattr(detect.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(saving.time, "perf_counter", lambda: clock[0])
 
     def render(scene, camera, made, seed):
         mean, noise, seconds = (
@@ -87,8 +87,8 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
         clock[0] += seconds * (1 + seed % 5)  # the machine is slow in some rounds, for all alike
         return mean + noise * np.random.default_rng((seed, int(seconds))).standard_normal((8, 8, 3))
 
-    monkeypatch.setattr(detect, "render_plan", render)
-    cost = detect.measure(scene, size=8, spp=4, rounds=40)
+    monkeypatch.setattr(saving, "render_plan", render)
+    cost = saving.measure(scene, size=8, spp=4, rounds=40)
     low, high = cost.cap.bias_interval
     # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192)
     # = 0.054 %.
@@ -112,17 +112,17 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     )
     row = table._times(json.loads(json.dumps(cost.to_dict())))
     assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
-    endless = detect.measure(
+    endless = saving.measure(
         make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3
     )
     assert endless.cap is None and table._times(endless.to_dict())[2] == "no cap"
 
 
 def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak_of():
-    bias, (low, high) = detect._cut(np.full(5, 0.5), np.full(5, 1.0))
+    bias, (low, high) = saving._cut(np.full(5, 0.5), np.full(5, 1.0))
     assert bias == low == high == pytest.approx(-0.5, rel=1e-12)
-    assert detect._cut(np.zeros(5), np.ones(5)) == (None, None)
-    assert detect._cut(np.ones(1), np.ones(1)) == (None, None)
+    assert saving._cut(np.zeros(5), np.ones(5)) == (None, None)
+    assert saving._cut(np.ones(1), np.ones(1)) == (None, None)
 
 
 def test_the_interval_of_the_light_cut_off_is_scipys():
@@ -131,7 +131,7 @@ def test_the_interval_of_the_light_cut_off_is_scipys():
         np.random.default_rng(1).uniform(0.95, 1.05, 9),
     )
     theirs = stats.ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.95)
-    bias, ours = detect._cut(a, b)
+    bias, ours = saving._cut(a, b)
     assert np.allclose(np.expm1(theirs), ours, rtol=1e-9) and ours[0] < bias < ours[1]
 
 

@@ -7,17 +7,9 @@ import numpy as np
 import pytest
 
 from attnwarp_eval import cache
-from attnwarp_eval.scene.shapes import (
-    Box,
-    Capsule,
-    Ellipsoid,
-    Mesh,
-    MeshNotice,
-    Sphere,
-    body_distance,
-    mesh_body,
-    read_mesh,
-)
+from attnwarp_eval.scene.meshes import read_mesh
+from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Sphere
+from attnwarp_eval.scene.solids import Capsule, Ellipsoid, body_distance, mesh_body
 
 BALL = [Ellipsoid((0.3, -0.2, 1.0), (0.5, 0.5, 0.5))]
 
@@ -210,7 +202,7 @@ def test_a_body_is_meshed_once_and_read_back_bit_for_bit(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     first = mesh_body(BALL, 0.0, 16)
     assert len(list((tmp_path / "meshes").iterdir())) == 1
-    monkeypatch.setattr("attnwarp_eval.scene.shapes._march", lambda *_: pytest.fail("meshed again"))
+    monkeypatch.setattr("attnwarp_eval.scene.solids._march", lambda *_: pytest.fail("meshed again"))
     second = mesh_body(BALL, 0.0, 16)
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(
         first.faces, second.faces

@@ -11,11 +11,12 @@ import pytest
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.effects import detect
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import DiffuseMaterial, PlasticMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SphereSpec
-from attnwarp_eval.scene.textures import albedo, linear_rgb
+from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.truth.mitsuba import render_plan
 from attnwarp_eval.truth.plan import plan
