@@ -85,8 +85,10 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
     """Welch (1947) with Satterthwaite's degrees of freedom, along the first axis.
 
     Args:
-        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Where neither varies, p is 1 for
-            equal values (within ``ROUNDING``) and 0 for others.
+        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Values that do not vary at all
+            have p = 1 where they are equal within ``ROUNDING`` and 0 elsewhere. Values that vary by
+            less than ``ROUNDING``, such as those of a smooth sky, are tested as all others are, but
+            for a part of their difference that may be rounding.
     """
     from scipy import stats
 
@@ -97,19 +99,29 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
         )
     va, vb = first.var(0, ddof=1) / len(first), second.var(0, ddof=1) / len(second)
     difference, variance = second.mean(0) - first.mean(0), va + vb
-    floor = (ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))) ** 2
-    still = variance <= floor
+    rounding = ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))
+    error = np.sqrt(variance)
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = np.where(
-            still, np.inf, variance**2 / (va**2 / (len(first) - 1) + vb**2 / (len(second) - 1))
+            variance > 0,
+            variance**2 / (va**2 / (len(first) - 1) + vb**2 / (len(second) - 1)),
+            np.inf,
         )
-        t = np.abs(difference) / np.sqrt(variance)
         p = np.where(
-            still,
-            np.where(difference**2 <= floor, 1.0, 0.0),
-            2 * stats.t.sf(t, np.minimum(freedom, 1e9)),
+            variance > 0,
+            2 * stats.t.sf(_beyond(difference, error, rounding) / error, np.minimum(freedom, 1e9)),
+            np.where(np.abs(difference) <= rounding, 1.0, 0.0),
         )
-    return Welch(difference, np.sqrt(variance), freedom, p)
+    return Welch(difference, error, freedom, p)
+
+
+def _beyond(difference: Array, error: Array, rounding: Array) -> Array:
+    """What of a difference is to be explained by noise: all of it, or where the noise is below the
+    rounding, what is beyond the rounding.
+    """
+    return np.where(
+        error > rounding, np.abs(difference), np.maximum(np.abs(difference) - rounding, 0.0)
+    )
 
 
 def sidak(alpha: float, tests: int) -> float:
@@ -261,11 +273,11 @@ def paired(a: npt.ArrayLike, b: npt.ArrayLike) -> Paired:
     d = (second - first) / scale
     error = float(d.std(ddof=1) / math.sqrt(len(d)))
     mean = float(d.mean())
-    p = (
-        float(2 * stats.t.sf(abs(mean) / error, len(d) - 1))
-        if error > ROUNDING
-        else float(abs(mean) <= ROUNDING)
-    )
+    if error > 0:
+        beyond = float(_beyond(np.array(mean), np.array(error), np.array(ROUNDING)))
+        p = float(2 * stats.t.sf(beyond / error, len(d) - 1))
+    else:
+        p = float(abs(mean) <= ROUNDING)
     return Paired(mean, error, p, len(d))
 
 
