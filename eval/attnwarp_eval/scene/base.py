@@ -18,9 +18,16 @@ from pydantic import (
 
 from attnwarp_eval.colors import to_linear
 
-Vector = tuple[float, float, float]
+FARTHEST = 1e9
+"""Largest coordinate or length, in scene units. Float64 resolves 1e-7 there; the squares and
+products of much larger ones overflow the float32 of what renders them."""
 
-Positive = Annotated[float, Field(gt=0)]
+# Strict: YAML's true, and a number in quotes, are mistakes.
+Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, strict=True)]
+
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+
+Positive = Annotated[float, Field(gt=0, le=FARTHEST, strict=True)]
 
 
 def _hex(value: Any) -> str:
@@ -41,7 +48,7 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value
 
 
-Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
+Direction = Annotated[Vector, AfterValidator(_direction)]
 """A vector of any length but zero."""
 
 Color = Annotated[str, BeforeValidator(_hex)]
