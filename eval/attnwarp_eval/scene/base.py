@@ -22,12 +22,23 @@ FARTHEST = 1e9
 """Largest coordinate or length, in scene units. Float64 resolves 1e-7 there; the squares and
 products of much larger ones overflow the float32 of what renders them."""
 
-# Strict: YAML's true, and a number in quotes, are mistakes.
-Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST, strict=True)]
+
+def _no_truth(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"got {str(value).lower()}, expected a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_truth)]
+"""A number, which yes and true are not. YAML reads 1e3 as text, so that text of a number counts."""
+
+Coordinate = Annotated[Number, Field(ge=-FARTHEST, le=FARTHEST)]
 
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 
-Positive = Annotated[float, Field(gt=0, le=FARTHEST, strict=True)]
+Positive = Annotated[Number, Field(gt=0, le=FARTHEST)]
+
+Length = Annotated[Number, Field(ge=0, le=FARTHEST)]
 
 
 def _hex(value: Any) -> str:

@@ -13,10 +13,10 @@ from pydantic import Field, model_validator
 
 from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.base import (
-    FARTHEST,
     LATER,
     Color,
     Coordinate,
+    Length,
     Positive,
     Spec,
     Vector,
@@ -24,8 +24,6 @@ from attnwarp_eval.scene.base import (
 )
 from attnwarp_eval.scene.shapes import Mesh
 from attnwarp_eval.scene.textures import lattice_noise
-
-Width = Annotated[float, Field(ge=0, le=FARTHEST, strict=True)]
 
 
 class RingSpec(Spec):
@@ -54,7 +52,7 @@ class _PartSpec(Spec):
 
     mirror: bool = False
     color: Color = "#ffffff"
-    blend: bool | Width = True
+    blend: bool | Length = True
     carve: bool = Field(False, json_schema_extra=LATER)
     ring: RingSpec | None = Field(None, json_schema_extra=LATER)
 
@@ -87,7 +85,7 @@ class BlockPart(_TurnedPart):
 
     type: Literal["block"]
     size: tuple[Positive, Positive, Positive]
-    round: Width = 0.0
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> BlockPart:
@@ -105,7 +103,7 @@ class DiscPart(_TurnedPart):
     type: Literal["disc"]
     radius: Positive
     height: Positive
-    round: Width = 0.0
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> DiscPart:
@@ -164,7 +162,7 @@ class BodySpec(Spec):
 
     type: Literal["body"]
     parts: tuple[PartSpec, ...] = Field(min_length=1)
-    blend: Width = 0.1
+    blend: Length = 0.1
     resolution: int = Field(128, ge=8, le=512)
     position: Vector = (0.0, 0.0, 0.0)
     yaw: float = 0.0

@@ -145,7 +145,7 @@ class SkySpec(Spec):
 LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discriminator="type")]
 
 
-Pixels = Annotated[int, Field(le=65536, strict=True)]
+Pixels = Annotated[int, Field(le=65536)]
 
 
 class ViewSpec(Spec):

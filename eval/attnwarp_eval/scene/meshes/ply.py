@@ -30,9 +30,14 @@ def read_ply(data: bytes) -> Surface:
     stream = io.BytesIO(data)
     try:
         ply = PlyData.read(stream)
-        rest = len(data) - stream.tell()
-        if data[stream.tell() :].strip(b"\0\r\n\t "):
-            raise ValueError(f"{rest} bytes follow its last element")
+        if ply.text:
+            body = data[data.index(b"\n", len(header)) :] if b"\n" in data[len(header) :] else b""
+            lines = sum(bool(line.strip()) for line in body.splitlines())
+            announced = sum(element.count for element in ply.elements)
+            if lines != announced:
+                raise ValueError(f"announces {announced} items, but {lines} lines follow")
+        elif data[stream.tell() :].strip(b"\0\r\n\t "):
+            raise ValueError(f"{len(data) - stream.tell()} bytes follow its last element")
     except (PlyParseError, ValueError, OverflowError, KeyError, TypeError, IndexError) as error:
         raise ValueError(f"damaged PLY: {' '.join(str(error).split())}") from error
     names = [element.name for element in ply.elements]

@@ -53,13 +53,17 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
             continue
         points = vertices[index]
         normal = _newell(points)
-        for k in np.flatnonzero(~_convex(points, normal)).tolist():
+        spoke = points[:, 1:] - points[:, :1]
+        area = np.linalg.norm(np.cross(spoke[:, :-1], spoke[:, 1:]), axis=-1).sum(1)
+        # What turns both ways by as much, as a bow tie does, has no normal but triangles with area.
+        whole = np.linalg.norm(normal, axis=-1) >= 1e-9 * area
+        for k in np.flatnonzero(~(_convex(points, normal) & whole)).tolist():
             if size > MOST_CORNERS:
                 raise ValueError(
                     f"polygon {group[k]} is concave and has {size} corners, more than"
                     f" {MOST_CORNERS}; split it"
                 )
-            ears = _ears(_flat(points[k], normal[k]))
+            ears = _ears(_flat(points[k], normal[k])) if whole[k] else ()
             if len(ears):
                 faces[row[group[k]] + np.arange(size - 2)] = index[k][ears]
             else:
@@ -86,8 +90,8 @@ def _convex(points: Array, normal: Array) -> npt.NDArray[np.bool_]:
     turn = np.einsum("gki,gi->gk", np.cross(edge, np.roll(edge, -1, axis=1)), normal)
     spoke = points[:, 1:] - points[:, :1]
     fan = np.einsum("gki,gi->gk", np.cross(spoke[:, :-1], spoke[:, 1:]), normal)
-    # Rounding of corners on a straight line is no turn.
-    slack = 1e-12 * np.einsum("gi,gi->g", normal, normal)[:, None]
+    length = np.einsum("gi,gi->g", normal, normal)
+    slack = 1e-12 * length[:, None]  # rounding of corners on a straight line is no turn
     return (turn >= -slack).all(1) & (fan >= -slack).all(1)
 
 

@@ -43,6 +43,7 @@ class MeshFile:
         flat: triangles left out because they have no area.
         unused: vertices that no polygon names.
         ignored: what else the file holds and nobody uses, in words.
+        cut_off: why polygons may be missing at the file's end, or None.
     """
 
     mesh: Mesh
@@ -51,6 +52,7 @@ class MeshFile:
     flat: int
     unused: int
     ignored: tuple[str, ...]
+    cut_off: str | None
 
     def __str__(self) -> str:
         left_out = [
@@ -66,6 +68,7 @@ class MeshFile:
             f"{self.polygons} polygons in, {len(self.mesh.faces)} triangles out"
             + (f"; left out: {', '.join(left_out)}" if left_out else "")
             + (f"; not used: {', '.join(self.ignored)}" if self.ignored else "")
+            + (f"; {self.cut_off}, so that its end may be missing" if self.cut_off else "")
         )
 
 
@@ -136,7 +139,8 @@ def read_mesh_file(path: Path) -> MeshFile:
         len(faces) - len(mesh.faces),
         unused,
         surface.ignored,
+        surface.cut_off,
     )
-    if result.crossed or result.flat or result.unused or result.ignored:
+    if result.crossed or result.flat or result.unused or result.ignored or result.cut_off:
         warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
     return result
