@@ -1,26 +1,36 @@
-# Every target makes .venv first (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
+# Every target makes .venv first, with the extras it needs (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
 SHELL := /bin/bash
 BIN := .venv/bin
 RUN ?= runs/demo
-# A worker of the demo needs up to 3 GB.
+# Worker processes of the demo and of the tests; each needs up to 3 GB.
 JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m < 1 ? 1 : m < n ? m : n }' /proc/meminfo)
 
-.PHONY: demo test test-all bench lint venv clean
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
+
+.PHONY: demo test test-all bench docs lint venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
-demo: venv
+demo:
+	@scripts/venv.sh edit,eval
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
-## lint, types and the tests that fit in a coffee break
+## lint, types, layers, and the tests that fit in a coffee break (docs/testing.md)
 test: lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 ## everything, the thorough checks too
 test-all: lint
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
+## every benchmark, one after the other
 bench: venv
-	$(BIN)/python -m benchmarks.render
+	@for file in $$(grep -l '__main__' benchmarks/*.py); do \
+		$(BIN)/python -m "benchmarks.$$(basename "$$file" .py)" || exit; \
+	done
+
+## the documents and the reference of both packages as a site: build/site/index.html
+docs: venv
+	$(BIN)/mkdocs build --strict --quiet
 
 lint: venv
 	$(BIN)/ruff check .

@@ -40,6 +40,15 @@ class Camera:
         ValueError: a wrong shape, a value that is not finite, a focal length that is not positive,
             a last row that is not [0, 0, 0, 1] ([0, 0, 1] for K), a rotation that is not
             orthonormal to 1e-5 or mirrors.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> camera = Camera.look_at((0, -4, 0), (0, 0, 0), width=8, height=6, fov_y=60)
+        >>> xy, z = camera.project([0.0, 0.0, 0.0])
+        >>> xy.round(9).tolist(), float(z)
+        ([4.0, 3.0], 4.0)
+        >>> camera.resize(16, 12).project([0.0, 0.0, 0.0])[0].round(9).tolist()
+        [8.0, 6.0]
     """
 
     K: Array

@@ -5,31 +5,43 @@ from __future__ import annotations
 import functools
 import io
 import json
+import os
 import signal
+import sys
+import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
+from attnwarp.errors import InputWarning
+
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
+    from attnwarp.gaussians import Gaussians
     from attnwarp.io import Dataset
 
 USAGE = 2
 """Exit code of everything that a person can mend: arguments, files, folders."""
 
 STOPPED = 130
-"""Exit code of a fit that was asked to stop and wrote what it had, as shells have it for Ctrl-C."""
+"""Exit code after Ctrl-C or a polite kill, as shells have it for Ctrl-C."""
+
+CLOSED_PIPE = 141
+"""Exit code when nobody reads the output any more (128 + SIGPIPE, as shells have it)."""
 
 app = typer.Typer(
     name="attnwarp",
-    help="Gaussian splats for consistent 3D scene editing: fit them to pictures, render them.",
+    help=(
+        "Gaussian splats for consistent 3D scene editing: fit them to pictures, render and convert"
+        " them."
+    ),
     epilog=(
-        "Exit codes: 0 done, 2 wrong usage or input, 130 stopped by Ctrl-C with everything so far"
-        " written."
+        "Exit codes: 0 done, 2 wrong usage or input, 130 stopped by Ctrl-C or kill with everything"
+        " so far written, 141 output pipe closed."
     ),
     no_args_is_help=True,
     add_completion=False,
@@ -44,6 +56,56 @@ class Kind(StrEnum):
     three = "3dgs"
 
 
+class Format(StrEnum):
+    """What a person may type for the format of a data set."""
+
+    transforms = "transforms"
+    colmap = "colmap"
+
+
+class MissingImages(StrEnum):
+    """What a person may type for what happens to cameras without a picture."""
+
+    error = "error"
+    none = "none"
+
+
+class Coordinates(StrEnum):
+    """What a person may type for the coordinates in a file of splats."""
+
+    auto = "auto"
+    world = "world"
+    relative = "relative"
+
+
+FormatOption = Annotated[
+    Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")
+]
+ImagesOption = Annotated[Path | None, typer.Option(help="Folder of the images of a COLMAP model.")]
+ResizeOption = Annotated[
+    bool, typer.Option("--resize-cameras", help="Fit cameras to images of another size.")
+]
+IgnoreOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--ignore-key", metavar="KEY", help="Pass over this key of a transforms.json (mask_path)."
+    ),
+]
+MissingOption = Annotated[
+    MissingImages, typer.Option(help="none: leave out cameras whose image is not there.")
+]
+SplatKindOption = Annotated[
+    Kind | None, typer.Option(help="Read the file as this kind, whatever it says of itself.")
+]
+AntialiasedOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--antialiased/--no-antialiased",
+        help="Whether the splats were fitted antialiased, whatever the file says.",
+    ),
+]
+
+
 def fail(message: str) -> typer.Exit:
     """Say what went wrong on stderr; raise what this returns."""
     typer.echo(f"attnwarp: {message}", err=True)
@@ -51,19 +113,60 @@ def fail(message: str) -> typer.Exit:
 
 
 @contextmanager
-def clear_errors() -> Iterator[None]:
-    """Turn errors about a person's input into one clear line and exit code 2."""
+def clear_errors(stopped: str = "stopped; nothing was written") -> Iterator[None]:
+    """Turn errors about a person's input into one clear line and exit code 2.
+
+    Args:
+        stopped: what is said after Ctrl-C or a polite kill.
+    """
+    printed: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+        if issubclass(category, InputWarning) and str(message) not in printed:
+            printed.add(str(message))
+            typer.echo(f"attnwarp: warning: {message}", err=True)
+
+    def terminate(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGTERM, terminate)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", InputWarning)
+            warnings.showwarning = show
+            yield
+    except typer.Exit:  # a RuntimeError too
+        raise
+    except KeyboardInterrupt:
+        typer.echo(f"attnwarp: {stopped}", err=True)
+        raise typer.Exit(STOPPED) from None
+    except BrokenPipeError:
+        raise _closed_pipe() from None
+    except ImportError as error:
+        package = error.name or str(error)
+        raise fail(f"needs the package {package}: pip install {package.split('.')[0]}") from None
+    except MemoryError:
+        raise fail("the memory does not suffice; use smaller pictures or fewer splats") from None
     except (ValueError, RuntimeError) as error:
         raise fail(str(error)) from None
     except OSError as error:
         if error.strerror is None:  # the library's own, which says what to do
             raise fail(str(error)) from None
-        where = f"{error.filename}: " if error.filename else ""
-        raise fail(
-            f"{where}{error.strerror}; check the path, the space on its disk and its permissions"
-        ) from None
+        raise fail(_file_error(error)) from None
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _file_error(error: OSError) -> str:
+    name = f"{error.filename}: " if error.filename else ""
+    return f"{name}{error.strerror}; check the path, the space on its disk and its permissions"
+
+
+def _closed_pipe() -> typer.Exit:
+    """Let what is still to be flushed go nowhere, as the reader of the output has gone."""
+    with suppress(OSError, ValueError):  # no real stream, as under a test's runner
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return typer.Exit(CLOSED_PIPE)
 
 
 def _check_out(out: Path) -> None:
@@ -133,14 +236,35 @@ def fit(
     restart: Annotated[
         bool, typer.Option("--restart", help="Begin again, whatever is in the folder.")
     ] = False,
+    third_scale: Annotated[
+        float | None,
+        typer.Option(help="2dgs: third scale in the PLY, for viewers of 3DGS (1e-6)."),
+    ] = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
-    with clear_errors():
+    with clear_errors(
+        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
+    ):
         # What needs nothing heavy is read first: a typing error is answered at once.
-        given = _assignments(change or [])
+        changes = _assignments(change or [])
         _check_out(out)
+        _check_third_scale(third_scale, kind)
         _use_threads(threads)
+        dataset = _read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+        )
         result = _fit(
+            dataset,
             data,
             out,
             kind,
@@ -151,22 +275,33 @@ def fit(
             points,
             hold_out,
             seed,
-            given,
+            changes,
             checkpoint_seconds,
             restart,
+            third_scale,
         )
-    last = result.history[-1]
-    held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
-    typer.echo(
-        f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations in "
-        f"{result.seconds:.0f} s{held}"
-    )
-    if result.stopped == "asked":
-        typer.echo("stopped; the same command goes on from here", err=True)
-        raise typer.Exit(STOPPED)
+        last = result.history[-1]
+        held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
+        typer.echo(
+            f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
+            f" in {result.seconds:.0f} s{held}"
+        )
+        if result.stopped == "asked":
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(STOPPED)
+
+
+def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
+    if third_scale is None:
+        return
+    if kind is not Kind.two:
+        raise ValueError(f"--third-scale: got {third_scale} for {kind.value}, which has three")
+    if not 0 < third_scale < float("inf"):
+        raise ValueError(f"--third-scale: got {third_scale}, expected a length such as 1e-6")
 
 
 def _fit(
+    dataset: Dataset,
     data: Path,
     out: Path,
     kind: Kind,
@@ -177,15 +312,16 @@ def _fit(
     points: int,
     every: int,
     seed: int,
-    given: dict[str, Any],
+    changes: dict[str, Any],
     checkpoint_seconds: float,
     restart: bool,
+    third_scale: float | None,
 ) -> Fit:
-    given = {**given, "kind": kind.value[:2], "seed": seed}
+    changes = {**changes, "kind": kind.value[:2], "seed": seed}
     if iterations is not None:
-        given["iterations"] = iterations
+        changes["iterations"] = iterations
     if max_splats is not None:
-        given["max_splats"] = max_splats
+        changes["max_splats"] = max_splats
     if every == 1:
         raise ValueError(
             "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
@@ -193,10 +329,9 @@ def _fit(
 
     from attnwarp import fit as fitting
     from attnwarp.fit.loop import CHECKPOINT
-    from attnwarp.fit.progress import shown
+    from attnwarp.fit.progress import progress_display
 
-    settings = fitting.FitSettings.from_dict(given)
-    dataset = _read_views(data)
+    settings = fitting.FitSettings.from_dict(changes)
     train, test = fitting.hold_out(dataset, every)
     views = fitting.load_views(train, max_size=max_size)
     held_out = fitting.load_views(test, max_size=max_size) if test is not None else None
@@ -211,10 +346,10 @@ def _fit(
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
-    with _asked_to_stop() as stop, shown(title=out.name) as watch:
+    with _asked_to_stop() as stop, progress_display(title=out.name) as watch:
         result = fitting.fit(
             start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
-            checkpoint_seconds=checkpoint_seconds, watch=watch, stop=stop,
+            checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
         )  # fmt: skip
     _write_results(out, result, held_out)
     return result
@@ -235,12 +370,16 @@ def _read_views(path: Path, **options: Any) -> Dataset:
         raise FileNotFoundError(
             f"{path}: no such file or folder; for a scene: {export}, then give DIR"
         )
+    options = {
+        name: value.value if isinstance(value, StrEnum) else value
+        for name, value in options.items()
+    }
     return read_dataset(path, **options)
 
 
 def _assignments(changes: list[str]) -> dict[str, Any]:
     """NAME=VALUE with JSON values; a bare word is text."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for change in changes:
         name, equals, text = change.partition("=")
         if not equals or not name:
@@ -248,10 +387,10 @@ def _assignments(changes: list[str]) -> dict[str, Any]:
         if name in ("kind", "seed", "iterations", "max_splats"):
             raise ValueError(f"--set: {name} has an option of its own, --{name.replace('_', '-')}")
         try:
-            found[name] = json.loads(text)
-        except json.JSONDecodeError:
-            found[name] = text
-    return found
+            values[name] = json.loads(text)
+        except (ValueError, RecursionError):
+            values[name] = text
+    return values
 
 
 @contextmanager
@@ -259,20 +398,20 @@ def _asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Whether Ctrl-C or a polite kill came; a second Ctrl-C stops at once, as it would without
     this.
     """
-    came = False
+    asked = False
 
     def note(number: int, frame: Any) -> None:
-        nonlocal came
-        if came:
+        nonlocal asked
+        if asked:
             raise KeyboardInterrupt
-        came = True
+        asked = True
         typer.echo("stopping after this iteration; press Ctrl-C again to leave at once", err=True)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: came
+        yield lambda: asked
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 
@@ -283,11 +422,11 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     from attnwarp.io.file import write_atomically
 
     lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
-    said = json.dumps(
+    settings = json.dumps(
         {**result.settings.to_dict(), "extent": result.extent, "stopped": result.stopped}, indent=2
     )
     write_atomically(out / "history.jsonl", lambda stream: stream.write(lines.encode()))
-    write_atomically(out / "settings.json", lambda stream: stream.write(f"{said}\n".encode()))
+    write_atomically(out / "settings.json", lambda stream: stream.write(f"{settings}\n".encode()))
     if held_out is None:
         return
 
@@ -337,21 +476,34 @@ def render(
     normal: Annotated[
         bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")
     ] = False,
+    kind: SplatKindOption = None,
+    antialiased: AntialiasedOption = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
 ) -> None:
     """Render splats from every camera of a data set; the images need not be there."""
-    with clear_errors():
+    with clear_errors(f"stopped; the files in {out} are whole, and the same command renders all"):
         import numpy as np
 
         behind = _color(background)
         _check_out(out)
 
-        from attnwarp.io import read_ply
         from attnwarp.io.file import write_atomically
         from attnwarp.render import render as draw
 
         _use_threads(threads)
-        splats = read_ply(model)
-        views = _read_views(cameras, missing_images="none", points=False).cameras
+        splats = _read_splats(model, kind, antialiased)
+        views = _read_views(
+            cameras,
+            format=format,
+            images=images,
+            missing_images="none",
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            points=False,
+        ).cameras
         out.mkdir(parents=True, exist_ok=True)
         for camera, name in zip(views, _file_names(views), strict=True):
             if size is not None:
@@ -369,7 +521,99 @@ def render(
                 )
             if normal:
                 _write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
-    typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
+        typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
+
+
+@app.command()
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Splats: .ply or .splat.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply or .splat.")],
+    kind: SplatKindOption = None,
+    antialiased: AntialiasedOption = None,
+    third_scale: Annotated[
+        float | None,
+        typer.Option(help="Write 2DGS as thin 3DGS with this third scale (1e-6)."),
+    ] = None,
+    sh_degree: Annotated[
+        int | None, typer.Option(min=0, max=3, help="Cut harmonics beyond this degree.")
+    ] = None,
+    coordinates: Annotated[
+        Coordinates,
+        typer.Option(
+            help="world, relative to the origin comment that attnwarp alone reads, or auto: world"
+            " unless float32 would lose too much."
+        ),
+    ] = Coordinates.auto,
+) -> None:
+    """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin."""
+    with clear_errors():
+        suffix = out.suffix.lower()
+        if suffix not in (".ply", ".splat"):
+            raise ValueError(f"OUT: got {out}, expected a name ending in .ply or .splat")
+        from attnwarp.io import THIRD_SCALE, write_ply, write_splat
+
+        splats = _read_splats(source, kind, antialiased)
+        if third_scale is not None and splats.kind == "3d":
+            raise ValueError(f"--third-scale: {source} holds 3DGS, which has three scales")
+        if sh_degree is not None:
+            splats = splats.with_sh_degree(min(sh_degree, splats.sh_degree))
+        if suffix == ".splat":
+            write_splat(
+                out,
+                splats,
+                third_scale=THIRD_SCALE if third_scale is None else third_scale,
+                coordinates="relative" if coordinates == "relative" else "world",
+            )
+        else:
+            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
+        typer.echo(f"{out}: {len(splats)} splats")
+
+
+@app.command()
+def undistort(
+    data: Annotated[
+        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+    ],
+    out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Resample pictures to pinhole cameras, for lens models that OpenCV has."""
+    with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
+        _check_out(out)
+        from attnwarp.io import undistort as write_undistorted
+
+        dataset = _read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            distorted="keep",
+        )
+        count = sum(lens is not None for lens in dataset.lenses)
+        result = write_undistorted(dataset, out)
+        typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")
+
+
+def _read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaussians:
+    from dataclasses import replace
+
+    from attnwarp.io import read_ply, read_splat
+
+    if path.suffix.lower() == ".splat":
+        if kind is Kind.two:
+            raise ValueError(f"--kind: {path} is a .splat, which holds 3DGS alone")
+        return replace(read_splat(path), antialiased=bool(antialiased))
+    return read_ply(
+        path,
+        kind=None if kind is None else "2d" if kind is Kind.two else "3d",
+        antialiased=antialiased,
+    )
 
 
 def _put(stream: BinaryIO, data: bytes) -> None:
@@ -403,16 +647,37 @@ def _file_names(cameras: Any) -> list[str]:
 
 def _write_image(path: Path, rgb: Any) -> None:
     """(H, W, 3) sRGB in [0, 1] as an 8-bit PNG, atomically."""
-    from attnwarp.io.file import write_atomically
-    from attnwarp.io.picture import encode_picture
+    import numpy as np
 
-    data = encode_picture(rgb)
+    from attnwarp.io.file import write_atomically
+    from attnwarp.io.images import encode_png
+
+    data = encode_png(np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8))
     write_atomically(path, lambda stream: stream.write(data))
 
 
 def main() -> None:
     """Entry point of the console script."""
-    app()
+    from attnwarp.errors import missing_extra
+
+    try:
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except ImportError as error:
+        explained = missing_extra(error)
+        if explained is None:
+            raise
+        sys.exit(fail(str(explained)).exit_code)
+    except BrokenPipeError:
+        sys.exit(_closed_pipe().exit_code)
+    except OSError as error:  # help that cannot be written
+        _closed_pipe()
+        sys.exit(fail(_file_error(error)).exit_code)
+    except SystemExit as done:
+        # Typer's own code for a pipe that is closed; no command of ours gives 1.
+        sys.exit(CLOSED_PIPE if done.code == 1 else done.code)
 
 
 if __name__ == "__main__":

@@ -42,6 +42,20 @@ class Gaussians:
         ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is
             not positive, an opacity outside [0, 1]; the message names the argument and the first
             bad row.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> red = Gaussians(
+        ...     "2d",
+        ...     means=torch.tensor([[0.0, 0.0, 2.0]]),
+        ...     quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        ...     scales=torch.tensor([[0.3, 0.3]]),
+        ...     opacities=torch.tensor([0.9]),
+        ...     sh=Gaussians.sh_from_rgb(torch.tensor([[1.0, 0.0, 0.0]])),
+        ... )
+        >>> len(red), red.sh_degree, red.normals().tolist()
+        (1, 0, [[0.0, 0.0, 1.0]])
     """
 
     kind: Kind
@@ -137,6 +151,25 @@ class Gaussians:
     ) -> Gaussians:
         """A copy in another floating dtype or on another device."""
         return self._map(lambda tensor: tensor.to(dtype=dtype, device=device))
+
+    def with_sh_degree(self, degree: int) -> Gaussians:
+        """The splats with harmonics up to ``degree``: further ones are cut, missing ones are 0.
+
+        Example:
+            >>> import torch
+            >>> from attnwarp import Gaussians
+            >>> one = Gaussians(
+            ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
+            ...     torch.ones(1), torch.zeros(1, 16, 3),
+            ... )
+            >>> one.with_sh_degree(0).sh.shape
+            torch.Size([1, 1, 3])
+        """
+        if degree not in (0, 1, 2, 3):
+            raise ValueError(f"degree: got {degree}, expected 0 to 3")
+        count = (degree + 1) ** 2
+        missing = self.sh.new_zeros(len(self), max(0, count - self.sh.shape[1]), 3)
+        return replace(self, sh=torch.cat([self.sh[:, :count], missing], dim=1))
 
     def detach(self) -> Gaussians:
         """The same values, outside autograd."""

@@ -1,13 +1,19 @@
 #!/usr/bin/env bash
 # Make .venv with the tested versions and this checkout in it, from whatever the machine has.
-# A stamp that holds the hash of pyproject.toml and constraints.txt makes a second call free.
+#
+#   scripts/venv.sh [EXTRAS]    the extras of pyproject.toml to install; dev, which has them all, if left out
+#
+# A stamp a set of extras, holding the hash of what decides the installation, makes a second call free.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
+extras=${1:-dev}
 venv=.venv
-stamp=$venv/.installed
-want=$(cat pyproject.toml constraints.txt scripts/venv.sh | sha256sum | cut -d' ' -f1)
-[ -f "$stamp" ] && [ "$(cat "$stamp")" = "$want" ] && exit 0
+hash=$(cat pyproject.toml constraints.txt scripts/venv.sh | sha256sum | cut -d' ' -f1)
+stamp=$venv/.installed-$extras
+for file in "$stamp" "$venv/.installed-dev"; do
+    [ -f "$file" ] && [ "$(cat "$file")" = "$hash" ] && exit 0
+done
 
 say() { printf '%s\n' "$*" >&2; }
 
@@ -81,8 +87,8 @@ install_libraries() {
 python=$(find_python)
 install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
-say "attnwarp: installing the tested versions into $venv (a few minutes the first time)"
+say "attnwarp: installing the tested versions into $venv, with the extras $extras (a few minutes the first time)"
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-printf '%s' "$want" >"$stamp"
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$extras]"
+printf '%s' "$hash" >"$stamp"

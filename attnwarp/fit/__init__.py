@@ -5,7 +5,7 @@ docs/fitting.md.
 from attnwarp.fit.loop import Fit, Record, Step, fit
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of, from_points, random_points
-from attnwarp.fit.views import Views, hold_out, load_views, read_image
+from attnwarp.fit.views import Views, hold_out, load_views
 
 __all__ = [
     "Fit",
@@ -19,5 +19,4 @@ __all__ = [
     "hold_out",
     "load_views",
     "random_points",
-    "read_image",
 ]

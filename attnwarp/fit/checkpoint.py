@@ -1,12 +1,14 @@
-"""Fits that can be stopped at any moment and taken up again, with the same bits as if they had not
-been.
+"""Checkpoints: what a fit that was stopped needs to give the bits of one that was not.
+
+A file is one line of text, which names the format and the SHA-256 of the rest, and what torch.save
+writes.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,14 @@ import torch
 from attnwarp.io import FileFormatError
 from attnwarp.io.file import write_atomically
 
-FORMAT = 1
+FORMAT = 2
 """Raised when a checkpoint's content changes meaning; older ones are then refused rather than
 misread.
 """
+
+REMEDY = "remove it to begin again (--restart)"
+
+_MAGIC = b"attnwarp checkpoint"
 
 
 def save(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
@@ -26,29 +32,43 @@ def save(path: str | os.PathLike[str], state: dict[str, Any]) -> None:
     or the one before.
     """
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, **state}, buffer)
-    write_atomically(path, lambda stream: stream.write(buffer.getbuffer()))
+    torch.save(state, buffer)
+    data = buffer.getvalue()
+    head = b"%s %d %s\n" % (_MAGIC, FORMAT, hashlib.sha256(data).hexdigest().encode())
+
+    write_atomically(path, lambda stream: stream.write(head + data))
 
 
 def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """What :func:`save` wrote. Only tensors and plain values are read; a file cannot run code.
 
     Raises:
-        FileFormatError: it is damaged, of another format, or something else altogether.
+        FileFormatError: it is damaged in any bit, of another format, or something else altogether.
     """
     path = Path(path)
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, OSError, EOFError, pickle.UnpicklingError, KeyError, ValueError) as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise FileFormatError(
-            path, f"not a checkpoint that can be read ({first}); remove it to begin again"
-        ) from error
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
-        came = state.get("format") if isinstance(state, dict) else type(state).__name__
+    head, _, data = path.read_bytes().partition(b"\n")
+    words = head.split()
+    if words[:2] != _MAGIC.split() or len(words) != 4:
+        raise FileFormatError(path, f"not a checkpoint of this version; {REMEDY}")
+    if words[2] != str(FORMAT).encode():
         raise FileFormatError(
             path,
-            f"got a checkpoint of format {came!r}, expected {FORMAT}; remove it to begin again",
+            f"got a checkpoint of format {words[2].decode('ascii', 'replace')}, expected {FORMAT};"
+            f" {REMEDY}",
             field="format",
         )
+    if words[3] != hashlib.sha256(data).hexdigest().encode():
+        raise FileFormatError(path, f"its checksum does not match, so it is damaged; {REMEDY}")
+    try:
+        state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    # A checksum that matches leaves a file made on purpose. torch's message advises to load it all
+    # the same, which runs its code, and is not passed on.
+    except Exception as error:
+        raise FileFormatError(
+            path,
+            f"holds something other than tensors and plain values ({type(error).__name__}); do not"
+            f" use it, {REMEDY}",
+        ) from None
+    if not isinstance(state, dict):
+        raise FileFormatError(path, f"holds {type(state).__name__}, expected a dict; {REMEDY}")
     return state

@@ -116,6 +116,7 @@ def fit(
     folder: str | os.PathLike[str] | None = None,
     max_seconds: float | None = None,
     checkpoint_seconds: float = 30.0,
+    third_scale: float | None = None,
     backend: str = "auto",
     measure: Measure | None = None,
     watch: Callable[[Step], object] | None = None,
@@ -137,6 +138,8 @@ def fit(
         max_seconds: stop after so many seconds of iterations, over all sittings. The learning rates
             follow ``settings.iterations`` all the same.
         checkpoint_seconds: see above.
+        third_scale: of 2D splats in ``splats.ply``, for viewers of 3D ones; see
+            :func:`attnwarp.io.write_ply`.
         backend: of :func:`attnwarp.render.render`.
         measure: called at every evaluation with the splats; its figures go into the history. A view
             of the truth, such as the error of depth.
@@ -149,6 +152,19 @@ def fit(
         FileFormatError: the folder's checkpoint is damaged.
         RuntimeError: the loss is no longer finite, or no splat is left; the message says what to
             try. The last checkpoint stays.
+
+    Warns:
+        InputWarning: float32 world coordinates would not do for ``splats.ply``.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import FitSettings, Views, fit, from_points
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=16, height=16, fov_y=40)
+        >>> start = from_points(np.eye(3), kind="3d", sh_degree=0)
+        >>> grey = Views([camera], [np.full((16, 16, 3), 0.5)])
+        >>> fit(start, grey, FitSettings(kind="3d", iterations=2, sh_degree=0)).iteration
+        2
     """
     settings = (
         FitSettings(kind=start.kind, sh_degree=start.sh_degree) if settings is None else settings
@@ -170,7 +186,9 @@ def fit(
     }.items():
         if value is not None and not value >= 0:
             raise ValueError(f"{name}: got {value}, expected seconds >= 0")
-    run = _Run(start, views, settings, held_out, backend, measure)
+    if third_scale is not None and settings.kind != "2d":
+        raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
+    run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     if folder is not None:
         Path(folder).mkdir(parents=True, exist_ok=True)
         run.take_up(Path(folder))
@@ -189,7 +207,9 @@ class _Run:
         held_out: Views | None,
         backend: str,
         measure: Measure | None,
+        third_scale: float | None,
     ) -> None:
+        self.third_scale = third_scale
         self.settings, self.views, self.held_out = settings, views, held_out
         self.backend, self.measure = backend, measure
         self.extent = extent_of(views.cameras)
@@ -205,7 +225,7 @@ class _Run:
         self.folder: Path | None = None
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must have been made from to be taken up."""
+        """Settings and data that a checkpoint must match to be resumed."""
         return {
             "settings": self.settings.to_dict(),
             "views": self.views.digest,
@@ -219,20 +239,20 @@ class _Run:
         if not path.exists():
             return
         state = checkpoint.load(path)
-        for what, ours in self.identity().items():
-            theirs = state.get(what)
-            if theirs == ours:
+        for name, expected in self.identity().items():
+            stored = state.get(name)
+            if stored == expected:
                 continue
-            if isinstance(ours, dict) and isinstance(theirs, dict):
+            if isinstance(expected, dict) and isinstance(stored, dict):
                 differ = [
-                    f"{k}: {theirs.get(k)!r}, now {v!r}"
-                    for k, v in ours.items()
-                    if theirs.get(k) != v
+                    f"{k}: {stored.get(k)!r}, now {v!r}"
+                    for k, v in expected.items()
+                    if stored.get(k) != v
                 ]
-                what = f"settings ({'; '.join(differ)})"
+                name = f"settings ({'; '.join(differ)})"
             raise ValueError(
-                f"folder: {folder} holds a fit of other {what}; go on with the same ones, or name"
-                " another folder or remove its checkpoint.pt to begin again"
+                f"folder: {folder} holds a fit of other {name}; go on with the same ones, or name"
+                " another folder, or begin again without its checkpoint.pt (--restart)"
             )
         try:
             self.model.restore(state["model"])
@@ -243,15 +263,15 @@ class _Run:
             self.seconds, self.cpu_seconds = float(state["seconds"]), float(state["cpu_seconds"])
             self.loss, self.error = float(state["loss"]), float(state["error"])
             self.history = [Record(**record) for record in state["history"]]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise FileFormatError(
-                path, f"lacks something or is damaged: {error}; remove it to begin again"
+                path, f"lacks something or is damaged: {error}; {checkpoint.REMEDY}"
             ) from error
 
     def save(self) -> None:
         if self.folder is None:
             return
-        write_ply(self.folder / SPLATS, self.model.gaussians())
+        write_ply(self.folder / SPLATS, self.model.gaussians(), third_scale=self.third_scale)
         checkpoint.save(
             self.folder / CHECKPOINT,
             {
@@ -320,10 +340,10 @@ class _Run:
 
     def _out_of_patience(self) -> bool:
         patience = self.settings.patience
-        known = [record.psnr for record in self.history if record.psnr is not None]
-        if patience is None or len(known) <= patience:
+        values = [record.psnr for record in self.history if record.psnr is not None]
+        if patience is None or len(values) <= patience:
             return False
-        return max(known[-patience:]) < max(known[:-patience]) + self.settings.min_gain
+        return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
 
     def step(self) -> Step:
         held = self.history[-1].psnr if self.history else None
@@ -422,7 +442,6 @@ class _Run:
                 errors.append(
                     float((image - self.held_out.target(index, background)).square().mean())
                 )
-        known = bool(errors)
         self.history.append(
             Record(
                 iteration=self.iteration,
@@ -430,8 +449,8 @@ class _Run:
                 cpu_seconds=self.cpu_seconds,
                 splats=len(self.model),
                 loss=None if math.isnan(self.loss) else self.loss,
-                psnr=sum(losses.psnr_of_mse(e) for e in errors) / len(errors) if known else None,
-                psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if known else None,
+                psnr=sum(losses.psnr_of_mse(e) for e in errors) / len(errors) if errors else None,
+                psnr_pooled=losses.psnr_of_mse(sum(errors) / len(errors)) if errors else None,
                 measures=dict(self.measure(gaussians)) if self.measure else {},
             )
         )

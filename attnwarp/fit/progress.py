@@ -28,13 +28,13 @@ def _decibels(value: float) -> str:
 
 
 @contextmanager
-def shown(
+def progress_display(
     console: Console | None = None, *, title: str = "fit"
 ) -> Iterator[Callable[[Step], None]]:
     """What to pass as ``watch`` to :func:`attnwarp.fit.fit`; writes to stderr unless told where.
 
     Example:
-        >>> with shown(title="bear") as watch:  # doctest: +SKIP
+        >>> with progress_display(title="bear") as watch:  # doctest: +SKIP
         ...     result = fit(start, views, settings, watch=watch)
     """
     from rich.console import Console as Terminal

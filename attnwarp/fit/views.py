@@ -7,7 +7,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.io import Dataset, FileFormatError
+from attnwarp.io import Dataset, FileFormatError, read_image
 
 HELD_OUT_EVERY = 8
 """Where a data set names no split, one image of so many is held out (the field's habit since LLFF).
@@ -120,9 +119,15 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
         ValueError: no camera has a picture.
     """
     cameras, images = [], []
-    for camera, path in zip(dataset.cameras, dataset.image_paths, strict=True):
+    for camera, path, lens in zip(
+        dataset.cameras, dataset.image_paths, dataset.lenses, strict=True
+    ):
         if path is None:
             continue
+        if lens is not None:
+            raise FileFormatError(
+                path, "was taken through a lens that distorts; undistort the data set first"
+            )
         image = read_image(path)
         if image.shape[:2] != (camera.height, camera.width):
             raise FileFormatError(
@@ -138,30 +143,6 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
     if not cameras:
         raise ValueError("dataset: none of its cameras has an image")
     return Views(cameras, images)
-
-
-def read_image(path: Path) -> npt.NDArray[Any]:
-    """(H, W, 3) or (H, W, 4) RGB(A) in the file's own depth, as its pixels lie in the file.
-
-    A camera's pose belongs to the pixels as stored, so a tag that asks for the picture to be turned
-    is not followed.
-
-    Raises:
-        FileFormatError: not a picture of 8 or 16 bits.
-    """
-    import cv2
-
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise FileFormatError(path, "cannot be read as an image; convert it to PNG or JPEG")
-    if image.dtype not in (np.uint8, np.uint16):
-        raise FileFormatError(
-            path, f"holds {image.dtype}, expected 8 or 16 bits a channel of sRGB; convert it to PNG"
-        )
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=2)
-    code = cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
-    return np.asarray(cv2.cvtColor(image, code))
 
 
 def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:

@@ -4,19 +4,29 @@ from attnwarp.io.colmap import read_colmap
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.folder import read_dataset
+from attnwarp.io.images import image_size, read_image
+from attnwarp.io.lens import Lens, undistorted_camera, undistorted_image
 from attnwarp.io.ply import THIRD_SCALE, read_ply, read_points, write_ply, write_points
-from attnwarp.io.splat import write_splat
+from attnwarp.io.splat import read_splat, write_splat
 from attnwarp.io.transforms import read_transforms, write_transforms
+from attnwarp.io.undistort import undistort
 
 __all__ = [
     "THIRD_SCALE",
     "Dataset",
     "FileFormatError",
+    "Lens",
+    "image_size",
     "read_colmap",
     "read_dataset",
+    "read_image",
     "read_ply",
     "read_points",
+    "read_splat",
     "read_transforms",
+    "undistort",
+    "undistorted_camera",
+    "undistorted_image",
     "write_ply",
     "write_points",
     "write_splat",

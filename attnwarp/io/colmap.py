@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.io.dataset import Dataset, Missing, with_images
+from attnwarp.io.dataset import Dataset, Distorted, Missing, with_images
 from attnwarp.io.file import FileFormatError, existing_file
+from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
 
@@ -38,6 +40,22 @@ MODELS: dict[int, tuple[str, int]] = {
     11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 """COLMAP's camera models: id -> name and number of parameters (colmap/sensor/models.h)."""
+
+BROWN: dict[str, tuple[int, ...]] = {
+    "SIMPLE_RADIAL": (0,),
+    "RADIAL": (0, 1),
+    "OPENCV": (0, 1, 2, 3),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+}
+FISHEYE: dict[str, tuple[int, ...]] = {
+    "SIMPLE_RADIAL_FISHEYE": (0,),
+    "RADIAL_FISHEYE": (0, 1),
+    "OPENCV_FISHEYE": (0, 1, 2, 3),
+}
+"""Models that :class:`Lens` holds: which of its coefficients their last parameters are."""
+
+ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+"""Models with one focal length for both axes."""
 
 MODEL_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 """Where a sparse model is looked for in a folder, first hit first."""
@@ -59,6 +77,7 @@ def read_colmap(
     missing_images: Missing = "error",
     resize_cameras: bool = False,
     points: bool = True,
+    distorted: Distorted = "error",
 ) -> Dataset:
     """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as
     COLMAP does.
@@ -75,11 +94,14 @@ def read_colmap(
             resize the camera instead of refusing.
         points: False to leave the points out; their file is then not read, and may be missing or
             damaged.
+        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+            ``Dataset.lenses`` for :func:`undistort`.
 
     Raises:
         FileNotFoundError: no model there.
         FileFormatError: a camera with lens distortion, a damaged or truncated file, missing images.
     """
+    check.one_of(distorted, ("error", "keep"), "distorted")
     path = Path(path)
     model = find_model(path)
     if model is None:
@@ -89,21 +111,26 @@ def read_colmap(
         )
     suffix = ".bin" if (model / "cameras.bin").is_file() else ".txt"
     binary = suffix == ".bin"
-    lenses = (_binary_cameras if binary else _text_cameras)(
+    intrinsics = (_binary_cameras if binary else _text_cameras)(
         existing_file(model / f"cameras{suffix}")
     )
     source = existing_file(model / f"images{suffix}")
     poses = sorted((_binary_images if binary else _text_images)(source), key=lambda pose: pose.name)
     if not poses:
         raise FileFormatError(source, "holds no registered image; the reconstruction failed")
-    cameras = []
+    cameras: list[Camera] = []
+    lenses: list[Lens | None] = []
     for pose in poses:
-        if pose.camera not in lenses:
+        if pose.camera not in intrinsics:
             raise FileFormatError(
                 source,
                 f"image {pose.name!r} uses camera {pose.camera}, which is not in cameras{suffix}",
             )
-        cameras.append(_camera(source, pose, lenses[pose.camera], model / f"cameras{suffix}"))
+        camera, lens = _camera(
+            source, pose, intrinsics[pose.camera], model / f"cameras{suffix}", distorted
+        )
+        cameras.append(camera)
+        lenses.append(lens)
     folder = _image_folder(path, model, images)
     cameras, paths = with_images(
         source,
@@ -114,19 +141,18 @@ def read_colmap(
     )
     cloud = model / f"points3D{suffix}"
     if not points or not cloud.is_file():
-        return Dataset(cameras, paths)
-    if binary:
-        return Dataset(cameras, paths, *_binary_points(existing_file(cloud)))
-    # Empty is what COLMAP's own guide asks for where poses are known and points are not: no points,
-    # not a damaged file.
-    return Dataset(cameras, paths, *_text_points(cloud))
+        return Dataset(cameras, paths, lenses=lenses)
+    # An empty text file is what COLMAP's own guide asks for where poses are known and points are
+    # not: no points, not a damaged file.
+    xyz, colors = _binary_points(existing_file(cloud)) if binary else _text_points(cloud)
+    return Dataset(cameras, paths, xyz, colors, lenses=lenses)
 
 
 # --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class _Lens:
+class _Intrinsics:
     model: str
     width: int
     height: int
@@ -148,29 +174,47 @@ def _image_folder(path: Path, model: Path, images: str | os.PathLike[str] | None
     return next((root / "images" for root in roots if (root / "images").is_dir()), path / "images")
 
 
-def _camera(source: Path, pose: _Pose, lens: _Lens, cameras_file: Path) -> Camera:
-    match lens.model, lens.params:
-        case "SIMPLE_PINHOLE", (f, cx, cy):
-            fx = fy = f
-        case "PINHOLE", (fx, fy, cx, cy):
-            pass
-        case _:
+def _camera(
+    source: Path, pose: _Pose, intrinsics: _Intrinsics, cameras_file: Path, distorted: Distorted
+) -> tuple[Camera, Lens | None]:
+    model, params = intrinsics.model, intrinsics.params
+    whose = f"camera {pose.camera}, of image {pose.name!r}, has model {model}"
+    lens: Lens | None = None
+    if model in BROWN or model in FISHEYE:
+        coefficients = [0.0] * (8 if model in BROWN else 4)
+        places = BROWN.get(model) or FISHEYE[model]
+        for place, value in zip(places, params[-len(places) :], strict=True):
+            coefficients[place] = value
+        try:
+            lens = Lens("brown" if model in BROWN else "fisheye", tuple(coefficients))
+        except ValueError as error:
+            raise FileFormatError(cameras_file, f"camera {pose.camera}: {error}") from error
+        lens = None if lens.is_pinhole else lens
+        if lens is not None and distorted == "error":
             raise FileFormatError(
                 cameras_file,
-                f"camera {pose.camera}, of image {pose.name!r}, has model {lens.model}, expected"
-                " PINHOLE or SIMPLE_PINHOLE; run COLMAP's image_undistorter and read the folder"
-                " that it writes",
+                f"{whose}, expected PINHOLE or SIMPLE_PINHOLE; undistort the images first (attnwarp"
+                " undistort, or COLMAP's image_undistorter) and read the folder that this writes",
                 field="model",
             )
+    elif model not in ("SIMPLE_PINHOLE", "PINHOLE"):
+        raise FileFormatError(
+            cameras_file,
+            f"{whose}, expected PINHOLE, SIMPLE_PINHOLE or, to undistort,"
+            f" {', '.join([*BROWN, *FISHEYE])}; run COLMAP's image_undistorter and read the folder"
+            " that it writes",
+            field="model",
+        )
+    fx, fy, cx, cy = (params[0], *params[:3]) if model in ONE_FOCAL else params[:4]
     quat = np.array(pose.quat)
-    where = f"image {pose.name!r}"
-    norm = np.linalg.norm(quat)
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quat)
     if not (np.isfinite(norm) and norm > 0) or not np.isfinite(pose.translation).all():
         raise FileFormatError(
             source,
             f"got quaternion {pose.quat} and translation {pose.translation}, expected a finite"
             " pose",
-            field=where,
+            field=f"image {pose.name!r}",
         )
     w, x, y, z = quat / norm
     world_to_camera = np.eye(4)
@@ -182,7 +226,7 @@ def _camera(source: Path, pose: _Pose, lens: _Lens, cameras_file: Path) -> Camer
     world_to_camera[:3, 3] = pose.translation
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     try:
-        return Camera(K, world_to_camera, lens.width, lens.height, pose.name)
+        return Camera(K, world_to_camera, intrinsics.width, intrinsics.height, pose.name), lens
     except ValueError as error:
         raise FileFormatError(cameras_file, f"camera {pose.camera}: {error}") from error
 
@@ -193,7 +237,7 @@ class _Reader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at, self.what = (
+        self.path, self.data, self.position, self.what = (
             path,
             path.read_bytes(),
             0,
@@ -201,7 +245,7 @@ class _Reader:
         )
 
     def need(self, count: int) -> None:
-        if self.at + count > len(self.data):
+        if self.position + count > len(self.data):
             raise FileFormatError(
                 self.path,
                 f"ends at byte {len(self.data)} while reading {self.what}; get the file again,"
@@ -211,20 +255,20 @@ class _Reader:
     def take(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize("<" + layout)
         self.need(size)
-        values = struct.unpack_from("<" + layout, self.data, self.at)
-        self.at += size
+        values = struct.unpack_from("<" + layout, self.data, self.position)
+        self.position += size
         return values
 
     def skip(self, count: int) -> None:
         self.need(count)
-        self.at += count
+        self.position += count
 
     def text(self) -> str:
-        end = self.data.find(b"\0", self.at)
+        end = self.data.find(b"\0", self.position)
         if end < 0:
             self.need(len(self.data))
-        text = self.data[self.at : end].decode("utf-8", "surrogateescape")
-        self.at = end + 1
+        text = self.data[self.position : end].decode("utf-8", "surrogateescape")
+        self.position = end + 1
         return text
 
     def entries(self, noun: str) -> Iterator[int]:
@@ -233,30 +277,30 @@ class _Reader:
         for i in range(count):
             self.what = f"{noun} {i} of {count}"
             yield i
-        if self.at != len(self.data):
+        if self.position != len(self.data):
             raise FileFormatError(
                 self.path,
-                f"{len(self.data) - self.at} bytes are left after {count} entries; not a COLMAP"
-                " file, or damaged",
+                f"{len(self.data) - self.position} bytes are left after {count} entries; the file"
+                " is damaged, or of another format",
             )
 
 
-def _binary_cameras(path: Path) -> dict[int, _Lens]:
+def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
     reader = _Reader(path)
-    lenses = {}
+    intrinsics = {}
     for i in reader.entries("camera"):
         camera, model, width, height = reader.take("IiQQ")
         if model not in MODELS:
             raise FileFormatError(
                 path,
-                f"got id {model} for entry {i}, expected 0 (SIMPLE_PINHOLE) or 1 (PINHOLE); "
-                "run COLMAP's image_undistorter and read the folder that it writes",
+                f"got id {model} for entry {i}, expected 0 to {max(MODELS)}; the file is"
+                " damaged, or of a newer COLMAP",
                 field="model",
                 row=i,
             )
         name, count = MODELS[model]
-        lenses[camera] = _Lens(name, width, height, reader.take(f"{count}d"))
-    return lenses
+        intrinsics[camera] = _Intrinsics(name, width, height, reader.take(f"{count}d"))
+    return intrinsics
 
 
 def _binary_images(path: Path) -> list[_Pose]:
@@ -301,15 +345,15 @@ def _damaged(path: Path, number: int, line: str, expected: str) -> FileFormatErr
     )
 
 
-def _text_cameras(path: Path) -> dict[int, _Lens]:
-    lenses = {}
+def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
+    intrinsics = {}
     for number, line in _text_lines(path):
         if not line:
             continue
         fields = line.split()
         try:
             camera, model, width, height, *params = fields
-            lenses[int(camera)] = _Lens(
+            intrinsics[int(camera)] = _Intrinsics(
                 model, int(width), int(height), tuple(float(v) for v in params)
             )
         except ValueError as error:
@@ -317,7 +361,7 @@ def _text_cameras(path: Path) -> dict[int, _Lens]:
         count = next((count for name, count in MODELS.values() if name == model), len(params))
         if len(params) != count:
             raise _damaged(path, number, line, f"{count} parameters for {model}")
-    return lenses
+    return intrinsics
 
 
 def _text_images(path: Path) -> list[_Pose]:

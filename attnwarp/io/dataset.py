@@ -12,7 +12,9 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.io.file import FileFormatError
+from attnwarp.io.file import FileFormatError, is_file
+from attnwarp.io.images import image_size
+from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
 
@@ -25,6 +27,7 @@ allows 1e-5.
 """
 
 Missing = Literal["error", "none"]
+Distorted = Literal["error", "keep"]
 
 
 @dataclass(eq=False)
@@ -38,6 +41,8 @@ class Dataset:
         points: (P, 3) float64 world coordinates, or None.
         colors: (P, 3) uint8 sRGB of the points, or None.
         splits: one for each camera: "train", "val", "test", or None where the file names no split.
+        lenses: one for each camera; None for a pinhole, as which every camera is used. Pictures
+            taken through another lens must be undistorted first: see :func:`undistort`.
         applied_transform: (3, 4) transform that the program which wrote a transforms.json applied
             to the original world before it wrote; cameras and points are in the world after it.
             Information only.
@@ -52,10 +57,12 @@ class Dataset:
     colors: npt.NDArray[np.uint8] | None = None
     splits: list[str | None] = field(default_factory=list)
     applied_transform: Array | None = None
+    lenses: list[Lens | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.splits = self.splits or [None] * len(self.cameras)
-        for name in ("image_paths", "splits"):
+        self.lenses = self.lenses or [None] * len(self.cameras)
+        for name in ("image_paths", "splits", "lenses"):
             if len(getattr(self, name)) != len(self.cameras):
                 raise ValueError(
                     f"{name}: got {len(getattr(self, name))}, expected {len(self.cameras)}, as"
@@ -88,6 +95,7 @@ class Dataset:
             self.colors,
             [self.splits[i] for i in indices],
             self.applied_transform,
+            [self.lenses[i] for i in indices],
         )
 
     def split(self, name: str) -> Dataset:
@@ -98,20 +106,26 @@ class Dataset:
         """
         indices = [i for i, split in enumerate(self.splits) if split == name]
         if not indices:
-            there = sorted({split for split in self.splits if split is not None})
+            available = sorted({split for split in self.splits if split is not None})
             raise ValueError(
                 f"name: got {name!r}, expected one of"
-                f" {', '.join(map(repr, there)) or '(no splits)'}"
+                f" {', '.join(map(repr, available)) or '(no splits)'}"
             )
         return self.select(indices)
 
 
-def nearest_rotation(path: Path, where: str, R: Array) -> Array:
+def nearest_rotation(path: Path, name: str, R: Array) -> Array:
     """``R`` if it is a rotation to 1e-12; the nearest one (by SVD) if it is to 1e-4; an error that
     says by how much.
+
+    Args:
+        path: the file that ``R`` comes from, for the error.
+        name: of the field there.
+        R: (3, 3).
     """
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE:
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if not error <= ROTATION_TOLERANCE:
         size = np.linalg.norm(R, axis=0)
         hint = (
             "its axes are not at right angles, or it was rounded too coarsely; export the poses"
@@ -123,32 +137,17 @@ def nearest_rotation(path: Path, where: str, R: Array) -> Array:
             path,
             f"rotation is not orthonormal, max |R R^T - I| = {error:.3g}, and only up to"
             f" {ROTATION_TOLERANCE:g} is repaired; {hint}",
-            field=where,
+            field=name,
         )
     if np.linalg.det(R) < 0:
         raise FileFormatError(
-            path, "rotation has determinant -1 (it mirrors); flip one axis of the pose", field=where
+            path, "rotation has determinant -1 (it mirrors); flip one axis of the pose", field=name
         )
     if error <= EXACT_ROTATION:
         return R
     U, _, Vt = np.linalg.svd(R)
     rotation: Array = U @ Vt
     return rotation
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """(width, height) from an image's header, without decoding it and without turning it by its
-    EXIF tag.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except UnidentifiedImageError as error:
-        raise FileFormatError(
-            path, "not an image that can be read; replace it or leave it out"
-        ) from error
 
 
 def with_images(
@@ -166,19 +165,19 @@ def with_images(
         where missing.
     """
     check.one_of(missing_images, ("error", "none"), "missing_images")
-    absent = [path for path in paths if not path.is_file()]
+    absent = [path for path in paths if not is_file(path)]
     if absent and missing_images == "error":
         first = ", ".join(str(path) for path in absent[:3])
         more = f" and {len(absent) - 3} more" if len(absent) > 3 else ""
         raise FileFormatError(
             source,
             f"{len(absent)} of {len(paths)} images are missing: {first}{more}; "
-            "put them there, or pass missing_images='none' for the cameras alone",
+            "put them there, or pass missing_images='none' (--missing-images none) to do without",
         )
-    gone = set(absent)
-    found: list[Path | None] = [None if path in gone else path for path in paths]
+    missing = set(absent)
+    available: list[Path | None] = [None if path in missing else path for path in paths]
     cameras = list(cameras)
-    for i, path in enumerate(found):
+    for i, path in enumerate(available):
         if path is None:
             continue
         camera, (width, height) = cameras[i], image_size(path)
@@ -188,8 +187,8 @@ def with_images(
             raise FileFormatError(
                 source,
                 f"{path} is {width} x {height}, but its camera is {camera.width} x {camera.height};"
-                " use the images the cameras were made for, or pass resize_cameras=True if they"
-                " are the same pictures at another size",
+                " use the images the cameras were made for, or pass resize_cameras=True"
+                " (--resize-cameras) if they are the same pictures at another size",
             )
         cameras[i] = camera.resize(width, height)
-    return cameras, found
+    return cameras, available

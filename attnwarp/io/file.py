@@ -15,8 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+from attnwarp.errors import InputError
 
-class FileFormatError(ValueError):
+
+class FileFormatError(InputError):
     """A file that cannot be read as what it claims to be.
 
     The message names the file, the property or field, the first bad row where there is one (counted
@@ -37,6 +39,14 @@ class FileFormatError(ValueError):
         super().__init__(f"{path}: {field}: {message}" if field else f"{path}: {message}")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; False too for a name that no file system can hold."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def existing_file(path: str | os.PathLike[str]) -> Path:
     """``path`` as a Path.
 
@@ -45,7 +55,11 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
         FileFormatError: it is a folder, or it is empty.
     """
     path = Path(path)
-    if not path.exists():
+    try:
+        exists = path.exists()
+    except ValueError:  # a zero byte in the name
+        exists = False
+    if not exists:
         raise FileNotFoundError(f"{path}: no such file")
     if path.is_dir():
         raise FileFormatError(path, "is a folder, expected a file")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from attnwarp import check
 from attnwarp.io.colmap import find_model, read_colmap
-from attnwarp.io.dataset import Dataset, Missing
+from attnwarp.io.dataset import Dataset, Distorted, Missing
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.transforms import SPLITS, read_transforms
 
@@ -23,6 +24,8 @@ def read_dataset(
     missing_images: Missing = "error",
     resize_cameras: bool = False,
     points: bool = True,
+    distorted: Distorted = "error",
+    ignore_keys: Sequence[str] = (),
 ) -> Dataset:
     """Read a transforms.json or a COLMAP model.
 
@@ -40,6 +43,10 @@ def read_dataset(
             refusing.
         points: False to leave the points out; their file is then not read, and may be missing or
             damaged.
+        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+            ``Dataset.lenses`` for :func:`undistort`.
+        ignore_keys: keys of a transforms.json to pass over although they change what a picture
+            shows, such as "mask_path".
 
     Raises:
         FileNotFoundError: nothing there that could be read.
@@ -58,7 +65,7 @@ def read_dataset(
             raise FileFormatError(
                 path,
                 f"holds both a transforms.json and a COLMAP model ({model}); pass"
-                " format='transforms' or 'colmap'",
+                " format='transforms' or 'colmap' (--format)",
             )
         if not transforms and model is None:
             raise FileNotFoundError(
@@ -73,11 +80,18 @@ def read_dataset(
             missing_images=missing_images,
             resize_cameras=resize_cameras,
             points=points,
+            distorted=distorted,
         )
     if images is not None:
         raise ValueError(
-            "images: only COLMAP models take a folder of images; a transforms.json names its own"
+            "images (--images): only COLMAP models take a folder of images; a transforms.json names"
+            " its own"
         )
     return read_transforms(
-        path, missing_images=missing_images, resize_cameras=resize_cameras, points=points
+        path,
+        missing_images=missing_images,
+        resize_cameras=resize_cameras,
+        points=points,
+        distorted=distorted,
+        ignore_keys=ignore_keys,
     )

@@ -31,6 +31,8 @@ def encode_picture(
     """
     import cv2
 
+    from attnwarp.io.images import encode_png
+
     pixels = np.asarray(image)
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise ValueError(f"image: got shape {pixels.shape}, expected (H, W, 3)")
@@ -38,11 +40,11 @@ def encode_picture(
         raise ValueError(f"suffix: got {suffix!r}, expected '.png' or '.jpg'")
     if pixels.dtype != np.uint8:
         pixels = np.clip(np.rint(pixels * 255), 0, 255).astype(np.uint8)
-    options = []
-    if suffix == ".jpg":
-        sampling = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{chroma}")
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    if suffix == ".png":
+        return encode_png(pixels)
+    sampling = getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{chroma}")
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     encoded, data = cv2.imencode(suffix, pixels[..., ::-1], options)
     if not encoded:
         raise ValueError(f"image: OpenCV makes no {suffix} of shape {pixels.shape}")
-    return data.tobytes()
+    return bytes(data.tobytes())

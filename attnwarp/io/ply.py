@@ -9,17 +9,21 @@ else writes them.
 
 from __future__ import annotations
 
+import io
 import os
+import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from attnwarp import check
+from attnwarp.errors import InputWarning
 from attnwarp.gaussians import Gaussians, Kind
 from attnwarp.io.file import FileFormatError, existing_file, write_atomically
 
@@ -32,6 +36,13 @@ THIRD_SCALE = 1e-6
 The value the authors of 2DGS recommend for that (hbb1/2d-gaussian-splatting, issue 94). A file
 whose third scales are all exactly this is read back as 2D.
 """
+
+WORLD_TOLERANCE = 0.01
+"""How far float32 world coordinates may move a splat, as a share of its largest scale: a hundredth
+of a standard deviation changes no pixel by more than 0.6 % of the splat's peak.
+"""
+
+Coordinates = Literal["auto", "world", "relative"]
 
 LOGIT_OF_ZERO = -120.0
 LOGIT_OF_ONE = 40.0
@@ -51,9 +62,9 @@ def read_ply(
     ASCII and binary PLY of either byte order are read; further properties and elements are ignored.
     The kind is, in this order: ``kind``; what a comment says (``attnwarp kind 2d``,
     ``SplatRenderMode: 2dgs``); 2D when there is no ``scale_2``; 2D when every ``scale_2`` is
-        exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale
-    that is one constant, a hundredth of both others or less in every row, could be either and is
-    refused without ``kind``. For the 2D kind a third scale is dropped.
+    exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale that is one constant, a
+    hundredth of both others or less in every row, could be either and is refused without ``kind``.
+    For the 2D kind a third scale is dropped.
 
     Args:
         path: the file.
@@ -70,6 +81,18 @@ def read_ply(
         FileNotFoundError: no such file.
         FileFormatError: it is not a splat file, or a value in it is out of range; the message names
             the property and the first bad row.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.io import read_ply, write_ply
+        >>> one = Gaussians(
+        ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
+        ...     torch.ones(1), torch.zeros(1, 1, 3),
+        ... )
+        >>> write_ply("one.ply", one)
+        >>> read_ply("one.ply").scales
+        tensor([[1., 1., 1.]])
     """
     path = existing_file(path)
     if kind is not None:
@@ -91,8 +114,8 @@ def read_ply(
         "the quaternion's length overflows float32",
         "remove the row",
     )
-    says = _read_comments(path, comments)
-    kind, names = _recognise(path, columns, says, kind)
+    header = _read_comments(path, comments)
+    kind, names = _recognise(path, columns, header, kind)
     scales = np.empty((n, len(names)), np.float32)
     for i, name in enumerate(names):
         log = _column(path, columns, name, np.float64)
@@ -107,7 +130,7 @@ def read_ply(
             log,
         )
     if antialiased is None:
-        antialiased = says.antialiased(path)
+        antialiased = header.antialiased(path)
     offset, means = _split_origin(xyz)
     if not np.isfinite(means).all():
         _refuse(
@@ -126,21 +149,25 @@ def read_ply(
         torch.from_numpy(scales),
         torch.from_numpy(alpha.astype(np.float32)),
         torch.from_numpy(_read_sh(path, columns, n)),
-        origin=says.origin + offset,
+        origin=header.origin + offset,
         antialiased=antialiased,
     )
 
 
 def write_ply(
-    path: str | os.PathLike[str], gaussians: Gaussians, *, third_scale: float | None = None
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    *,
+    third_scale: float | None = None,
+    coordinates: Coordinates = "auto",
+    tolerance: float = WORLD_TOLERANCE,
 ) -> None:
     """Write splats as binary little-endian PLY, all properties float32, atomically.
 
-    Read back, means (float32), quaternions, spherical harmonics, origin, kind and the antialias
-    flag are the same bit for bit, and opacities 0 and 1 are exact; other opacities and the scales
-    pass through a float32 logarithm and come back within 4e-6 of their value. float64 means are
-    stored in float32 relative to an origin moved to the scene, when they would otherwise lose
-    digits.
+    Read back, quaternions, spherical harmonics, kind and the antialias flag are the same bit for
+    bit, and opacities 0 and 1 are exact; other opacities and the scales pass through a float32
+    logarithm and come back within 4e-6 of their value. Means are world coordinates rounded to
+    float32, as every other program reads them; with an origin they are the same bit for bit.
 
     Args:
         path: the file; an older one is replaced.
@@ -148,10 +175,18 @@ def write_ply(
         third_scale: for the 2D kind, write a third scale of this size (scene units) for viewers
             that know only 3D splats; :data:`THIRD_SCALE` is the usual one. Left out, two scales are
             written, as 2DGS trainers do.
+        coordinates: "world" for world coordinates; "relative" for means relative to the model's
+            origin, which a comment of the header gives and only this package knows; "auto" for
+            world coordinates unless float32 would move a splat by more than ``tolerance``.
+        tolerance: share of a splat's largest scale by which rounding may move it.
+
+    Warns:
+        InputWarning: "auto" writes an origin, or "world" moves splats by more than ``tolerance``.
 
     Raises:
         ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
-            ``third_scale`` is not positive or is given for the 3D kind.
+            ``third_scale`` is not positive or is given for the 3D kind, ``tolerance`` is negative,
+            or a world coordinate does not fit float32.
     """
     from plyfile import PlyData, PlyElement
 
@@ -170,8 +205,7 @@ def write_ply(
                 f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
             )
         scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
-    offset, means = _split_origin(original.means.numpy())
-    origin = g.origin + offset
+    origin, means = _place(Path(path), original, coordinates, tolerance)
     sh = g.sh.numpy()
     # (N, K, 3) -> (N, 3, K): the trainers flatten channel by channel.
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(g), 3 * (sh.shape[1] - 1))
@@ -188,10 +222,9 @@ def write_ply(
     for names, block in parts:
         for i, name in enumerate(names):
             rows[name] = block[:, i]
-    comments = [
-        f"attnwarp kind {g.kind}",
-        "attnwarp origin " + " ".join(repr(float(v)) for v in origin),
-    ]
+    comments = [f"attnwarp kind {g.kind}"]
+    if origin.any():
+        comments += ["attnwarp origin " + " ".join(repr(float(v)) for v in origin)]
     if g.kind == "2d":
         comments += ["SplatRenderMode: 2dgs", *(["antialiased 1"] if g.antialiased else [])]
     else:
@@ -273,8 +306,16 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
     """The scalar columns of the element ``vertex``, and all comments of the header."""
     import plyfile
 
+    text = _check_counts(path)
     try:
-        data = plyfile.PlyData.read(str(path))
+        # plyfile closes what it reads text from.
+        # Values too large for their type become infinite, and are refused as such.
+        with (
+            np.errstate(over="ignore"),
+            io.BytesIO(path.read_bytes()) if text else path.open("rb") as stream,
+        ):
+            data = plyfile.PlyData.read(stream)
+            left = 0 if text else path.stat().st_size - stream.tell()
     except plyfile.PlyHeaderParseError as error:
         raise FileFormatError(
             path, f"not a PLY file, or its header is damaged ({error})"
@@ -284,17 +325,28 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
         prop = error.prop.name if error.prop is not None else None
         count = error.element.count if error.element is not None else 0
         if "early end-of-file" in error.message:
-            text = (
+            message = (
                 f"the body ends in row {row} of the {count} that the header announces; get the file"
                 " again, whole"
             )
         else:
-            text = f"{error.message} in row {row} of {count}; the row is damaged"
-        raise FileFormatError(path, text, field=prop, row=row) from error
+            message = f"{error.message} in row {row} of {count}; the row is damaged"
+        raise FileFormatError(path, message, field=prop, row=row) from error
     except UnicodeDecodeError as error:
         raise FileFormatError(path, "not a PLY file: its header is not ASCII text") from error
     except (ValueError, OverflowError, MemoryError) as error:
-        raise FileFormatError(path, f"cannot be read as a PLY file: {error}") from error
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise FileFormatError(path, f"cannot be read as a PLY file: {first}") from error
+    if text:
+        body = path.read_bytes().partition(b"end_header")[2]
+        rows = sum(element.count for element in data.elements)
+        left = max(0, sum(1 for line in body.splitlines() if line.strip()) - rows)
+    if left:
+        raise FileFormatError(
+            path,
+            f"{left} {'lines' if text else 'bytes'} are left after the rows that the header"
+            " announces; the file is damaged, so get it again",
+        )
     if "vertex" not in data:
         names = [element.name for element in data.elements]
         raise FileFormatError(
@@ -306,6 +358,22 @@ def _read_vertices(path: Path) -> tuple[Columns, list[str]]:
         comment for element in data.elements for comment in element.comments
     ]
     return {name: np.asarray(vertex.data[name]) for name in scalar}, comments
+
+
+def _check_counts(path: Path) -> bool:
+    """Whether the body is text. Refuses more rows than bytes, before memory is asked for them."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(1 << 20).partition(b"end_header")[0]
+    for name, digits in re.findall(rb"^element\s+(\S+)\s+(\d+)", header, re.MULTILINE):
+        if len(digits) > 18 or int(digits) > size:
+            raise FileFormatError(
+                path,
+                f"the header announces {digits[:30].decode()} rows, but the file has {size} bytes;"
+                " get the file again, whole",
+                field=name.decode("ascii", "replace"),
+            )
+    return re.search(rb"^format\s+ascii", header, re.MULTILINE) is not None
 
 
 def _refuse_other_formats(path: Path, columns: Columns) -> None:
@@ -341,7 +409,7 @@ def _column(
             field=name,
         )
     raw = columns[name]
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         values = raw.astype(dtype)
     bad = np.isnan(values) if infinities else ~np.isfinite(values)
     _refuse(
@@ -386,7 +454,7 @@ def _read_sh(path: Path, columns: Columns, n: int) -> npt.NDArray[np.float32]:
     return sh
 
 
-class _Comments:
+class _Header:
     """What the comments of a header say about the splats; contradictions are kept until someone
     asks.
     """
@@ -400,25 +468,27 @@ class _Comments:
         if len(self.flags) > 1:
             both = " and ".join(map(repr, self.flags.values()))
             raise FileFormatError(
-                path, f"comments contradict each other: {both}; pass antialiased=True or False"
+                path,
+                f"comments contradict each other: {both}; pass antialiased=True or False"
+                " (--antialiased or --no-antialiased)",
             )
         return next(iter(self.flags), False)
 
 
-def _read_comments(path: Path, comments: list[str]) -> _Comments:
-    says = _Comments()
+def _read_comments(path: Path, comments: list[str]) -> _Header:
+    header = _Header()
     for comment in comments:
         match comment.lower().split():
             case ["attnwarp", "kind", "2d"]:
-                says.kinds["2d"] = comment
+                header.kinds["2d"] = comment
             case ["attnwarp", "kind", "3d"]:
-                says.kinds["3d"] = comment
+                header.kinds["3d"] = comment
             case ["attnwarp", "origin", *numbers]:
                 try:
-                    says.origin = np.array([float(v) for v in numbers])
+                    header.origin = np.array([float(v) for v in numbers])
                 except ValueError:
-                    says.origin = np.full(1, np.nan)
-                if says.origin.shape != (3,) or not np.isfinite(says.origin).all():
+                    header.origin = np.full(1, np.nan)
+                if header.origin.shape != (3,) or not np.isfinite(header.origin).all():
                     raise FileFormatError(
                         path, f"got {comment!r}, expected three finite numbers", field="origin"
                     )
@@ -429,16 +499,16 @@ def _read_comments(path: Path, comments: list[str]) -> _Comments:
                 "2dgs",
             ):
                 if mode == "2dgs":
-                    says.kinds["2d"] = comment
+                    header.kinds["2d"] = comment
                 else:
-                    says.flags[mode == "mip"] = comment
+                    header.flags[mode == "mip"] = comment
             case ["antialiased", ("0" | "1") as flag]:
-                says.flags[flag == "1"] = comment
-    return says
+                header.flags[flag == "1"] = comment
+    return header
 
 
 def _recognise(
-    path: Path, columns: Columns, says: _Comments, kind: Kind | None
+    path: Path, columns: Columns, header: _Header, kind: Kind | None
 ) -> tuple[Kind, tuple[str, ...]]:
     """The kind of the splats and the names of the scales that it uses."""
     for name in ("scale_0", "scale_1"):
@@ -449,12 +519,13 @@ def _recognise(
                 field=name,
             )
     if kind is None:
-        if len(says.kinds) > 1:
-            both = " and ".join(map(repr, says.kinds.values()))
+        if len(header.kinds) > 1:
+            both = " and ".join(map(repr, header.kinds.values()))
             raise FileFormatError(
-                path, f"comments contradict each other: {both}; pass kind='2d' or kind='3d'"
+                path,
+                f"comments contradict each other: {both}; pass kind='2d' or kind='3d' (--kind)",
             )
-        kind = next(iter(says.kinds), None)
+        kind = next(iter(header.kinds), None)
     if kind is None:
         kind = _kind_by_scales(path, columns)
     if kind == "2d":
@@ -463,7 +534,7 @@ def _recognise(
         raise FileFormatError(
             path,
             "missing for splats of kind '3d'; a file with two scales holds 2D splats: pass"
-            " kind='2d'",
+            " kind='2d' (--kind 2dgs)",
             field="scale_2",
         )
     return "3d", ("scale_0", "scale_1", "scale_2")
@@ -482,10 +553,55 @@ def _kind_by_scales(path: Path, columns: Columns) -> Kind:
         raise FileFormatError(
             path,
             f"{third[0]} in every row, at most a hundredth of the other scales: flat 3D splats, or"
-            " 2D ones written for a 3D viewer; pass kind='2d' or kind='3d'",
+            " 2D ones written for a 3D viewer; pass kind='2d' or kind='3d' (--kind)",
             field="scale_2",
         )
     return "3d"
+
+
+def world_error(gaussians: Gaussians) -> Array:
+    """(N,) how far float32 world coordinates move each splat, as a share of its largest scale."""
+    exact = gaussians.world_means()
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved = np.abs(exact.astype(np.float32) - exact)
+    largest = gaussians.scales.detach().cpu().numpy().astype(np.float64)
+    return moved.max(axis=1, initial=0) / largest.max(axis=1, initial=1e-300)
+
+
+def _place(
+    path: Path, g: Gaussians, coordinates: Coordinates, tolerance: float
+) -> tuple[Array, npt.NDArray[np.float32]]:
+    """The origin that the file names, and the float32 means relative to it."""
+    check.one_of(coordinates, get_args(Coordinates), "coordinates")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance: got {tolerance}, expected a share of the scales >= 0")
+    error = world_error(g)
+    moved = int((~(error <= tolerance)).sum())
+    if coordinates == "relative" or (coordinates == "auto" and moved):
+        offset, means = _split_origin(g.means.numpy())
+        origin = g.origin + offset
+        if coordinates == "auto":
+            _warn(
+                f"{path}: means are relative to the comment 'attnwarp origin"
+                f" {' '.join(repr(float(v)) for v in origin)}', and other programs will show the"
+                f" splats around zero: float32 world coordinates would move {moved} of {len(g)} by"
+                f" more than {tolerance:g} of their scale; coordinates='world' (--coordinates"
+                " world) writes those"
+            )
+        return origin, means
+    with np.errstate(over="ignore"):
+        means = g.world_means().astype(np.float32)
+    check.finite(means, "means (world coordinates in float32)")
+    if moved:
+        _warn(
+            f"{path}: float32 world coordinates move {moved} of {len(g)} splats by more than"
+            f" {tolerance:g} of their scale, up to {error.max():.3g} of it"
+        )
+    return np.zeros(3), means
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, InputWarning, stacklevel=4)
 
 
 def _split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:

@@ -1,15 +1,21 @@
-"""``.splat`` files: the 32 bytes a splat that web viewers load."""
+"""``.splat`` files: the 32 bytes a splat that web viewers load.
+
+Layout of github.com/antimatter15/splat.
+"""
 
 from __future__ import annotations
 
 import os
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
+import torch
 
+from attnwarp import check
 from attnwarp.gaussians import SH_C0, Gaussians
-from attnwarp.io.file import write_atomically
-from attnwarp.io.ply import THIRD_SCALE
+from attnwarp.io.file import FileFormatError, existing_file, write_atomically
+from attnwarp.io.ply import THIRD_SCALE, WORLD_TOLERANCE, world_error
 
 RECORD = np.dtype(
     [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)]
@@ -22,7 +28,7 @@ def write_splat(
     gaussians: Gaussians,
     *,
     third_scale: float = THIRD_SCALE,
-    relative_to_origin: bool = False,
+    coordinates: Literal["world", "relative"] = "world",
 ) -> None:
     """Write splats as ``.splat``, for viewing; the format keeps neither view-dependent colour nor
     the origin.
@@ -37,30 +43,33 @@ def write_splat(
         path: the file; an older one is replaced, atomically.
         gaussians: what to write.
         third_scale: third scale of 2D splats, in scene units.
-        relative_to_origin: write positions without ``gaussians.origin``. World positions are
-            written otherwise.
+        coordinates: "world", or "relative" for positions without ``gaussians.origin``.
 
     Raises:
         ValueError: a value of ``gaussians`` is out of range, ``third_scale`` is not positive, or
-            float32 world positions would move a splat by more than a tenth of its largest scale.
+            float32 world positions would move a splat by more than a hundredth of its largest
+            scale.
     """
     g = replace(gaussians.detach().to(device="cpu"))
     if not (np.isfinite(third_scale) and third_scale > 0):
         raise ValueError(
             f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
         )
+    check.one_of(coordinates, ("world", "relative"), "coordinates")
+    if coordinates == "relative":
+        g = replace(g, origin=np.zeros(3))
     scales = g.scales.numpy().astype(np.float64)
-    exact = g.means.numpy().astype(np.float64) if relative_to_origin else g.world_means()
-    position = exact.astype(np.float32)
-    error = np.abs(position - exact).max(axis=1) if len(g) else np.zeros(0)
-    bad = error > 0.1 * scales.max(axis=1)
+    error = world_error(g)
+    bad = ~(error <= WORLD_TOLERANCE)
     if bad.any():
         row = int(np.argmax(bad))
         raise ValueError(
             f"means: float32 world positions, all that .splat holds, would move splat {row} by"
-            f" {error[row]:.3g} ({int(bad.sum())} of {len(g)} move by more than a tenth of their"
-            " scale); pass relative_to_origin=True and place the scene in the viewer"
+            f" {error[row]:.3g} of its scale ({int(bad.sum())} of {len(g)} by more than"
+            f" {WORLD_TOLERANCE:g}); pass coordinates='relative' (--coordinates relative) and place"
+            " the scene in the viewer"
         )
+    position = g.world_means().astype(np.float32)
     opacity = g.opacities.numpy().astype(np.float64)
     order = np.argsort(-scales.prod(axis=1) * opacity, kind="stable")
     if g.kind == "2d":
@@ -76,3 +85,65 @@ def write_splat(
     )
     rows["quat"] = np.clip(np.round(128 + 128 * quats), 0, 255)
     write_atomically(path, lambda stream: stream.write(rows[order].tobytes()))
+
+
+def read_splat(path: str | os.PathLike[str]) -> Gaussians:
+    """Read ``.splat``: 3D splats with constant colour, as precise as their bytes.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Gaussians in float32, of degree 0, in the order of the file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        FileFormatError: not a whole number of records, a value that is not finite, a scale that is
+            not positive, or a quaternion of zeros; the message names the first bad row.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.io import read_splat, write_splat
+        >>> one = Gaussians(
+        ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
+        ...     torch.ones(1), torch.zeros(1, 1, 3),
+        ... )
+        >>> write_splat("one.splat", one)
+        >>> read_splat("one.splat").scales
+        tensor([[1., 1., 1.]])
+    """
+    path = existing_file(path)
+    data = path.read_bytes()
+    if len(data) % RECORD.itemsize:
+        raise FileFormatError(
+            path,
+            f"has {len(data)} bytes, expected a multiple of {RECORD.itemsize}; it is no .splat"
+            " file, or not whole",
+        )
+    rows = np.frombuffer(data, RECORD)
+    quats = (rows["quat"].astype(np.float32) - 128) / 128
+    for field, bad, expected in (
+        ("position", ~np.isfinite(rows["position"]).all(axis=1), "finite numbers"),
+        ("scale", ~(np.isfinite(rows["scale"]) & (rows["scale"] > 0)).all(axis=1), "lengths > 0"),
+        ("quaternion", ~quats.any(axis=1), "a rotation"),
+    ):
+        if bad.any():
+            row = int(np.argmax(bad))
+            value = rows["quat" if field == "quaternion" else field][row]
+            raise FileFormatError(
+                path,
+                f"{value.tolist()} in row {row} ({int(bad.sum())} of {len(rows)} rows), expected"
+                f" {expected}; the file is damaged",
+                field=field,
+                row=row,
+            )
+    rgba = rows["rgba"].astype(np.float32) / 255
+    return Gaussians(
+        "3d",
+        torch.from_numpy(rows["position"].astype(np.float32)),
+        torch.from_numpy(quats),
+        torch.from_numpy(rows["scale"].astype(np.float32)),
+        torch.from_numpy(rgba[:, 3].copy()),
+        Gaussians.sh_from_rgb(torch.from_numpy(rgba[:, :3].copy())),
+    )

@@ -8,18 +8,25 @@ world of the file: ``applied_transform`` is handed on as information, and instan
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import os
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.io.dataset import Dataset, Missing, image_size, nearest_rotation, with_images
-from attnwarp.io.file import FileFormatError, existing_file, write_atomically
+from attnwarp.errors import InputWarning, suggest
+from attnwarp.io.dataset import Dataset, Distorted, Missing, nearest_rotation, with_images
+from attnwarp.io.file import FileFormatError, existing_file, is_file, write_atomically
+from attnwarp.io.images import image_size
+from attnwarp.io.lens import Lens
 from attnwarp.io.ply import read_points, write_points
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +44,12 @@ IMAGE_SUFFIXES = (
     ".tiff",
     ".exr",
 )
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+"""Keys of the distortion coefficients, in the order of OpenCV's vector."""
+
+DISTORTION_LIST = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""What the six numbers of nerfstudio's ``distortion_params`` are."""
+
 PINHOLE_MODELS = (
     "OPENCV",
     "PINHOLE",
@@ -49,6 +61,42 @@ PINHOLE_MODELS = (
 )
 """Values of ``camera_model`` that are a pinhole as long as every distortion coefficient is zero."""
 
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+CHANGES_THE_PICTURE = {
+    "mask_path": "pixels that a mask leaves out",
+    "rolling_shutter": "a rolling shutter",
+    "transform_matrix_start": "a camera that moves during the exposure",
+    "transform_matrix_end": "a camera that moves during the exposure",
+    "skew": "axes that are not at right angles",
+    "ftheta_p0": "an f-theta lens",
+    "latlong": "a panorama",
+    "equirectangular": "a panorama",
+    "orthographic": "an orthographic camera",
+    "white_transparent": "white pixels that are transparent",
+    "black_transparent": "black pixels that are transparent",
+    "mask_color": "a colour that is transparent",
+    "fix_premult": "alpha of another kind",
+    "sharpen": "sharpened pictures",
+}
+"""Keys that are not read though they change what a picture shows, and how; refused if set."""
+
+UNUSED = {
+    "aabb_scale", "scale", "offset", "up", "n_frames", "from_na", "render_aabb", "sharpness",
+    "rotation", "colmap_im_id", "colmap_image_id", "depth_file_path", "depth_path", "normal_path",
+    "integer_depth_scale", "enable_depth_loading", "enable_ray_loading", "importance_sampling",
+    "orientation_override", "auto_scale_poses_override", "applied_scale", "time", "timestamp",
+    "driver_parameters", "n_extra_learnable_dims", "ftheta_p1", "ftheta_p2", "ftheta_p3",
+    "ftheta_p4", "ftheta_cx", "ftheta_cy",
+}  # fmt: skip
+"""Keys that change no picture: other programs' hints, and how they fit a scene into their box."""
+
+USED = {
+    "camera_model", "is_fisheye", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy",
+    "w", "h", "file_path", "transform_matrix", "frames", "ply_file_path", "applied_transform",
+    "distortion_params", *DISTORTION, *(f"{split}_filenames" for split in SPLITS),
+}  # fmt: skip
+
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
 
 
@@ -58,6 +106,8 @@ def read_transforms(
     missing_images: Missing = "error",
     resize_cameras: bool = False,
     points: bool = True,
+    distorted: Distorted = "error",
+    ignore_keys: Sequence[str] = (),
 ) -> Dataset:
     """Read a transforms.json.
 
@@ -75,23 +125,36 @@ def read_transforms(
             refusing.
         points: False to leave the points out; their file is then not read, and may be missing or
             damaged.
+        distorted: "error" to refuse lens distortion, or "keep" to hand it on in
+            ``Dataset.lenses`` for :func:`undistort`.
+        ignore_keys: keys to pass over although they change what a picture shows, such as
+            "mask_path".
 
     Raises:
         FileNotFoundError: no such file.
         FileFormatError: not JSON, a key that is missing or of the wrong type, lens distortion, a
-            pose that is not rigid, missing images; the message names the frame and the key.
+            key that changes the picture and is not read, a pose that is not rigid, missing images,
+            a split that names no frame; the message names the frame and the key.
+
+    Warns:
+        InputWarning: keys that are not understood; frames that no split names.
     """
+    check.one_of(distorted, ("error", "keep"), "distorted")
     path = Path(path)
+    read = functools.partial(
+        _read_file,
+        missing_images=missing_images,
+        resize_cameras=resize_cameras,
+        with_points=points,
+        distorted=distorted,
+        ignore_keys=ignore_keys,
+    )
     if not path.is_dir():
-        return _read_file(path, _split_of(path), missing_images, resize_cameras, points)
+        return read(path, _split_of(path))
     if (path / "transforms.json").exists():
-        return _read_file(path / "transforms.json", None, missing_images, resize_cameras, points)
+        return read(path / "transforms.json", None)
     files = [path / f"transforms_{split}.json" for split in SPLITS]
-    parts = [
-        _read_file(file, _split_of(file), missing_images, resize_cameras, points)
-        for file in files
-        if file.exists()
-    ]
+    parts = [read(file, _split_of(file)) for file in files if file.exists()]
     if not parts:
         raise FileNotFoundError(
             f"{path}: neither transforms.json nor transforms_train.json is there"
@@ -104,6 +167,7 @@ def read_transforms(
         with_points.colors,
         [split for part in parts for split in part.splits],
         parts[0].applied_transform,
+        [lens for part in parts for lens in part.lenses],
     )
 
 
@@ -114,7 +178,8 @@ def write_transforms(
     are not copied.
 
     Read back, rotations, camera centres to one rounding of float64, intrinsics, points and splits
-    are the same.
+    are the same. nerfstudio asks for all three splits as soon as there is one: where only "test" or
+    only "val" is there beside "train", its images are written under both names.
 
     Args:
         path: the file, or a folder in which transforms.json is written.
@@ -123,8 +188,16 @@ def write_transforms(
         points_name: name of the point cloud beside the file.
 
     Raises:
-        ValueError: a camera with skew, which the format cannot hold, or with neither image nor
-            name.
+        ValueError: a camera with skew, which the format cannot hold, with a lens, or with neither
+            image nor name.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Dataset, read_transforms, write_transforms
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=8, height=6, fov_y=40, name="a")
+        >>> write_transforms("transforms.json", Dataset([camera], [None]))
+        >>> read_transforms("transforms.json", missing_images="none").cameras[0].width
+        8
     """
     path = Path(path)
     path = path / "transforms.json" if path.is_dir() else path
@@ -133,6 +206,10 @@ def write_transforms(
         if camera.K[0, 1] != 0:
             raise ValueError(
                 f"dataset: camera {i} has skew {camera.K[0, 1]}, which transforms.json cannot hold"
+            )
+        if dataset.lenses[i] is not None:
+            raise ValueError(
+                f"dataset: camera {i} ({camera.name}) has a lens; undistort the images first"
             )
         name = (
             camera.name if image is None else Path(os.path.relpath(image, path.parent)).as_posix()
@@ -159,10 +236,14 @@ def write_transforms(
         frames = [frame | each for frame, each in zip(frames, intrinsics, strict=True)]
     if dataset.applied_transform is not None:
         data["applied_transform"] = dataset.applied_transform.tolist()
-    for split in sorted({split for split in dataset.splits if split is not None}):
-        data[f"{split}_filenames"] = [
-            name for name, its in zip(names, dataset.splits, strict=True) if its == split
-        ]
+    members = {
+        split: [name for name, its in zip(names, dataset.splits, strict=True) if its == split]
+        for split in SPLITS
+    }
+    held_out = members["test"] or members["val"]
+    if members["train"] and held_out:
+        members["test"], members["val"] = members["test"] or held_out, members["val"] or held_out
+    data |= {f"{split}_filenames": members[split] for split in SPLITS if members[split]}
     if dataset.points is not None:
         write_points(path.with_name(points_name), dataset.points, dataset.colors)
         data["ply_file_path"] = points_name
@@ -179,18 +260,24 @@ def _split_of(path: Path) -> str | None:
 
 
 def _read_file(
-    path: Path, split: str | None, missing_images: Missing, resize_cameras: bool, with_points: bool
+    path: Path,
+    split: str | None,
+    *,
+    missing_images: Missing,
+    resize_cameras: bool,
+    with_points: bool,
+    distorted: Distorted,
+    ignore_keys: Sequence[str],
 ) -> Dataset:
     path = existing_file(path)
-    try:
-        data = json.loads(path.read_bytes())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise FileFormatError(path, f"not JSON: {error}") from error
+    data = _read_json(path)
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
         raise FileFormatError(path, "missing or empty, expected a list of frames", field="frames")
-    cameras, paths, splits = [], [], []
-    named = {name: each for each in SPLITS for name in _names_of_split(path, data, each)}
+    cameras: list[Camera] = []
+    lenses: list[Lens | None] = []
+    names: list[str] = []
+    paths: list[Path] = []
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise FileFormatError(
@@ -199,21 +286,39 @@ def _read_file(
         name = frame.get("file_path")
         if not isinstance(name, str) or not name:
             raise FileFormatError(
-                path, f"got {name!r}, expected a path", field=f"frames[{i}].file_path", row=i
+                path,
+                f"got {brief(name)}, expected a path",
+                field=f"frames[{i}].file_path",
+                row=i,
             )
         image = _find_image(path.parent / name)
-        cameras.append(_camera(_Values(path, i, name, frame, data), image))
+        values = _Values(path, i, name, frame, data)
+        _check_keys(values, ignore_keys)
+        lens = _lens(values)
+        if lens is not None and distorted == "error":
+            raise values.refuse(*_distortion_message(values, lens))
+        cameras.append(_camera(values, image))
+        lenses.append(lens)
+        names.append(name)
         paths.append(image)
-        splits.append(named.get(name, split))
-    cameras, found = with_images(
+    unknown = sorted({key for level in (data, *frames) for key in level} - USED - UNUSED)
+    unknown = [key for key in unknown if key not in CHANGES_THE_PICTURE]
+    if unknown:
+        warnings.warn(
+            f"{path}: not used, as their meaning is not known: {', '.join(unknown)[:200]}",
+            InputWarning,
+            stacklevel=2,
+        )
+    splits = _splits(path, data, names, paths, split)
+    cameras, available = with_images(
         path, cameras, paths, missing_images=missing_images, resize_cameras=resize_cameras
     )
     points = colors = None
     ply = data.get("ply_file_path") if with_points else None
     if ply is not None:
         if not isinstance(ply, str):
-            raise FileFormatError(path, f"got {ply!r}, expected a path", field="ply_file_path")
-        if not (path.parent / ply).is_file():
+            raise FileFormatError(path, f"got {brief(ply)}, expected a path", field="ply_file_path")
+        if not is_file(path.parent / ply):
             raise FileFormatError(
                 path,
                 f"{path.parent / ply} is missing; put it there or remove the key",
@@ -223,26 +328,124 @@ def _read_file(
     applied = None
     if "applied_transform" in data:
         applied = _matrix(path, "applied_transform", None, data["applied_transform"])[:3]
-    return Dataset(cameras, found, points, colors, splits, applied)
+    return Dataset(cameras, available, points, colors, splits, applied, lenses)
 
 
-def _names_of_split(path: Path, data: dict[str, Any], split: str) -> list[str]:
-    key = f"{split}_filenames"
-    names = data.get(key, [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise FileFormatError(path, "expected a list of paths", field=key)
-    return names
+def brief(value: Any) -> str:
+    """A value in an error: its beginning alone, since it may be of any length."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # thousands of digits, or of brackets
+        text = type(value).__name__
+    return text if len(text) <= 60 else f"{text[:60]}..."
+
+
+def _read_json(path: Path) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result = dict(pairs)
+        if len(result) < len(pairs):
+            names = [name for name, _ in pairs]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise FileFormatError(path, "stands twice in one object; remove one", field=twice[:60])
+        return result
+
+    try:
+        return json.loads(path.read_bytes(), object_pairs_hook=unique)
+    except FileFormatError:
+        raise
+    except RecursionError:
+        raise FileFormatError(path, "not JSON: brackets are nested too deeply") from None
+    except ValueError as error:
+        first = str(error).splitlines()[0]
+        raise FileFormatError(path, f"not JSON: {first}; write the file again") from None
+
+
+def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
+    for key, effect in CHANGES_THE_PICTURE.items():
+        value = values.get(key)
+        if key in ignore_keys or not value:
+            continue
+        if isinstance(value, list) and not any(value):
+            continue
+        raise values.refuse(
+            key,
+            f"got {brief(value)}: {effect}, which is not supported; prepare the images without it,"
+            f" or pass ignore_keys=[{key!r}] (--ignore-key {key})",
+        )
+
+
+def _splits(
+    path: Path, data: dict[str, Any], names: list[str], images: list[Path], split: str | None
+) -> list[str | None]:
+    """The split of each frame: what the lists of the file say, else ``split``.
+
+    Names are compared as paths, so "./a.png" is "a.png", with or without the image's suffix. A
+    frame in both test and val belongs to test.
+    """
+    frames: dict[str, list[int]] = {}
+    for i, (name, image) in enumerate(zip(names, images, strict=True)):
+        for key in {os.path.normpath(path.parent / name), os.path.normpath(image)}:
+            frames.setdefault(key, []).append(i)
+    result: list[str | None] = [split] * len(names)
+    lists = [each for each in SPLITS if f"{each}_filenames" in data]
+    for each in lists:
+        key = f"{each}_filenames"
+        listed = data[key]
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise FileFormatError(path, "expected a list of paths", field=key)
+        members = [
+            frames.get(os.path.normpath(path.parent / name))
+            or frames.get(os.path.normpath(_find_image(path.parent / name)), [])
+            for name in listed
+        ]
+        lost = [name for name, indices in zip(listed, members, strict=True) if not indices]
+        if lost:
+            raise FileFormatError(
+                path,
+                f"{len(lost)} of {len(listed)} names are those of no frame: "
+                f"{', '.join(map(brief, lost[:3]))}{suggest(lost[0], names)}; name frames by their"
+                " file_path",
+                field=key,
+            )
+        for i in (i for indices in members for i in indices):
+            if each != "train" and result[i] == "train":
+                raise FileFormatError(
+                    path, f"{brief(names[i])} is in train_filenames too; remove one", field=key
+                )
+            result[i] = each
+    without = [name for name, each in zip(names, result, strict=True) if each is None]
+    if lists and without:
+        warnings.warn(
+            f"{path}: {len(without)} of {len(names)} frames are in no split and not used by a"
+            f" fit: {', '.join(map(brief, without[:3]))}",
+            InputWarning,
+            stacklevel=2,
+        )
+    return result
 
 
 def _find_image(path: Path) -> Path:
     """``path``, or if there is no such file, ``path`` with the first image suffix that makes it
     one.
     """
-    if path.is_file():
+    if is_file(path):
         return path
     return next(
-        (each for suffix in IMAGE_SUFFIXES if (each := Path(f"{path}{suffix}")).is_file()), path
+        (each for suffix in IMAGE_SUFFIXES if is_file(each := Path(f"{path}{suffix}"))), path
     )
+
+
+def number(value: Any) -> float | None:
+    """A JSON number as float; None for anything else, "1.0" and true among it, and what is not
+    finite.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        result = float(value)
+    except OverflowError:
+        return None
+    return result if math.isfinite(result) else None
 
 
 class _Values:
@@ -269,37 +472,89 @@ class _Values:
         value = self.get(key) if level is None else level.get(key)
         if value is None:
             return None
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
-            raise self.refuse(key, f"got {value!r}, expected a finite number")
-        return float(value)
+        result = number(value)
+        if result is None:
+            raise self.refuse(key, f"got {brief(value)}, expected a finite number")
+        return result
+
+
+def _lens(values: _Values) -> Lens | None:
+    """The lens of a frame, None for a pinhole.
+
+    Coefficients stand in ``distortion_params`` or under their own keys, in the frame or at the top.
+    """
+    model = values.get("camera_model")
+    if model is not None and model not in (*PINHOLE_MODELS, *FISHEYE_MODELS):
+        raise values.refuse(
+            "camera_model",
+            f"got {brief(model)}, expected one of {', '.join((*PINHOLE_MODELS, *FISHEYE_MODELS))};"
+            " undistort the images first",
+        )
+    fisheye = model in FISHEYE_MODELS or bool(values.get("is_fisheye"))
+    # A level without any coefficient says nothing; two that differ cannot both be right.
+    given = [c for level in values.levels if (c := _coefficients(values, level)) is not None]
+    if len(given) == 2 and given[0] != given[1]:
+        raise values.refuse(
+            "k1", "lens distortion differs between the frame and the top of the file"
+        )
+    by_name = given[0] if given else dict.fromkeys(DISTORTION, 0.0)
+    if by_name["k4"] and not fisheye and model != "FULL_OPENCV":
+        # The term of a polynomial for some programs, of a denominator for others.
+        raise values.refuse(
+            "k4", f"got {by_name['k4']:g}, expected 0 unless camera_model is FULL_OPENCV"
+        )
+    if fisheye:
+        names = ("k1", "k2", "k3", "k4")
+        spare = [key for key in DISTORTION if key not in names and by_name[key]]
+        if spare:
+            raise values.refuse(spare[0], "got a coefficient that a fisheye lens does not have")
+        return Lens("fisheye", tuple(by_name[key] for key in names))
+    lens = Lens("brown", tuple(by_name[key] for key in DISTORTION))
+    return None if lens.is_pinhole else lens
+
+
+def _distortion_message(values: _Values, lens: Lens) -> tuple[str, str]:
+    """The key at fault, and what to do."""
+    remedy = (
+        "expected a pinhole; undistort the images first (attnwarp undistort DATA OUT, or COLMAP's"
+        " image_undistorter)"
+    )
+    if lens.kind == "fisheye":
+        key = "is_fisheye" if values.get("is_fisheye") else "camera_model"
+        return key, f"got {brief(values.get(key))}, {remedy}"
+    key = next(key for key, c in zip(DISTORTION, lens.coefficients, strict=True) if c)
+    value = lens.coefficients[DISTORTION.index(key)]
+    return key, f"got lens distortion {value:g}, {remedy}"
+
+
+def _coefficients(values: _Values, level: dict[str, Any]) -> dict[str, float] | None:
+    """Coefficients by name of one level; None where it has none."""
+    own = {key: values.number(key, level) for key in DISTORTION}
+    listed = level.get("distortion_params")
+    if listed is None:
+        if all(value is None for value in own.values()):
+            return None
+        return {key: value or 0.0 for key, value in own.items()}
+    coefficients = [number(v) for v in listed] if isinstance(listed, list) else []
+    if len(coefficients) != len(DISTORTION_LIST) or None in coefficients:
+        raise values.refuse(
+            "distortion_params",
+            f"got {brief(listed)}, expected six numbers: {' '.join(DISTORTION_LIST)}",
+        )
+    result = dict.fromkeys(DISTORTION, 0.0)
+    result.update(
+        {key: value or 0.0 for key, value in zip(DISTORTION_LIST, coefficients, strict=True)}
+    )
+    for key, value in own.items():
+        if value is not None and value != result[key]:
+            raise values.refuse(key, "differs from distortion_params; remove one of them")
+    return result
 
 
 def _camera(values: _Values, image: Path) -> Camera:
-    model = values.get("camera_model")
-    if model is not None and model not in PINHOLE_MODELS:
-        raise values.refuse(
-            "camera_model", f"got {model!r}, expected a pinhole; undistort the images first"
-        )
-    if values.get("is_fisheye"):
-        raise values.refuse(
-            "is_fisheye", "a fisheye lens is not a pinhole; undistort the images first"
-        )
-    for key in DISTORTION:
-        value = values.number(key)
-        if value:
-            raise values.refuse(
-                key,
-                f"got lens distortion {value:g}, expected 0; undistort the images first (COLMAP's"
-                " image_undistorter or OpenCV's undistort) and write the file for the undistorted"
-                " ones",
-            )
     size = [values.number("w"), values.number("h")]
     if None in size:
-        if not image.is_file():
+        if not is_file(image):
             raise values.refuse(
                 "w, h", f"missing, and the image {image} is not there to take the size from"
             )
@@ -345,23 +600,31 @@ def _camera(values: _Values, image: Path) -> Camera:
     pose = np.eye(4)
     pose[:3, :3] = R.T
     pose[:3, 3] = -R.T @ matrix[:3, 3]
-    return Camera(K, pose, width, height, values.name.removeprefix("./"))
+    try:
+        return Camera(K, pose, width, height, values.name.removeprefix("./"))
+    except ValueError as error:
+        raise values.refuse("transform_matrix", str(error)) from None
 
 
 def _matrix(path: Path, key: str, row: int | None, value: Any) -> Array:
     """(4, 4) or (3, 4) of finite numbers, with the last row [0, 0, 0, 1] if it is there."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        matrix = np.zeros(0)
-    if matrix.shape not in ((4, 4), (3, 4)):
+    rows = value if isinstance(value, list) else []
+    if len(rows) not in (3, 4) or not all(isinstance(r, list) and len(r) == 4 for r in rows):
         raise FileFormatError(
-            path, f"got {str(value)[:60]}, expected a 4 x 4 matrix of numbers", field=key, row=row
+            path, f"got {brief(value)}, expected a 4 x 4 matrix of numbers", field=key, row=row
         )
-    if not np.isfinite(matrix).all():
+    # Strings and booleans, which numpy would take for numbers, are none.
+    entries = [number(entry) for entries in rows for entry in entries]
+    if None in entries:
+        wrong = [entry for entries in rows for entry in entries][entries.index(None)]
         raise FileFormatError(
-            path, "holds a value that is not finite; leave the frame out", field=key, row=row
+            path,
+            f"holds {brief(wrong)}, expected 4 x 4 finite numbers; correct it or leave the frame"
+            " out",
+            field=key,
+            row=row,
         )
+    matrix = np.array(entries, dtype=np.float64).reshape(-1, 4)
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
         raise FileFormatError(
             path,

@@ -286,26 +286,29 @@ class _Splats:
         J = torch.stack(
             [inverse, zero, -limit[0] * inverse, zero, inverse, -limit[1] * inverse], dim=-1
         ).reshape(-1, 2, 3)
-        J = K[:2, :2] @ J
-        cov = J @ sigma @ J.transpose(1, 2)
-        blurred = cov + constants.BLUR_3D * torch.eye(2, dtype=torch.float64)
-        det = blurred[:, 0, 0] * blurred[:, 1, 1] - blurred[:, 0, 1] ** 2
+        # The columns of M are the splat's axes in the picture, cov = M M^T. Sums of squares keep
+        # their digits where S11 S22 - S12^2 of a needle loses all: with axes of 1e6 px and less
+        # than one, the squares are 1e24 apart.
+        M = K[:2, :2] @ J @ half
+        blur = constants.BLUR_3D
+        minors = torch.linalg.cross(M[:, 0], M[:, 1])
+        sharp = (minors**2).sum(-1)
+        det = sharp + blur * (M**2).sum((-1, -2)) + blur**2
         opacity = self.opacities
         if inputs.antialiased:
-            sharp = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
             opacity = opacity * (sharp / det).clamp(min=constants.COMPENSATION_MIN).sqrt()
         xc, yc = _project(c, in_front, K)
         dx, dy = x[:, None] - xc, y[:, None] - yc
-        power = (
-            blurred[:, 1, 1] * dx * dx - 2 * blurred[:, 0, 1] * dx * dy + blurred[:, 0, 0] * dy * dy
-        ) / det
+        across = dx[..., None] * M[:, 1] - dy[..., None] * M[:, 0]
+        power = ((across**2).sum(-1) + blur * (dx * dx + dy * dy)) / det
         alpha = opacity * torch.exp(-0.5 * power)
         drawn = in_front.expand_as(alpha)
         if inputs.depth == "center":
             return alpha, depth.expand_as(alpha), drawn
-        precision = self.axes / self.scales[:, None, :] ** 2 @ self.axes.transpose(1, 2)
-        along = torch.einsum("pi,nij,nj->pn", rays, precision, c)
-        across = torch.einsum("pi,nij,pj->pn", rays, precision, rays)
+        # d.P.c and d.P.d in the splat's own axes and scales: P itself spans the scales squared.
+        ray = torch.einsum("pi,nij->pnj", rays, self.axes) / self.scales
+        center = torch.einsum("ni,nij->nj", c, self.axes) / self.scales
+        along, across = (ray * center).sum(-1), (ray * ray).sum(-1)
         lo, hi = self._extent(sigma[:, 2, 2])
         return alpha, torch.minimum(torch.maximum(along / across, lo), hi), drawn
 

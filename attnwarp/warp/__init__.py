@@ -1,36 +1,34 @@
 """Warps: correspondences between two views, what the source saw, and sampling along them."""
 
 from attnwarp.warp.correspondence import (
-    SNAP,
-    TAP_SPREAD,
     Correspondence,
     correspond,
     correspond_at,
     in_bounds,
     layer_size,
-    resize_depth,
-    sample,
-    sample_at,
-    sample_depth,
 )
-from attnwarp.warp.settings import PRESETS, WarpSettings, preset
-from attnwarp.warp.view import (
+from attnwarp.warp.depth import TAP_SPREAD, depth_slope, resize_depth
+from attnwarp.warp.features import FeatureWarp
+from attnwarp.warp.masks import resize_mask
+from attnwarp.warp.rules import (
     EXACT_DEPTH_TOLERANCE,
-    FeatureWarp,
-    Surface,
-    WarpedView,
     angle_between,
     camera_frame,
     depth_agrees,
-    depth_slope,
     facing,
     gaussian_filter,
     in_front,
     opaque,
     photometric,
-    render_surface,
-    resize_mask,
     source_incidence,
+)
+from attnwarp.warp.sampling import sample, sample_at, sample_depth
+from attnwarp.warp.settings import PRESETS, WarpSettings, preset
+from attnwarp.warp.taps import SNAP
+from attnwarp.warp.view import (
+    Surface,
+    WarpedView,
+    render_surface,
     warp_surfaces,
     warp_view,
 )

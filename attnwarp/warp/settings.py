@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from attnwarp import check
-from attnwarp.warp.correspondence import DepthInterpolation, PixelCenters
 
+PixelCenters = Literal["half", "integer"]
+DepthInterpolation = Literal["inverse", "bilinear", "nearest"]
 Bounds = Literal["source", "target"]
 NormalTest = Literal["none", "facing", "camera_frame", "source_incidence"]
 GaussianFilter = Literal["none", "printed", "facing", "camera_frame", "source_incidence"]
@@ -48,7 +49,7 @@ class WarpSettings:
             there.
         depth_relative, depth_slope: tolerance of that test, ``depth_relative * z + depth_slope *
             slope``, the slope being the depth's change per pixel
-            (:func:`attnwarp.warp.view.depth_slope`).
+            (:func:`attnwarp.warp.depth.depth_slope`).
         photometric: largest mean over channels of abs(warped source image - target image), sRGB in
             [0, 1], on the images before the edit; None leaves the test out.
         segment: only pixels of the target's segment, where one is given.
@@ -185,7 +186,7 @@ would open holes through which the target's depth shows the far side. Depth by r
 intersection, its median along the ray, carried to a feature grid in 1 / z without blending across
 edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered
 splats and come from the measurements in docs/warping.md; exact depth takes
-``attnwarp.warp.view.EXACT_DEPTH_TOLERANCE`` and ``attnwarp.warp.correspondence.TAP_SPREAD``.
+``attnwarp.warp.rules.EXACT_DEPTH_TOLERANCE`` and ``attnwarp.warp.depth.TAP_SPREAD``.
 """
 
 

@@ -1,17 +1,21 @@
-"""The command line as a person meets it: in a process of its own, with files on disk."""
+"""The command line as a person meets it, in the process of the tests where that is not the point."""
 
 import functools
 import json
+import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians
@@ -102,7 +106,7 @@ def test_help_imports_nothing_heavy():
 
 def test_fit_and_render_do_what_they_say(data, tmp_path):
     out = tmp_path / "fit"
-    done = call(
+    done = in_process(
         "fit",
         data,
         "--threads",
@@ -118,7 +122,7 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
         "--set",
         "evaluate_every=20",
     )
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert "splats.ply: " in done.stdout and "held-out PSNR" in done.stdout
     assert "loss" in done.stderr and "PSNR" in done.stderr  # plain lines, as there is no terminal
     history = [json.loads(line) for line in (out / "history.jsonl").read_text().splitlines()]
@@ -132,7 +136,7 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
     assert cv2.imread(str(out / "held_out" / "0.png")).shape == (32, 64, 3)
 
     pictures = tmp_path / "pictures"
-    done = call(
+    done = in_process(
         "render",
         out / "splats.ply",
         data,
@@ -143,7 +147,7 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
         "--background",
         "0.2,0.4,1",
     )
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     assert len(list(pictures.iterdir())) == 27
     image = cv2.imread(str(pictures / "3.png"))
     # One step of 8 bits: the rim of a splat may reach into the corner.
@@ -153,8 +157,6 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
 
 
 def test_the_ply_opens_in_another_reader(data, tmp_path):
-    from plyfile import PlyData
-
     done = in_process("fit", data, "--kind", "3dgs", "--out", tmp_path, "--iterations", 5)
     assert done.exit_code == 0, done.stderr
     vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
@@ -275,23 +277,13 @@ def test_a_disk_without_room_ends_in_one_clear_line(data, tmp_path, command):
     arguments = [data, "--iterations", 1] if command == "fit" else [tmp_path / "m.ply", data]
     # Once without the limit, lest it be numba's cache of compiled kernels that finds the disk full.
     assert in_process(command, *arguments, "--out", tmp_path / "warm").exit_code == 0
-    done = subprocess.run(
-        [
-            *ATTNWARP,
-            command,
-            *map(str, arguments),
-            "--threads",
-            "1",
-            "--out",
-            str(tmp_path / "out"),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
-    )
-    assert done.returncode == 2, done.stderr
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+    try:
+        done = in_process(command, *arguments, "--threads", 1, "--out", tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert done.exit_code == 2, done.stderr
     assert "Traceback" not in done.stderr
     last = done.stderr.strip().splitlines()[-1]
     assert (
@@ -335,3 +327,210 @@ def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path)
     assert done.exit_code == 0, done.stderr
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0000-a.png", "0001-a.png"]
     assert cv2.imread(str(tmp_path / "out" / "0000-a.png")).shape == (16, 16, 3)
+
+
+# -------- data sets that need a word more
+
+
+def test_a_folder_of_both_formats_and_images_of_another_size_have_their_flags(data, tmp_path):
+    both = tmp_path / "both"
+    shutil.copytree(data, both)
+    (both / "sparse").mkdir()
+    (both / "sparse/cameras.txt").write_text("1 PINHOLE 16 16 20 20 8 8\n")
+    (both / "sparse/images.txt").write_text(
+        "1 1 0 0 0 0 0 3 1 0.png\n\n2 1 0 0 0 0 0 3 1 x.png\n\n"
+    )
+    once = ["fit", both, "--out", tmp_path / "out", "--iterations", 1, "--hold-out", 0]
+    for flags, message in [
+        ([], "(--format)"),
+        (["--format", "colmap"], "(--missing-images none)"),
+        (["--format", "colmap", "--missing-images", "none"], "(--resize-cameras)"),
+        (["--format", "transforms", "--images", both], "(--images): only COLMAP"),
+    ]:
+        done = in_process(*once, *flags)
+        assert done.exit_code == 2 and message in done.stderr, done.stderr
+    flags = ["--format", "colmap", "--missing-images", "none", "--resize-cameras"]
+    done = in_process(*once, *flags, "--points", 20)
+    assert done.exit_code == 0, done.stderr
+
+
+def test_masks_are_not_passed_over_silently(data, tmp_path):
+    text = json.loads((data / "transforms.json").read_text())
+    text["frames"][2]["mask_path"] = "masks/2.png"
+    text["exposure"] = 3
+    (data / "masked.json").write_text(json.dumps(text))
+    write_ply(tmp_path / "m.ply", one_splat())
+    command = ["render", tmp_path / "m.ply", data / "masked.json", "--out", tmp_path / "out"]
+    done = in_process(*command)
+    assert done.exit_code == 2 and "--ignore-key mask_path" in done.stderr
+    done = in_process(*command, "--ignore-key", "mask_path")
+    assert done.exit_code == 0
+    assert done.stderr.splitlines() == [
+        f"attnwarp: warning: {data / 'masked.json'}: not used, as their meaning is not known:"
+        " exposure"
+    ]
+
+
+def test_undistort_makes_a_data_set_that_fit_takes(data, tmp_path):
+    text = json.loads((data / "transforms.json").read_text())
+    (data / "bent.json").write_text(json.dumps({**text, "k1": -0.1}))
+    fit = ["fit", "--iterations", 1, "--out", tmp_path / "fit"]
+    done = in_process(*fit, data / "bent.json")
+    assert done.exit_code == 2 and "attnwarp undistort DATA OUT" in done.stderr
+    done = in_process("undistort", data / "bent.json", tmp_path / "flat")
+    assert done.exit_code == 0, done.stderr
+    assert "9 pictures, 9 of them undistorted" in done.stdout
+    assert in_process(*fit, tmp_path / "flat").exit_code == 0
+
+
+# -------- convert
+
+
+def spread(kind="2d", origin=(0.0, 0.0, 0.0)):
+    random = torch.Generator().manual_seed(1)
+    return Gaussians(
+        kind,
+        torch.randn(20, 3, generator=random),
+        torch.randn(20, 4, generator=random),
+        0.1 + torch.rand(20, 2 if kind == "2d" else 3, generator=random),
+        torch.rand(20, generator=random),
+        torch.randn(20, 16, 3, generator=random),
+        origin=np.array(origin),
+    )
+
+
+def test_convert_makes_thin_3dgs_of_2dgs_and_cuts_harmonics(tmp_path):
+    g = spread()
+    write_ply(tmp_path / "a.ply", g)
+    done = in_process(
+        "convert", tmp_path / "a.ply", tmp_path / "b.ply", "--third-scale", "1e-6", "--sh-degree", 1
+    )
+    assert done.exit_code == 0 and "b.ply: 20 splats" in done.stdout
+    vertex = PlyData.read(tmp_path / "b.ply")["vertex"]
+    np.testing.assert_allclose(vertex["scale_2"], np.log(1e-6), rtol=1e-6)
+    assert [p.name for p in vertex.properties if p.name.startswith("f_rest")] == [
+        f"f_rest_{i}" for i in range(9)
+    ]
+    # f_rest is channel by channel: the first of green is coefficient 1 of green.
+    np.testing.assert_array_equal(vertex["f_rest_3"], g.sh[:, 1, 1].numpy())
+    as_solid = in_process("convert", tmp_path / "b.ply", tmp_path / "c.ply", "--kind", "3dgs")
+    assert as_solid.exit_code == 0 and read_ply(tmp_path / "c.ply").kind == "3d"
+
+
+def test_convert_takes_the_origin_out_and_in(tmp_path):
+    g = spread(origin=(1e6, 0.0, 0.0))
+    write_ply(tmp_path / "a.ply", g, coordinates="relative")
+    done = in_process("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert done.exit_code == 0 and "warning" in done.stderr and "--coordinates" in done.stderr
+    assert np.array_equal(read_ply(tmp_path / "b.ply").origin, g.origin)
+    done = in_process("convert", tmp_path / "a.ply", tmp_path / "c.ply", "--coordinates", "world")
+    assert done.exit_code == 0 and "move" in done.stderr
+    assert (read_ply(tmp_path / "c.ply").origin == 0).all()
+    np.testing.assert_allclose(PlyData.read(tmp_path / "c.ply")["vertex"]["x"], 1e6, atol=5)
+    done = in_process("convert", tmp_path / "a.ply", tmp_path / "d.splat")
+    assert done.exit_code == 2 and "--coordinates relative" in done.stderr
+
+
+def test_convert_to_splat_and_back(tmp_path):
+    write_ply(tmp_path / "a.ply", spread("3d"))
+    assert in_process("convert", tmp_path / "a.ply", tmp_path / "b.splat").exit_code == 0
+    assert in_process("convert", tmp_path / "b.splat", tmp_path / "c.ply").exit_code == 0
+    back = read_ply(tmp_path / "c.ply")
+    assert (back.kind, len(back), back.sh_degree) == ("3d", 20, 0)
+    key = lambda g: np.sort(g.world_means()[:, 0])  # noqa: E731
+    np.testing.assert_array_equal(key(back), key(spread("3d")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{a}", "{out}.obj"], "ending in .ply or .splat"),
+        (["{a}", "{out}.ply", "--third-scale", "1"], "--third-scale"),
+        (["{none}", "{out}.ply"], "no such file"),
+    ],
+)
+def test_convert_says_what_it_cannot_do(tmp_path, arguments, message):
+    write_ply(tmp_path / "a.ply", spread("3d"))
+    names = {"a": tmp_path / "a.ply", "out": tmp_path / "out", "none": tmp_path / "none.ply"}
+    done = in_process("convert", *(a.format(**names) for a in arguments))
+    assert done.exit_code == 2 and message in done.stderr
+
+
+def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
+    done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--third-scale", "1e-5")
+    assert done.exit_code == 0, done.stderr
+    vertex = PlyData.read(tmp_path / "splats.ply")["vertex"]
+    np.testing.assert_allclose(vertex["scale_2"], np.log(1e-5), rtol=1e-6)
+    # World coordinates: the blobs are scattered by 0.4 about zero.
+    assert abs(np.mean(vertex["x"])) < 0.5
+    done = in_process("fit", data, "--out", tmp_path, "--kind", "3dgs", "--third-scale", "1e-5")
+    assert done.exit_code == 2 and "--third-scale" in done.stderr
+
+
+# -------- pipes, disks, signals, packages
+
+
+def test_a_closed_pipe_is_no_regression_and_no_traceback(tmp_path):
+    write_ply(tmp_path / "a.ply", spread())
+    for arguments in (["--help"], ["convert", tmp_path / "a.ply", tmp_path / "b.ply"]):
+        receiving, sending = os.pipe()
+        os.close(receiving)
+        done = subprocess.run(
+            [*ATTNWARP, *map(str, arguments)], stdout=sending, stderr=subprocess.PIPE, text=True,
+            timeout=60, check=False,
+        )  # fmt: skip
+        os.close(sending)
+        assert (done.returncode, done.stderr) == (141, ""), done.stderr
+    assert len(read_ply(tmp_path / "b.ply")) == 20
+
+
+def test_output_to_a_full_disk_is_one_line(tmp_path):
+    write_ply(tmp_path / "a.ply", spread())
+    for arguments in (["--help"], ["convert", tmp_path / "a.ply", tmp_path / "b.ply"]):
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(
+                [*ATTNWARP, *map(str, arguments)], stdout=full, stderr=subprocess.PIPE, text=True,
+                timeout=60, check=False,
+            )  # fmt: skip
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.count("\n") == 1 and "No space left on device" in done.stderr
+
+
+def test_a_polite_kill_says_what_is_kept(data, tmp_path, monkeypatch):
+    """In the middle of a render: after the first of the pictures was written."""
+    from attnwarp.io import images
+
+    write_ply(tmp_path / "m.ply", one_splat())
+    encode = images.encode_png
+
+    def killed(rgb):
+        if (tmp_path / "out" / "0.png").exists():
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1)
+        return encode(rgb)
+
+    monkeypatch.setattr(images, "encode_png", killed)
+    done = in_process("render", tmp_path / "m.ply", data, "--out", tmp_path / "out")
+    assert done.exit_code == 130
+    assert done.stderr.startswith(f"attnwarp: stopped; the files in {tmp_path / 'out'} are whole")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["0.png"]
+
+
+def test_a_missing_package_is_named(tmp_path, monkeypatch):
+    write_ply(tmp_path / "a.ply", spread())
+    monkeypatch.setitem(sys.modules, "plyfile", None)
+    done = in_process("convert", tmp_path / "a.ply", tmp_path / "b.ply")
+    assert done.exit_code == 2 and "needs the package plyfile: pip install plyfile" in done.stderr
+
+
+def test_half_a_jpeg_is_refused_by_name(data, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(data, folder)
+    text = (folder / "transforms.json").read_text().replace("4.png", "4.jpg")
+    (folder / "transforms.json").write_text(text)
+    cv2.imwrite(str(folder / "images/4.jpg"), cv2.imread(str(folder / "images/4.png")))
+    whole = (folder / "images/4.jpg").read_bytes()
+    (folder / "images/4.jpg").write_bytes(whole[: len(whole) // 2])
+    done = in_process("fit", folder, "--out", tmp_path / "out", "--iterations", 1)
+    assert done.exit_code == 2
+    assert f"{folder / 'images/4.jpg'}: the picture is damaged" in done.stderr

@@ -8,8 +8,7 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import render
-from attnwarp.warp.correspondence import correspond, in_bounds, sample
-from attnwarp.warp.view import angle_between, resize_mask
+from attnwarp.warp import angle_between, correspond, in_bounds, resize_mask, sample
 
 IDENTITY = np.eye(4)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import typer
 
-from attnwarp_eval.cli import cache, metrics, run, scenes
-from attnwarp_eval.cli.shell import CRASH
+from attnwarp_eval.cli import cache, inspect, metrics, run, scenes
+from attnwarp_eval.cli.shell import CRASH, USAGE
 
 app = typer.Typer(
     name="attnwarp-eval",
@@ -28,6 +28,7 @@ for command in (
     run.studies,
     metrics.metrics,
     metrics.encoders,
+    inspect.inspect,
 ):
     app.command()(command)
 app.add_typer(scenes.app, name="scenes")
@@ -38,9 +39,15 @@ def main() -> None:
     """Entry point of the console script."""
     import traceback
 
+    from attnwarp.errors import missing_extra
+
     try:
         app()
-    except Exception:
+    except Exception as error:
+        explained = missing_extra(error) if isinstance(error, ImportError) else None
+        if explained is not None:
+            typer.echo(f"attnwarp-eval: {explained}", err=True)
+            raise SystemExit(USAGE) from None
         # Python's own exit code for a crash is 1, which here means a regression.
         traceback.print_exc()
         raise SystemExit(CRASH) from None

@@ -18,9 +18,27 @@ from pydantic import (
 
 from attnwarp_eval.colors import to_linear
 
-Vector = tuple[float, float, float]
+FARTHEST = 1e9
+"""Largest coordinate or length, in scene units. Float64 resolves 1e-7 there; the squares and
+products of much larger ones overflow the float32 of what renders them."""
 
-Positive = Annotated[float, Field(gt=0)]
+
+def _no_truth(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"got {str(value).lower()}, expected a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_truth)]
+"""A number, which yes and true are not. YAML reads 1e3 as text, so that text of a number counts."""
+
+Coordinate = Annotated[Number, Field(ge=-FARTHEST, le=FARTHEST)]
+
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+
+Positive = Annotated[Number, Field(gt=0, le=FARTHEST)]
+
+Length = Annotated[Number, Field(ge=0, le=FARTHEST)]
 
 
 def _hex(value: Any) -> str:
@@ -41,7 +59,7 @@ def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return value
 
 
-Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
+Direction = Annotated[Vector, AfterValidator(_direction)]
 """A vector of any length but zero."""
 
 Color = Annotated[str, BeforeValidator(_hex)]

@@ -12,11 +12,18 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from attnwarp_eval.scene import solids
-from attnwarp_eval.scene.base import LATER, Color, Positive, Spec, Vector, linear_rgb
+from attnwarp_eval.scene.base import (
+    LATER,
+    Color,
+    Coordinate,
+    Length,
+    Positive,
+    Spec,
+    Vector,
+    linear_rgb,
+)
 from attnwarp_eval.scene.shapes import Mesh
 from attnwarp_eval.scene.textures import lattice_noise
-
-Width = Annotated[float, Field(ge=0)]
 
 
 class RingSpec(Spec):
@@ -28,10 +35,10 @@ class RingSpec(Spec):
     """
 
     count: int = Field(ge=1, le=500)
-    about: tuple[float, float] = (0.0, 0.0)
+    about: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     sweep: float = 360.0
     jitter: float = Field(0.0, ge=0, le=1)
-    lift: float = 0.0
+    lift: Coordinate = 0.0
     seed: int = 0
 
 
@@ -45,7 +52,7 @@ class _PartSpec(Spec):
 
     mirror: bool = False
     color: Color = "#ffffff"
-    blend: bool | Width = True
+    blend: bool | Length = True
     carve: bool = Field(False, json_schema_extra=LATER)
     ring: RingSpec | None = Field(None, json_schema_extra=LATER)
 
@@ -78,7 +85,7 @@ class BlockPart(_TurnedPart):
 
     type: Literal["block"]
     size: tuple[Positive, Positive, Positive]
-    round: float = Field(0.0, ge=0)
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> BlockPart:
@@ -96,7 +103,7 @@ class DiscPart(_TurnedPart):
     type: Literal["disc"]
     radius: Positive
     height: Positive
-    round: float = Field(0.0, ge=0)
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> DiscPart:
@@ -155,7 +162,7 @@ class BodySpec(Spec):
 
     type: Literal["body"]
     parts: tuple[PartSpec, ...] = Field(min_length=1)
-    blend: float = Field(0.1, ge=0)
+    blend: Length = 0.1
     resolution: int = Field(128, ge=8, le=512)
     position: Vector = (0.0, 0.0, 0.0)
     yaw: float = 0.0

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from attnwarp_eval.scene.base import Color, Direction, Spec, linear_rgb
+from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, linear_rgb
 
 Array = npt.NDArray[np.float64]
 
@@ -22,7 +22,7 @@ class _Texture(Spec):
     variation: float = Field(
         0.0, ge=0, le=1
     )  # share by which a fine noise brightens or darkens the colour
-    grain: float = Field(0.1, gt=0)  # size of that noise, scene units
+    grain: Positive = 0.1  # size of that noise, scene units
 
 
 class Plain(_Texture):
@@ -37,7 +37,7 @@ class Checker(_Texture):
 
     type: Literal["checker"]
     colors: tuple[Color, Color]
-    size: float = Field(gt=0)
+    size: Positive
 
 
 class Stripes(_Texture):
@@ -45,7 +45,7 @@ class Stripes(_Texture):
 
     type: Literal["stripes"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
+    size: Positive
     direction: Direction = (0.0, 0.0, 1.0)
     wobble: float = Field(0.0, ge=0)  # how far noise bends the layers, in layers
 
@@ -55,7 +55,7 @@ class Noise(_Texture):
 
     type: Literal["noise"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
+    size: Positive
     octaves: int = Field(4, ge=1, le=8)
 
 
@@ -67,8 +67,8 @@ class Bricks(_Texture):
     type: Literal["bricks"]
     colors: tuple[Color, ...] = Field(min_length=1)
     mortar: Color
-    size: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
-    joint: float = Field(0.02, gt=0)
+    size: tuple[Positive, Positive]
+    joint: Positive = 0.02
 
 
 class Rings(_Texture):
@@ -78,8 +78,8 @@ class Rings(_Texture):
 
     type: Literal["rings"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
-    center: tuple[float, float] = (0.0, 0.0)
+    size: Positive
+    center: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     wobble: float = Field(0.0, ge=0)  # how far noise bends the rings, in rings
 
 

@@ -18,8 +18,7 @@ from attnwarp_eval.truth import Geometry
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Step
     from attnwarp.gaussians import Gaussians
-    from attnwarp.warp.settings import WarpSettings
-    from attnwarp.warp.view import Surface
+    from attnwarp.warp import Surface, WarpSettings
     from attnwarp_eval.twoview import Hits
 
 
@@ -99,8 +98,7 @@ def surface_error(
         settings: how depth is read off the splats; the median depth if left out.
         edge: (H, W) bool, the band around edges; None for no scores by place.
     """
-    from attnwarp.warp.settings import WarpSettings
-    from attnwarp.warp.view import render_surface
+    from attnwarp.warp import WarpSettings, render_surface
 
     surface = render_surface(splats, camera, settings or WarpSettings(depth_statistic="median"))
     figures = metrics.depth_error(

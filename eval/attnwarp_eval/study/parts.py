@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
-from attnwarp.warp.settings import PRESETS, WarpSettings
+from attnwarp.warp import PRESETS, WarpSettings
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp.io.picture import encode_picture
-from attnwarp.warp.correspondence import sample
-from attnwarp.warp.view import Surface, WarpedView
+from attnwarp.warp import Surface, WarpedView, sample
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 if TYPE_CHECKING:

@@ -6,8 +6,7 @@ from typing import Any
 
 import torch
 
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import Surface, WarpedView, warp_surfaces
+from attnwarp.warp import Surface, WarpedView, WarpSettings, warp_surfaces
 from attnwarp_eval import metrics
 from attnwarp_eval.study.probes.base import Work
 from attnwarp_eval.twoview import TwoView

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval.scene.extent import extent
+from attnwarp_eval.scene.meshes import read_mesh_file
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.shapes import MeshNotice
+from attnwarp_eval.scene.spec import MeshSpec
 from attnwarp_eval.truth.plan import plan
 
 Image = npt.NDArray[Any]
@@ -29,6 +34,16 @@ def describe(scene: Scene) -> str:
     lines.append(f"objects ({len(spec.objects)})")
     for index, item in enumerate(spec.objects):
         lines.append(f"  {index:2} {item.name:16} {item.shape.type:10} {item.texture.type}")
+    for item in spec.objects:
+        if isinstance(item.shape, MeshSpec):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MeshNotice)  # the line itself says it
+                lines.append(f"  {item.shape.file}: {read_mesh_file(scene.mesh_path(item.shape))}")
+    reach = extent(scene)
+    sides = " x ".join(f"{side:.4g}" for side in reach.high - reach.low)
+    lines.append(f"extent: {sides} {spec.units}, made by {', '.join(reach.makers)}")
+    if reach.notice:
+        lines.append(f"  {reach.notice}")
     lines.append(f"lights: {', '.join(light.type for light in spec.lights)}")
     lines.append(
         f"cameras ({1 + len(scene.targets)}), {scene.source.width} x {scene.source.height} px,"

@@ -252,14 +252,11 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
     Raises:
         InputError: not a picture, one that breaks off, or one of other than 8 or 16 bits.
     """
-    from attnwarp.fit.views import read_image
-    from attnwarp.io import FileFormatError
+    from attnwarp.io import read_image
 
-    _header(path, whole=True)
-    try:
-        image = read_image(path)
-    except FileFormatError as error:
-        raise InputError(str(error)) from None
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; check the path")
+    image = read_image(path)
     values = image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
     if image.shape[2] == 3:
         return values
@@ -270,32 +267,6 @@ def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> P
 def inside(picture: Picture) -> npt.NDArray[np.bool_]:
     """(H, W) bool of a mask's picture: where the mean of the channels is above a half."""
     return np.asarray(picture.mean(axis=2) > 0.5)
-
-
-def _header(path: Path, *, whole: bool = False) -> tuple[int, int] | None:
-    """(width, height) of a picture; None where Pillow does not know the format. ``whole`` decodes
-    it too.
-
-    OpenCV, which reads 16 bits and so reads the pixels, fills what is missing of a JPEG with grey
-    and says nothing.
-    """
-    import warnings
-
-    from PIL import Image, UnidentifiedImageError
-
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; check the path")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a large picture, an odd tag: not for a person to mend
-            with Image.open(path) as image:
-                if whole:
-                    image.load()
-                return image.size
-    except UnidentifiedImageError:
-        return None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path}: the picture is damaged ({error}); write it again") from None
 
 
 def _possible(
@@ -392,13 +363,13 @@ def _check_sizes(
     folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]
 ) -> None:
     """Before anything is computed: every pair has one size."""
+    from attnwarp.io import image_size
+
     for figure, names in views.items():
         for other in _groups(figure, folders):
             for name in names if other != "renders" else ():
                 one, two = folders["renders"][name], folders[other][name]
-                a, b = _header(one), _header(two)
-                if a is not None and b is not None:
-                    _same_size(one, a, two, b)
+                _same_size(one, image_size(one), two, image_size(two))
 
 
 def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> None:

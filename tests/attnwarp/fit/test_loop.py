@@ -12,7 +12,7 @@ import torch
 from attnwarp import Gaussians
 from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
-from attnwarp.io import FileFormatError, read_ply
+from attnwarp.io import read_ply
 from attnwarp.render import render
 
 from .conftest import blobs, pictures, ring
@@ -137,7 +137,8 @@ def test_the_folder_always_holds_splats_that_can_be_read(scene, tmp_path):
     result = fit(start, scene[0], settings, folder=tmp_path, checkpoint_seconds=0, watch=look)
     assert seen[0] == 0 and all(seen[1:])
     final = read_ply(tmp_path / SPLATS)
-    assert torch.equal(final.means, result.gaussians.means)
+    expected = result.gaussians.world_means().astype(np.float32)
+    assert np.array_equal(final.world_means(), expected)
     assert sorted(p.name for p in tmp_path.iterdir()) == [CHECKPOINT, SPLATS]
 
 
@@ -253,23 +254,6 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
         fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
-
-
-@pytest.mark.parametrize("content", [b"", b"not a checkpoint", b"PK\x03\x04 half a zip"])
-def test_a_damaged_checkpoint_is_refused_by_path(scene, tmp_path, content):
-    (tmp_path / CHECKPOINT).write_bytes(content)
-    start, settings = begin(scene, iterations=5, sh_degree=0)
-    with pytest.raises(FileFormatError, match=r"checkpoint\.pt: .*remove it to begin again"):
-        fit(start, scene[0], settings, folder=tmp_path)
-
-
-def test_a_truncated_checkpoint_is_refused(scene, tmp_path):
-    start, settings = begin(scene, iterations=2, sh_degree=0)
-    fit(start, scene[0], settings, folder=tmp_path)
-    whole = (tmp_path / CHECKPOINT).read_bytes()
-    (tmp_path / CHECKPOINT).write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(FileFormatError, match="remove it to begin again"):
-        fit(start, scene[0], settings, folder=tmp_path)
 
 
 def test_numbers_that_explode_end_in_a_clear_error(scene):

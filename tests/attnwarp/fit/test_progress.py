@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from attnwarp.fit import Step
-from attnwarp.fit.progress import describe, shown
+from attnwarp.fit.progress import describe, progress_display
 
 
 def step(iteration, **changes):
@@ -24,7 +24,7 @@ def test_a_step_is_described_by_its_loss_and_psnr():
 
 def test_without_a_terminal_there_are_plain_lines_now_and_then():
     text = io.StringIO()
-    with shown(Console(file=text, force_terminal=False), title="bear") as watch:
+    with progress_display(Console(file=text, force_terminal=False), title="bear") as watch:
         for k in range(1, 3001):
             watch(step(k))
     # 3000 steps in an instant: none but the last is worth a line.
@@ -35,7 +35,7 @@ def test_without_a_terminal_there_are_plain_lines_now_and_then():
 def test_on_a_terminal_the_counts_keep_their_digits(width):
     text = io.StringIO()
     console = Console(file=text, force_terminal=True, width=width, color_system=None)
-    with shown(console, title="bear") as watch:
+    with progress_display(console, title="bear") as watch:
         watch(step(2999))
         watch(step(3000))
     assert (

@@ -1,6 +1,5 @@
 """What a fit begins with: first splats, pictures from files, and which of them are held out."""
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,9 +13,8 @@ from attnwarp.fit import (
     hold_out,
     load_views,
     random_points,
-    read_image,
 )
-from attnwarp.io import Dataset, FileFormatError
+from attnwarp.io import Dataset
 
 from .conftest import ring
 
@@ -151,34 +149,6 @@ def test_white_is_one_in_every_depth(dtype):
 def test_pictures_that_cannot_be_used_are_refused_by_name(image, message):
     with pytest.raises(ValueError, match=message):
         Views([camera()], [image])
-
-
-def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
-    pixels = np.zeros((4, 6, 3), np.uint8)
-    pixels[:, :3] = 255
-    tags = Image.Exif()
-    tags[0x0112] = 6  # "turn by 90 degrees"
-    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=tags, quality=100)
-    image = read_image(tmp_path / "a.jpg")
-    assert image.shape == (4, 6, 3)
-    assert image[:, 0].min() > 200 and image[:, -1].max() < 50
-
-
-def test_files_come_as_rgb_in_their_own_depth(tmp_path):
-    rgb = np.array([[[60000, 3, 500]]], np.uint16)
-    cv2.imwrite(str(tmp_path / "deep.png"), rgb[..., ::-1])
-    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), rgb)
-    cv2.imwrite(str(tmp_path / "grey.png"), np.array([[7, 8]], np.uint8))
-    np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), [[[7] * 3, [8] * 3]])
-    rgba = np.array([[[1, 2, 3, 4]]], np.uint8)
-    Image.fromarray(rgba).save(tmp_path / "clear.png")
-    np.testing.assert_array_equal(read_image(tmp_path / "clear.png"), rgba)
-
-
-def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
-    (tmp_path / "a.png").write_bytes(b"nothing")
-    with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):
-        read_image(tmp_path / "a.png")
 
 
 def test_pictures_are_shrunk_by_area_and_their_cameras_with_them(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from attnwarp import Gaussians
+from attnwarp.errors import InputWarning
 from attnwarp.io import THIRD_SCALE, FileFormatError, read_ply, read_points, write_ply, write_points
 
 DEGREE = {0: 0, 1: 9, 2: 24, 3: 45}
@@ -114,7 +115,7 @@ def test_further_properties_elements_and_missing_normals_do_not_matter(tmp_path)
     for name in ("nx", "ny", "nz"):
         del columns[name]
     columns = {"segment": np.ones(3), **columns, "filter_3D": np.ones(3)}
-    g = read_ply(by_hand(tmp_path / "a.ply", columns, 3, extra=b"anything after the rows"))
+    g = read_ply(by_hand(tmp_path / "a.ply", columns, 3))
     assert np.array_equal(g.means[:, 2].numpy(), columns["z"])
 
 
@@ -153,7 +154,7 @@ def test_what_is_written_is_read_back(tmp_path, kind, antialiased, third_scale):
     origin = np.array([448262.123456789012, -5411932.1, 1 / 3])
     g = model(300, kind, origin=origin, antialiased=antialiased)
     g.opacities[:2] = torch.tensor([0.0, 1.0])
-    write_ply(tmp_path / "a.ply", g, third_scale=third_scale)
+    write_ply(tmp_path / "a.ply", g, third_scale=third_scale, coordinates="relative")
     back = read_ply(tmp_path / "a.ply")
     assert (back.kind, back.antialiased) == (kind, antialiased)
     for name in ("means", "quats", "sh"):
@@ -364,7 +365,8 @@ def test_far_away_double_positions_are_kept_relative_to_a_rounded_origin(tmp_pat
     # Half an ulp of float32 below 64: 2e-6; float32 world coordinates would be off by 0.25.
     assert np.abs(g.world_means() - world).max() < 2e-6
     assert np.array_equal(g.origin, np.round(g.origin, -1)), "rounded to tens for a box of 60"
-    write_ply(tmp_path / "b.ply", g)
+    with pytest.warns(InputWarning, match="attnwarp origin"):
+        write_ply(tmp_path / "b.ply", g)
     assert np.array_equal(read_ply(tmp_path / "b.ply").world_means(), g.world_means())
 
 
@@ -372,7 +374,8 @@ def test_float64_means_far_away_lose_nothing_in_a_float32_file(tmp_path):
     g = model(50).to(dtype=torch.float64)
     g.means = g.means + torch.tensor([1e6, -2e6, 3e5], dtype=torch.float64)
     g.origin = np.array([0.5, 0.0, 0.0])
-    write_ply(tmp_path / "a.ply", g)
+    with pytest.warns(InputWarning, match="attnwarp origin"):
+        write_ply(tmp_path / "a.ply", g)
     back = read_ply(tmp_path / "a.ply")
     assert (
         np.abs(back.world_means() - g.world_means()).max() < 1e-6
@@ -479,7 +482,7 @@ def test_a_truncated_body_names_the_row_where_it_ends(tmp_path, form):
 def test_a_header_that_promises_too_much_does_not_eat_the_memory(tmp_path):
     whole = by_hand(tmp_path / "a.ply", columns_of(2, np.random.default_rng(0)), 2).read_bytes()
     (tmp_path / "b.ply").write_bytes(whole.replace(b"vertex 2", b"vertex 99999999999"))
-    refused(tmp_path / "b.ply", "row 2 of the 99999999999")
+    refused(tmp_path / "b.ply", "vertex", "announces 99999999999 rows")
 
 
 @pytest.mark.parametrize("reader", [read_ply, read_points])
@@ -600,3 +603,54 @@ def test_tensors_that_are_being_trained_can_be_written(tmp_path):
     g.means = g.means.requires_grad_()
     write_ply(tmp_path / "a.ply", g)
     assert torch.equal(read_ply(tmp_path / "a.ply").means, g.means.detach())
+
+
+# -------- world coordinates and damage
+
+
+def test_means_are_written_in_world_coordinates_which_every_program_reads(tmp_path):
+    g = model(50, "2d", origin=np.array([3.25, -7.5, 0.125]))
+    write_ply(tmp_path / "a.ply", g)
+    lines, columns = parse_by_hand(tmp_path / "a.ply")
+    assert not [line for line in lines if "origin" in line]
+    expected = (g.means.double().numpy() + g.origin).astype(np.float32)
+    for i, name in enumerate("xyz"):
+        assert np.array_equal(columns[name], expected[:, i])
+    assert (read_ply(tmp_path / "a.ply").origin == 0).all()
+
+
+def test_an_origin_is_written_only_where_float32_would_lose_more_than_is_asked(tmp_path):
+    g = model(50, origin=np.array([4e5, 5e6, 0.0]))  # an ulp of 5e6 is 0.5
+    with pytest.warns(InputWarning, match=r"other programs will show .* around zero.*50 of 50"):
+        write_ply(tmp_path / "a.ply", g)
+    back = read_ply(tmp_path / "a.ply")
+    assert np.array_equal(back.origin, g.origin) and torch.equal(back.means, g.means)
+    with pytest.warns(InputWarning, match=r"world coordinates move 50 of 50 splats"):
+        write_ply(tmp_path / "b.ply", g, coordinates="world")
+    back = read_ply(tmp_path / "b.ply")
+    assert (back.origin == 0).all()
+    assert np.abs(back.world_means() - g.world_means()).max() <= 0.25
+    write_ply(tmp_path / "c.ply", g, tolerance=1e6)  # asked for no more
+    assert (read_ply(tmp_path / "c.ply").origin == 0).all()
+    with pytest.raises(ValueError, match="coordinates: got 'local'"):
+        write_ply(tmp_path / "d.ply", g, coordinates="local")
+
+
+def test_files_with_the_origin_of_earlier_versions_are_read(tmp_path):
+    columns = columns_of(3, np.random.default_rng(0))
+    comments = ["attnwarp kind 3d", "attnwarp origin 100.5 -2.0 1e6"]
+    g = read_ply(by_hand(tmp_path / "a.ply", columns, 3, comments=comments))
+    assert g.origin.tolist() == [100.5, -2.0, 1e6]
+    assert np.array_equal(g.means[:, 0].numpy(), columns["x"])
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("count", [1, 4, 68])
+def test_inserted_bytes_are_refused_wherever_they_are(tmp_path, form, count):
+    columns = columns_of(10, np.random.default_rng(0))
+    whole = by_hand(tmp_path / "a.ply", columns, 10, form=form).read_bytes()
+    head = whole.index(b"end_header\n") + len(b"end_header\n")
+    patch = b"\n0 " * count if form == "ascii" else bytes(count)
+    for start in range(head, len(whole) + 1, 97):
+        (tmp_path / "b.ply").write_bytes(whole[:start] + patch + whole[start:])
+        refused(tmp_path / "b.ply")

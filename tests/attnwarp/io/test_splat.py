@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from attnwarp import Gaussians
-from attnwarp.io import THIRD_SCALE, write_splat
+from attnwarp.io import THIRD_SCALE, FileFormatError, read_splat, write_splat
 
 
 def model(n=40, kind="3d", **more):
@@ -68,9 +68,9 @@ def test_extreme_opacities_colours_and_quaternions_stay_in_a_byte(tmp_path):
 
 def test_a_far_origin_is_refused_unless_the_caller_leaves_it_out(tmp_path):
     g = model(origin=np.array([1e8, 0, 0]))
-    with pytest.raises(ValueError, match="relative_to_origin=True"):
+    with pytest.raises(ValueError, match="coordinates='relative'"):
         write_splat(tmp_path / "a.splat", g)
-    write_splat(tmp_path / "a.splat", g, relative_to_origin=True)
+    write_splat(tmp_path / "a.splat", g, coordinates="relative")
     assert {row[:3] for row in records(tmp_path / "a.splat")} == {
         tuple(p) for p in g.means.tolist()
     }
@@ -93,3 +93,50 @@ def test_bad_values_are_refused(tmp_path):
 def test_an_empty_model_is_an_empty_file(tmp_path):
     write_splat(tmp_path / "a.splat", model(0))
     assert (tmp_path / "a.splat").read_bytes() == b""
+
+
+def test_a_file_made_by_hand_is_read(tmp_path):
+    rows = [
+        struct.pack("<6f8B", 1, -2, 3.5, 0.5, 0.25, 4, 255, 0, 51, 102, 192, 64, 128, 128),
+        struct.pack("<6f8B", 0, 0, 1e6, 1, 1, 1e-3, 0, 0, 0, 255, 255, 128, 128, 128),
+    ]
+    (tmp_path / "a.splat").write_bytes(b"".join(rows))
+    g = read_splat(tmp_path / "a.splat")
+    assert (g.kind, len(g), g.sh_degree) == ("3d", 2, 0)
+    assert g.means.tolist() == [[1, -2, 3.5], [0, 0, 1e6]]
+    assert g.scales[0].tolist() == [0.5, 0.25, 4]
+    assert g.quats[0].tolist() == [0.5, -0.5, 0, 0]
+    np.testing.assert_allclose(g.opacities, [0.4, 1], atol=1e-7)
+    color = 0.5 + 0.28209479177387814 * g.sh[0, 0].numpy()
+    np.testing.assert_allclose(color, [1, 0, 0.2], atol=1e-6)
+
+
+def test_what_is_written_is_read_back_to_a_byte(tmp_path):
+    g = model()
+    write_splat(tmp_path / "a.splat", g)
+    write_splat(tmp_path / "b.splat", read_splat(tmp_path / "a.splat"))
+    again = np.frombuffer((tmp_path / "b.splat").read_bytes(), np.uint8).reshape(-1, 32)
+    once = np.frombuffer((tmp_path / "a.splat").read_bytes(), np.uint8).reshape(-1, 32)
+    # Opacities are bytes now: rows of nearly equal importance may change places.
+    np.testing.assert_array_equal(
+        again[np.lexsort(again[:, :12].T)][:, :28], once[np.lexsort(once[:, :12].T)][:, :28]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "part"),
+    [
+        (lambda data: data[:-1], "multiple of 32"),
+        (lambda data: data + b"\0", "multiple of 32"),
+        (lambda data: data[:32] + struct.pack("<f", np.nan) + data[36:], "position: .* in row 1"),
+        (lambda data: data[:44] + struct.pack("<f", 0) + data[48:], "scale: .* in row 1"),
+        (lambda data: data[:60] + bytes([128] * 4) + data[64:], "quaternion: .* in row 1"),
+        (lambda data: b"", "empty"),
+    ],
+)
+def test_a_damaged_file_is_refused_by_row(tmp_path, change, part):
+    write_splat(tmp_path / "a.splat", model(3))
+    path = tmp_path / "a.splat"
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(FileFormatError, match=part):
+        read_splat(path)

@@ -7,6 +7,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.io import (
     Dataset,
     FileFormatError,
@@ -148,7 +149,7 @@ def test_a_clean_rotation_is_kept_bit_for_bit(tmp_path):
         (lambda m: m + np.eye(4) * [2e-3, 0, 0, 0], ["not orthonormal", "0.00"]),
         (lambda m: m @ np.diag([1, 1, -1, 1]), ["mirrors"]),
         (lambda m: m.T, ["last row", "transposed"]),
-        (lambda m: m * np.nan, ["not finite"]),
+        (lambda m: m * np.nan, ["finite"]),
         (lambda m: m[:2], ["4 x 4"]),
     ],
 )
@@ -249,7 +250,7 @@ def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
 def test_a_file_that_is_no_image_is_refused(tmp_path):
     path = folder_of(tmp_path)
     (tmp_path / "images/001.png").write_text("not a picture")
-    with pytest.raises(FileFormatError, match=r"001.png: not an image"):
+    with pytest.raises(FileFormatError, match=r"001.png: cannot be read as an image"):
         read_transforms(path)
 
 
@@ -319,3 +320,182 @@ def test_a_dataset_checks_its_lists():
         Dataset([camera], [None], colors=np.zeros((1, 3), np.uint8))
     with pytest.raises(ValueError, match="colors: got float64"):
         Dataset([camera], [None], np.zeros((1, 3)), np.zeros((1, 3)))
+
+
+# -------- keys that change the picture
+
+
+def brown(folder, top=(), frame=()):
+    image(folder / "a.png")
+    frames = [{"file_path": "a.png", "transform_matrix": pose(0), **dict(frame)}]
+    return write(folder, frames, **(LENS | dict(top)))
+
+
+LISTED = [-0.02, 0.01, 0.003, 0.0, 1e-4, -2e-4]
+NAMED = {"k1": -0.02, "k2": 0.01, "k3": 0.003, "p1": 1e-4, "p2": -2e-4}
+
+
+@pytest.mark.parametrize("level", ["top", "frame"])
+@pytest.mark.parametrize("keys", [{"distortion_params": LISTED}, NAMED])
+def test_distortion_is_refused_or_handed_on_wherever_it_stands(tmp_path, level, keys):
+    path = brown(tmp_path, **{level: keys})
+    with pytest.raises(FileFormatError, match=r"frames\[0\] \(a.png\): k1.*-0.02.*undistort"):
+        read_transforms(path)
+    (lens,) = read_transforms(path, distorted="keep").lenses
+    # nerfstudio's list is k1 k2 k3 k4 p1 p2, OpenCV's vector k1 k2 p1 p2 k3.
+    assert lens.kind == "brown"
+    assert lens.coefficients == (-0.02, 0.01, 1e-4, -2e-4, 0.003, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("top", "frame", "part"),
+    [
+        ({"distortion_params": [0.1]}, {}, "six numbers"),
+        ({"distortion_params": ["0.1", 0, 0, 0, 0, 0]}, {}, "six numbers"),
+        ({"distortion_params": [True, 0, 0, 0, 0, 0]}, {}, "six numbers"),
+        ({"distortion_params": LISTED, "k1": 0.5}, {}, "differs from distortion_params"),
+        ({"k1": 0.1}, {"k1": 0.2}, "differs between the frame and the top"),
+        ({"k4": 0.1}, {}, "k4"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}, {}, "p1"),
+        ({"camera_model": "EQUIRECTANGULAR"}, {}, "camera_model"),
+    ],
+)
+def test_distortion_that_could_mean_two_things_is_refused(tmp_path, top, frame, part):
+    with pytest.raises(FileFormatError, match=part):
+        read_transforms(brown(tmp_path, top, frame), distorted="keep")
+
+
+def test_a_list_of_zeros_is_a_pinhole(tmp_path):
+    data = read_transforms(brown(tmp_path, {"distortion_params": [0.0] * 6}))
+    assert data.lenses == [None]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("mask_path", "masks/a.png"),
+        ("rolling_shutter", [0, 0, 0.1, 0]),
+        ("transform_matrix_start", [[1, 0, 0, 0]]),
+        ("latlong", True),
+        ("skew", 0.5),
+        ("white_transparent", True),
+    ],
+)
+@pytest.mark.parametrize("level", ["top", "frame"])
+def test_a_key_that_changes_the_picture_is_refused_unless_it_is_waived(tmp_path, key, value, level):
+    path = brown(tmp_path, **{level: {key: value}})
+    with pytest.raises(FileFormatError, match=rf"{key}: .*--ignore-key {key}"):
+        read_transforms(path)
+    assert len(read_transforms(path, ignore_keys=[key])) == 1
+
+
+def test_keys_that_change_nothing_pass_and_unknown_ones_are_named(tmp_path):
+    top = {"aabb_scale": 16, "scale": 0.3, "rolling_shutter": [0, 0, 0, 0], "latlong": False}
+    read_transforms(brown(tmp_path, top, {"sharpness": 30.0, "colmap_im_id": 3}))
+    path = brown(tmp_path, {"lens_shading": 3}, {"vignette": 0.2})
+    with pytest.warns(InputWarning, match=r"meaning is not known: lens_shading, vignette"):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("-0.25", '"-0.25"', "holds '-0.25', expected 4 x 4 finite numbers"),
+        ("-0.25", "true", "holds True"),
+        ("-0.25", "null", "holds None"),
+        ("-0.25", "1e999", "holds inf"),
+        ("-0.25", "9" * 400, "holds 999"),
+        ("-0.25", "9" * 5000, "not JSON"),
+        ("-0.25", "[" * 100_000, "not JSON"),
+        ('"w": 8', '"w": true', "w: got True"),
+        ('"w": 8', '"w": "8"', "w: got '8'"),
+        ('"w": 8', '"w": 8, "w": 9', "w: stands twice"),
+    ],
+)
+def test_only_numbers_are_numbers(tmp_path, old, new, part):
+    matrix = np.eye(4)
+    matrix[0, 3] = -0.25
+    image(tmp_path / "a.png")
+    path = write(tmp_path, [{"file_path": "a.png", "transform_matrix": matrix}], **LENS)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(FileFormatError) as caught:
+        read_transforms(path)
+    assert part in str(caught.value) and "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 400 + len(str(path))
+
+
+# -------- splits
+
+
+def split_names(tmp_path, spell):
+    return {
+        "train_filenames": [spell("images/000.png"), spell("images/002.png")],
+        "test_filenames": [spell("images/001.png")],
+    }
+
+
+@pytest.mark.parametrize(
+    "spell",
+    [
+        lambda name: name,
+        lambda name: f"./{name}",
+        lambda name: name.replace("/", "//"),
+        lambda name: f"images/../{name}",
+        lambda name: name.removesuffix(".png"),
+    ],
+)
+def test_names_of_splits_are_compared_as_paths(tmp_path, spell):
+    path = folder_of(tmp_path, **split_names(tmp_path, spell))
+    assert read_transforms(path).splits == ["train", "test", "train"]
+    path = folder_of(tmp_path, **split_names(tmp_path, lambda name: str(tmp_path / spell(name))))
+    assert read_transforms(path).splits == ["train", "test", "train"]
+
+
+def test_frames_may_be_named_in_either_way_too(tmp_path):
+    frames = []
+    for i in range(3):
+        image(tmp_path / f"images/{i:03}.png")
+        frames.append({"file_path": f"./images/{i:03}", "transform_matrix": pose(i)})
+    path = write(tmp_path, frames, **LENS, **split_names(tmp_path, lambda name: name))
+    assert read_transforms(path).splits == ["train", "test", "train"]
+
+
+def test_a_split_that_names_no_frame_is_refused_with_the_nearest_name(tmp_path):
+    lists = split_names(tmp_path, lambda name: name)
+    lists["test_filenames"] = ["image/001.png"]
+    with pytest.raises(
+        FileFormatError,
+        match=r"test_filenames: 1 of 1 names .* 'image/001.png'; did you mean 'images/001.png'",
+    ):
+        read_transforms(folder_of(tmp_path, **lists))
+
+
+def test_a_frame_to_fit_on_is_not_held_out_as_well(tmp_path):
+    lists = split_names(tmp_path, lambda name: name)
+    lists["val_filenames"] = ["images/002.png"]
+    with pytest.raises(FileFormatError, match=r"val_filenames: 'images/002.png' is in train_fil"):
+        read_transforms(folder_of(tmp_path, **lists))
+    lists["val_filenames"] = lists["test_filenames"]  # as nerfstudio's own files have it
+    assert read_transforms(folder_of(tmp_path, **lists)).splits == ["train", "test", "train"]
+
+
+def test_frames_in_no_split_are_counted(tmp_path):
+    lists = split_names(tmp_path, lambda name: name)
+    lists["train_filenames"].pop()
+    with pytest.warns(InputWarning, match=r"1 of 3 frames are in no split.*'images/002.png'"):
+        data = read_transforms(folder_of(tmp_path, **lists))
+    assert data.splits == ["train", "test", None]
+
+
+@pytest.mark.parametrize("held_out", ["test", "val"])
+def test_nerfstudio_finds_all_three_splits_in_what_we_write(tmp_path, held_out):
+    """Its dataparser: with any of the lists there, each of the three must be, and is looked up."""
+    data = dataset_of(tmp_path)
+    data.splits = ["train", held_out]
+    write_transforms(tmp_path, data)
+    written = json.loads((tmp_path / "transforms.json").read_text())
+    for split, index in (("train", 0), ("val", 1), ("test", 1)):
+        assert written[f"{split}_filenames"] == [written["frames"][index]["file_path"]]
+    assert read_dataset(tmp_path).splits == ["train", "test"]

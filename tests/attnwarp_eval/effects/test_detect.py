@@ -577,7 +577,10 @@ def test_geometry_of_glass_is_its_first_surface():
 # --------------------------------------------------------------------------------------------------
 
 
-def test_the_command_line_prints_effects_and_plan_for_people_and_as_json():
+def test_the_command_line_prints_effects_and_plan_for_people_and_as_json(monkeypatch):
+    monkeypatch.setattr(
+        saving, "measure", functools.partial(saving.measure, size=16, spp=4, rounds=2)
+    )
     runner = CliRunner()
     out = json.loads(runner.invoke(app, ["scenes", "effects", "spheres", "--json"]).stdout)
     assert out["effects"]["textures"]["needed"] and not out["effects"]["medium"]["needed"]

@@ -165,7 +165,9 @@ def test_the_interval_of_the_light_cut_off_is_scipys():
     assert np.allclose(np.expm1(theirs), ours, rtol=1e-9) and ours[0] < bias < ours[1]
 
 
-def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, tmp_path):
+def test_a_dropped_light_shows_eight_times_as_strong_about_grey(small, monkeypatch, tmp_path):
+    written, write = [], cv2.imwrite
+    monkeypatch.setattr(cv2, "imwrite", lambda *a: written.append(a[1]) or write(*a))
     scene = make([FLOOR], [SUN, SKY])
     same = side_by_side(scene, tmp_path / "same.jpg")["largest_difference"]
 
@@ -176,6 +178,12 @@ def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, 
     monkeypatch.setattr(table, "plan", without_sky)
     dark = side_by_side(scene, tmp_path / "dark.jpg")["largest_difference"]
     assert same < 0.01 < 0.1 < dark
+    # As written, before JPEG: eight times (ours - full) / 2 about grey.
+    for rows in written:
+        ours, full, difference = (rows[:, k : k + 16, ::-1].astype(float) for k in (0, 20, 40))
+        expected = np.clip(127.5 + 4 * (ours - full), 0, 255)
+        assert np.abs(difference - expected).max() <= 4.5  # each picture is rounded to a level
+    assert len(written) == 2 and np.ptp(written[1][:, 40:56]) > 50
     picture = cv2.imread(str(tmp_path / "dark.jpg"))
     assert picture.shape == (16, 3 * 16 + 8, 3)
     assert (

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.warp.correspondence import sample_at
+from attnwarp.warp.sampling import sample_at
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.metrics.registry import metric

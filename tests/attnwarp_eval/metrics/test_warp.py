@@ -9,7 +9,7 @@ import torch
 from scipy import fft
 
 from attnwarp import Camera
-from attnwarp.warp.correspondence import correspond, correspond_at, sample
+from attnwarp.warp import correspond, correspond_at, sample
 from attnwarp_eval import metrics
 from attnwarp_eval.metrics.registry import METRICS, metric
 from attnwarp_eval.truth.features import SolidField

@@ -25,6 +25,22 @@ def test_values_without_noise_are_compared_exactly_up_to_rounding():
     assert tests_of.welch(a, b).p.tolist() == [1.0, 1.0, 0.0]
 
 
+def test_values_that_hardly_vary_are_tested_by_their_own_noise():
+    rng = np.random.default_rng(11)
+    a, b = 1 + 3e-6 * rng.standard_normal((2, 12, 2000))
+    # Twice the rounding apart and with noise of a third of it: the old way to say p = 0.
+    close = tests_of.welch(a, b + 1.2e-5)
+    assert (close.error < tests_of.ROUNDING).all() and (close.p > 0).all()
+    # What is beyond the rounding, 2e-6, is 1.6 standard errors (1.2e-6); scipy knows its p.
+    beyond_rounding = b + 1.2e-5 - tests_of.ROUNDING * (b + 1.2e-5).mean(0)
+    theirs = stats.ttest_ind(beyond_rounding, a, equal_var=False)
+    beyond = close.difference > 1.1e-5
+    assert beyond.sum() > 500 and np.allclose(close.p[beyond], theirs.pvalue[beyond], rtol=1e-3)
+    # Ten times the rounding apart is light.
+    assert tests_of.welch(a, b + 1e-4).p.max() < 1e-9
+    assert (tests_of.welch(a, b).p == 1).all()
+
+
 def test_too_few_samples_are_refused():
     for test in (tests_of.welch, tests_of.welch_interval):
         with pytest.raises(ValueError, match="got 1 and 5 samples, expected at least 2"):

@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp.warp.correspondence import TAP_SPREAD
-from attnwarp.warp.settings import PRESETS
-from attnwarp.warp.view import EXACT_DEPTH_TOLERANCE
+from attnwarp.warp import EXACT_DEPTH_TOLERANCE, PRESETS, TAP_SPREAD
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import render_surface
+from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.study import pictures

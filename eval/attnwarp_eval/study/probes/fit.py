@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from attnwarp.fit import FitSettings
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import render_surface
+from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.document import figures
 from attnwarp_eval.document.model import Picture, Section, Table

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import render_surface, warp_view
+from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell

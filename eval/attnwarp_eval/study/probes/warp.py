@@ -10,8 +10,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from attnwarp.warp.settings import WarpSettings
-from attnwarp.warp.view import render_surface, warp_view
+from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.document import figures
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.scene.base import linear_rgb
+from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.materials import (
     GlassMaterial,
     InteriorSpec,
@@ -231,7 +232,9 @@ def load_shapes(
     origin; plugins.
     """
     mi = library()
-    bounds = np.stack([shape.bounds() for shape in scene.shapes()])
+    shapes = scene.shapes()
+    warn_of_strays(scene, shapes)
+    bounds = np.stack([shape.bounds() for shape in shapes])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     out: dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]] = {}
     plugins: list[tuple[str, str]] = []

@@ -8,9 +8,10 @@ import pytest
 import runs
 import torch
 
-from attnwarp.warp.correspondence import TAP_SPREAD
+from attnwarp.warp.depth import TAP_SPREAD
+from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
 from attnwarp.warp.settings import PRESETS, preset
-from attnwarp.warp.view import EXACT_DEPTH_TOLERANCE, Surface, warp_surfaces
+from attnwarp.warp.view import Surface, warp_surfaces
 from attnwarp_eval import metrics
 from attnwarp_eval.effects.table import plan_words, said_by
 from attnwarp_eval.scene.file import load_scene

@@ -1,0 +1,237 @@
+"""Lens distortion: OpenCV's two formulas, and pictures resampled as a pinhole camera sees them.
+
+Formulas: docs.opencv.org, calib3d ("Brown", rational, with tangential terms) and calib3d_fisheye
+(Kannala and Brandt 2006). COLMAP's models RADIAL, OPENCV, FULL_OPENCV and their fisheye kin are
+special cases. Coordinates here have pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import check
+from attnwarp.camera import Camera
+
+Array = npt.NDArray[np.float64]
+
+LARGEST_GROWTH = 2.0
+"""An undistorted picture has at most so many times the width and the height (COLMAP's limit)."""
+
+STEEPEST = 1.4
+"""Rays further than this from the optical axis (radians, 80 degrees) are left out: a pinhole needs
+ever more pixels for them."""
+
+ROUND_TRIP = 0.01
+"""Largest distance in px between a border pixel and its undistorted point distorted again."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Distortion of a lens, as a function of normalised image coordinates.
+
+    Args:
+        kind: "brown" for radial and tangential terms, "fisheye" for a polynomial in the angle.
+        coefficients: k1 k2 p1 p2 k3 k4 k5 k6 for "brown", k1 k2 k3 k4 for "fisheye"; those left
+            out are 0.
+
+    Raises:
+        ValueError: another kind, too many coefficients, or one that is not finite.
+    """
+
+    kind: Literal["brown", "fisheye"]
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check.one_of(self.kind, ("brown", "fisheye"), "kind")
+        count = 8 if self.kind == "brown" else 4
+        if len(self.coefficients) > count:
+            raise ValueError(
+                f"coefficients: got {len(self.coefficients)}, expected at most {count} for"
+                f" {self.kind!r}"
+            )
+        values = tuple(float(v) for v in self.coefficients)
+        check.finite(np.array(values), "coefficients")
+        object.__setattr__(self, "coefficients", values + (0.0,) * (count - len(values)))
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether it changes nothing. A fisheye lens without coefficients is no pinhole."""
+        return self.kind == "brown" and not any(self.coefficients)
+
+    def distort(self, xy: npt.ArrayLike) -> Array:
+        """Normalised coordinates (X/Z, Y/Z) as this lens shows them.
+
+        Args:
+            xy: (..., 2) undistorted.
+
+        Returns:
+            (..., 2) distorted.
+
+        Example:
+            >>> from attnwarp.io import Lens
+            >>> Lens("brown", (0.1,)).distort([1.0, 0.0]).tolist()  # 1 + 0.1 * 1^2
+            [1.1, 0.0]
+        """
+        xy = np.asarray(xy, dtype=np.float64)
+        x, y = xy[..., 0], xy[..., 1]
+        r2 = x * x + y * y
+        if self.kind == "fisheye":
+            r = np.sqrt(r2)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                factor = np.where(r > 0, self._angle(np.arctan(r)) / r, 1.0)
+            return xy * factor[..., None]
+        k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+            ],
+            axis=-1,
+        )
+
+    def undistort(self, xy: npt.ArrayLike) -> Array:
+        """The inverse of :meth:`distort`, by iteration; NaN where the iteration finds none.
+
+        Args:
+            xy: (..., 2) distorted normalised coordinates.
+
+        Returns:
+            (..., 2) undistorted; beyond 80 degrees from the axis the length is cut there.
+        """
+        target = np.asarray(xy, dtype=np.float64)
+        if self.kind == "fisheye":
+            # Newton's method in the angle alone, begun at the angle without coefficients.
+            r = np.linalg.norm(target, axis=-1)
+            theta = np.minimum(r, STEEPEST)
+            for _ in range(50):
+                slope = (self._angle(theta + 1e-6) - self._angle(theta - 1e-6)) / 2e-6
+                slope = np.where(np.abs(slope) > 1e-6, slope, 1.0)
+                theta = np.clip(theta - (self._angle(theta) - r) / slope, 0, STEEPEST)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                factor = np.where(r > 0, np.tan(theta) / r, 1.0)
+            return target * factor[..., None]
+        # Newton's method with the Jacobian from differences.
+        point = target.copy()
+        step = 1e-6
+        right, below = np.array([step, 0.0]), np.array([0.0, step])
+        for _ in range(50):
+            here = self.distort(point)
+            dx = (self.distort(point + right) - here) / step
+            dy = (self.distort(point + below) - here) / step
+            det = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+            error = here - target
+            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+                point = point - np.stack(
+                    [
+                        (dy[..., 1] * error[..., 0] - dy[..., 0] * error[..., 1]) / det,
+                        (dx[..., 0] * error[..., 1] - dx[..., 1] * error[..., 0]) / det,
+                    ],
+                    axis=-1,
+                )
+        return point
+
+    def _angle(self, theta: Array) -> Array:
+        k1, k2, k3, k4 = self.coefficients
+        t2 = theta * theta
+        return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+
+def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
+    """The largest pinhole camera of the same focal length and axis that sees no blank pixel.
+
+    Args:
+        camera: of the distorted picture, its lens apart.
+        lens: its distortion.
+
+    Returns:
+        A camera at the same pose; its image is a window of whole pixels, at most twice as wide and
+        high as the distorted one.
+
+    Raises:
+        ValueError: the coefficients fold the picture over, so that no inverse exists.
+    """
+    W, H = camera.width, camera.height
+    across, down = np.arange(W) + 0.5, np.arange(H) + 0.5
+    sides = [
+        np.stack([np.full(H, 0.5), down], -1), np.stack([np.full(H, W - 0.5), down], -1),
+        np.stack([across, np.full(W, 0.5)], -1), np.stack([across, np.full(W, H - 0.5)], -1),
+    ]  # fmt: skip
+    points = [lens.undistort(camera.directions(side)[..., :2]) for side in sides]
+    for side, point in zip(sides, points, strict=True):
+        steep = np.linalg.norm(point, axis=-1) >= np.tan(STEEPEST) * (1 - 1e-9)
+        error = np.abs(_pixels(camera, lens.distort(point)) - side).max(axis=-1)
+        if not (steep | (error <= ROUND_TRIP)).all():
+            raise ValueError(
+                f"lens: the coefficients {lens.coefficients} fold the picture of camera"
+                f" {camera.name!r} over, so it cannot be undistorted; calibrate the lens again"
+            )
+    left, right, top, bottom = (_pixels(camera, point) for point in points)
+    cx, cy = camera.K[0, 2], camera.K[1, 2]
+    x0, x1 = _window(left[:, 0].max(), right[:, 0].min(), cx, W)
+    y0, y1 = _window(top[:, 1].max(), bottom[:, 1].min(), cy, H)
+    K = camera.K.copy()
+    K[:2, 2] -= [x0, y0]
+    return Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
+
+
+def undistorted_image(
+    image: npt.NDArray[Any], camera: Camera, lens: Lens, target: Camera
+) -> npt.NDArray[Any]:
+    """A picture resampled (bilinearly) to what ``target``, a pinhole at the same pose, sees.
+
+    Args:
+        image: (H, W, C) uint8 or uint16, taken by ``camera`` through ``lens``.
+        camera, lens: of the picture.
+        target: what to resample to.
+
+    Returns:
+        (target.height, target.width, C) of the same dtype; 0 where the picture does not reach.
+
+    Raises:
+        ValueError: ``image`` has another size than ``camera``.
+    """
+    from scipy.ndimage import map_coordinates
+
+    check.shape(image, (camera.height, camera.width, "C"), "image")
+    xy = _pixels(camera, lens.distort(target.directions()[..., :2]))
+    outside = ~(
+        (xy[..., 0] >= 0) & (xy[..., 0] <= camera.width)
+        & (xy[..., 1] >= 0) & (xy[..., 1] <= camera.height)
+    )  # fmt: skip
+    rows = np.where(outside, 0.0, xy[..., 1] - 0.5)
+    columns = np.where(outside, 0.0, xy[..., 0] - 0.5)
+    result = np.empty((target.height, target.width, image.shape[2]), image.dtype)
+    for channel in range(image.shape[2]):
+        values = map_coordinates(
+            image[..., channel].astype(np.float64), [rows, columns], order=1, mode="nearest"
+        )
+        result[..., channel] = np.where(outside, 0, np.rint(values))
+    return result
+
+
+def _pixels(camera: Camera, xy: Array) -> Array:
+    """(..., 2) px of (..., 2) normalised coordinates."""
+    K = camera.K
+    return np.stack(
+        [
+            K[0, 0] * xy[..., 0] + K[0, 1] * xy[..., 1] + K[0, 2],
+            K[1, 1] * xy[..., 1] + K[1, 2],
+        ],
+        axis=-1,
+    )
+
+
+def _window(low: float, high: float, center: float, size: int) -> tuple[int, int]:
+    """Whole pixels whose centres lie in [low, high], at most LARGEST_GROWTH as many as ``size``."""
+    first, last = int(np.ceil(low - 0.5)), int(np.floor(high - 0.5)) + 1
+    spare = last - first - int(LARGEST_GROWTH * size)
+    if spare > 0:
+        # Taken off the side that is further from the principal point, as far as that goes.
+        cut = int(np.clip(round((spare + (center - first) - (last - center)) / 2), 0, spare))
+        first, last = first + cut, last - (spare - cut)
+    return first, max(last, first + 1)

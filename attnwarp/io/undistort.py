@@ -1,0 +1,74 @@
+"""Pictures with lens distortion, written anew as pinhole cameras see them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from attnwarp.io.dataset import Dataset
+from attnwarp.io.file import write_atomically
+from attnwarp.io.images import encode_png, read_image
+from attnwarp.io.lens import undistorted_camera, undistorted_image
+from attnwarp.io.transforms import write_transforms
+
+
+def undistort(
+    dataset: Dataset,
+    folder: str | os.PathLike[str],
+    *,
+    progress: Callable[[int, int], object] | None = None,
+) -> Dataset:
+    """Write undistorted pictures, and a transforms.json for them.
+
+    Focal lengths, poses, points and splits stay. Each new picture is the largest window of whole
+    pixels without a blank one; pictures of pinhole cameras are copied pixel by pixel.
+
+    Args:
+        dataset: read with ``distorted="keep"``; cameras without a picture are left out.
+        folder: receives transforms.json and images/NAME.png; made if need be.
+        progress: called with the number of pictures done and their total.
+
+    Returns:
+        The data set that was written.
+
+    Raises:
+        FileFormatError: a picture that cannot be read.
+        ValueError: no camera has a picture, or a lens folds its picture over.
+    """
+    folder = Path(folder)
+    dataset = dataset.select([i for i, path in enumerate(dataset.image_paths) if path is not None])
+    if not len(dataset):
+        raise ValueError("dataset: none of its cameras has an image")
+    # Before the first picture is written: a lens that cannot be undone costs no work.
+    cameras = [
+        camera if lens is None else undistorted_camera(camera, lens)
+        for camera, lens in zip(dataset.cameras, dataset.lenses, strict=True)
+    ]
+    paths: list[Path | None] = []
+    for i, (camera, lens, target, source) in enumerate(
+        zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, strict=True)
+    ):
+        assert source is not None
+        image = read_image(source)
+        if lens is not None:
+            image = undistorted_image(image, camera, lens, target)
+        path = folder / "images" / _name(camera.name, i)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        data = encode_png(image)
+        write_atomically(path, lambda stream, data=data: stream.write(data))  # type: ignore[misc]
+        paths.append(path)
+        if progress is not None:
+            progress(i + 1, len(cameras))
+    result = replace(dataset, cameras=cameras, image_paths=paths, lenses=[None] * len(cameras))
+    write_transforms(folder, result)
+    return result
+
+
+def _name(name: str, index: int) -> str:
+    """A path below the folder for the picture of a camera, whatever the camera's name is."""
+    parts = [part for part in PurePosixPath(name).parts if part not in ("/", "..", ".", "images")]
+    if not parts:
+        return f"{index:06d}.png"
+    return str(PurePosixPath(*parts).with_suffix(".png"))

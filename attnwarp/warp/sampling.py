@@ -1,0 +1,170 @@
+"""Sampling of features and depth at the positions of a correspondence, in torch on any device.
+
+This is the definition. :mod:`attnwarp.warp.cpu` has kernels that give the same bits for feature
+maps and tokens in the host's memory.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.warp.correspondence import Correspondence, in_bounds, positions_in
+from attnwarp.warp.depth import TAP_SPREAD, Array, blend_depth, valid_depth
+from attnwarp.warp.settings import DepthInterpolation
+from attnwarp.warp.taps import Taps, clamp_index, taps_of
+
+
+def sample(
+    features: Tensor,
+    correspondence: Correspondence,
+    *,
+    mode: Literal["bilinear", "nearest"] = "bilinear",
+) -> tuple[Tensor, Tensor]:
+    """A source feature map, warped to the target's grid.
+
+    Args:
+        features: (C, h, w) or (B, C, h, w) on the source's image, of any size: a position u becomes
+            u * w / W (for integer centres u * (w - 1) / (W - 1) on indices, which is what
+            align_corners=True does). Its gradient flows back through the result.
+        correspondence: H x W positions, float64; moved to the features' device.
+        mode: "bilinear" for floating types: weights and sums in float32 for half precision, in the
+            features' own type otherwise. "nearest" for any type, labels included.
+
+    Returns:
+        warped: (C, H, W) or (B, C, H, W) in the features' type. A position outside the image takes
+            the border's value; a pixel without a position is 0, so that it cannot spread NaN into a
+            network. Use the mask.
+        mask: (H, W) bool, the position lies inside the source image (:func:`in_bounds`).
+
+    Raises:
+        ValueError: another number of axes, a type that cannot be blended, an unknown mode.
+    """
+    if features.ndim not in (3, 4):
+        raise ValueError(
+            f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)"
+        )
+    xy = positions_in(correspondence, features.shape[-1], features.shape[-2])
+    return sample_at(features, xy, mode=mode), in_bounds(correspondence).to(features.device)
+
+
+def sample_at(
+    features: Tensor, xy: Tensor, *, mode: Literal["bilinear", "nearest"] = "bilinear"
+) -> Tensor:
+    """Features at positions of their own image.
+
+    Args:
+        features: (..., h, w).
+        xy: (H, W, 2) positions in pixels of the feature map (centres at +0.5), float32 or float64.
+            NaN gives 0.
+        mode: as in :func:`sample`.
+
+    Returns:
+        (..., H, W) in the features' type.
+
+    Raises:
+        ValueError: a half-precision or integer ``xy``: bfloat16 cannot even tell 256.5 from 257.
+    """
+    check.one_of(mode, ("bilinear", "nearest"), "mode")
+    if xy.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"xy: got {xy.dtype}, expected float32 or float64; half precision moves positions by up"
+            " to pixels"
+        )
+    check.shape(xy, ("H", "W", 2), "xy")
+    if mode == "bilinear" and not features.dtype.is_floating_point:
+        raise ValueError(
+            f"features: got {features.dtype}, expected a floating type; labels and masks take"
+            " mode='nearest'"
+        )
+    h, w = features.shape[-2:]
+    xy = xy.to(device=features.device, dtype=torch.float64)
+    size = xy.shape[:2]
+    flat = features.flatten(-2)
+    if mode == "nearest":
+        # NaN is masked before it reaches an index.
+        defined = torch.isfinite(xy).all(dim=-1)
+        xy = torch.where(defined[..., None], xy, 0.5)
+        j = clamp_index(torch.floor(xy[..., 0]), w)
+        i = clamp_index(torch.floor(xy[..., 1]), h)
+        warped = flat[..., (i * w + j).reshape(-1)].unflatten(-1, size)
+        return torch.where(
+            defined, warped, torch.zeros((), dtype=features.dtype, device=features.device)
+        )
+    taps = taps_of(xy, h, w)
+    taps = Taps(taps.index, taps.weight.to(work_type(features.dtype)))
+    return sample_maps(flat, taps).unflatten(-1, size)
+
+
+def work_type(dtype: torch.dtype) -> torch.dtype:
+    """The type of weights and sums: float32 for half precision, else the features' own."""
+    return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
+
+
+def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
+    """(..., N) weighted sums of the pixels of maps, in the maps' type.
+
+    Args:
+        maps: (..., h*w) floating.
+        taps: of N positions, with weights of :func:`work_type`, on the maps' device.
+    """
+    total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
+    for index, share in zip(taps.index, taps.weight, strict=True):
+        value = maps[..., index].to(total.dtype)
+        # A tap of weight 0 may hold anything, an infinity included.
+        total = total + torch.where(share > 0, value * share, 0)
+    return total.to(maps.dtype)
+
+
+def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
+    """(B, N, C) weighted sums of tokens, in the weights' type.
+
+    Args:
+        tokens: (B, h*w, C) floating, row by row of the picture.
+        taps: as in :func:`sample_maps`.
+    """
+    total = torch.zeros((), dtype=taps.weight.dtype, device=tokens.device)
+    for index, share in zip(taps.index, taps.weight[..., None], strict=True):
+        value = tokens[:, index].to(total.dtype)
+        total = total + torch.where(share > 0, value * share, 0)
+    return total
+
+
+def blend_tokens(source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float) -> Tensor:
+    """a (M warp(source) + (1 - M) new) + (1 - a) new, in the type of ``new``, rounded once.
+
+    Args:
+        source: (B or 1, h*w, C), new: (B, N, C), of one type.
+        taps: as in :func:`sample_maps`.
+        mask: (N,) bool. Where it is False the result has the bits of ``new``.
+        alpha: in [0, 1].
+    """
+    warped = sample_tokens(source, taps)
+    mixed = alpha * warped + (1 - alpha) * new.to(warped.dtype)
+    return torch.where(mask[:, None], mixed.to(new.dtype), new)
+
+
+def sample_depth(
+    source_depth: Array,
+    correspondence: Correspondence,
+    *,
+    interpolation: DepthInterpolation = "inverse",
+    spread: float | None = TAP_SPREAD,
+) -> Tensor:
+    """The source's own depth at the positions of a correspondence.
+
+    Args:
+        source_depth: (h, w) depth along the source's optical axis, of any size.
+        interpolation, spread: as in :func:`resize_depth`.
+
+    Returns:
+        (H, W) float64, NaN outside the source image and where the taps do not answer.
+    """
+    depth = valid_depth(source_depth, "source_depth")
+    xy = positions_in(correspondence, depth.shape[1], depth.shape[0])
+    inside = in_bounds(correspondence)
+    sampled = blend_depth(depth, torch.where(inside[..., None], xy, 0.5), interpolation, spread)
+    return torch.where(inside, sampled, torch.nan)

@@ -1,0 +1,40 @@
+"""What a view knows of the surface before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from attnwarp.warp.depth import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Depth, normals, opacity and picture of one view.
+
+    Args:
+        depth: (H, W) along the optical axis, NaN where undefined.
+        normal: (H, W, 3) world normals of either sign and any length, NaN or zero where undefined.
+        alpha: (H, W) in [0, 1].
+        image: (H, W, C) sRGB in [0, 1], before any edit.
+        counters: how much work it was to render, see :class:`attnwarp.render.Render`.
+    """
+
+    depth: Array
+    normal: Array | None = None
+    alpha: Array | None = None
+    image: Array | None = None
+    counters: dict[str, int] = field(default_factory=dict, repr=False)
+
+
+def needed(surface: Surface | None, view: str, part: str, rule: str) -> Array:
+    """A part of a surface that a rule cannot do without.
+
+    Raises:
+        ValueError: it is not given; the message names the rule.
+    """
+    value: Array | None = getattr(surface, part, None)
+    if value is None:
+        raise ValueError(
+            f"{view}.{part}: got None, but the rule {rule} needs it; give it or turn the rule off"
+        )
+    return value

@@ -1,0 +1,104 @@
+"""The one door for pictures: what the file holds comes in, and a damaged file does not."""
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from attnwarp import Camera
+from attnwarp.fit import load_views
+from attnwarp.io import Dataset, FileFormatError, image_size, read_image
+
+
+def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
+    pixels = np.zeros((4, 6, 3), np.uint8)
+    pixels[:, :3] = 255
+    tags = Image.Exif()
+    tags[0x0112] = 6  # "turn by 90 degrees"
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", exif=tags, quality=100)
+    image = read_image(tmp_path / "a.jpg")
+    assert image.shape == (4, 6, 3)
+    assert image[:, 0].min() > 200 and image[:, -1].max() < 50
+
+
+def test_files_come_as_rgb_in_their_own_depth(tmp_path):
+    rgb = np.array([[[60000, 3, 500]]], np.uint16)
+    cv2.imwrite(str(tmp_path / "deep.png"), rgb[..., ::-1])
+    np.testing.assert_array_equal(read_image(tmp_path / "deep.png"), rgb)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.array([[7, 8]], np.uint8))
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png"), [[[7] * 3, [8] * 3]])
+    rgba = np.array([[[1, 2, 3, 4]]], np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "clear.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "clear.png"), rgba)
+
+
+def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"nothing")
+    with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):
+        read_image(tmp_path / "a.png")
+
+
+def noise(path, size=(64, 48), **options):
+    pixels = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a.webp", "a.tif"])
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_picture_that_breaks_off_is_refused_by_path(tmp_path, name, share):
+    path = noise(tmp_path / name)
+    whole = path.read_bytes()
+    assert read_image(path).shape == (48, 64, 3)
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(FileFormatError, match=rf"{name}: .*(damaged|cannot be read)"):
+        read_image(path)
+
+
+def test_a_fit_is_not_made_on_half_a_jpeg(tmp_path, capfd):
+    path = noise(tmp_path / "view.jpg")
+    camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FileFormatError, match=r"view\.jpg: the picture is damaged"):
+        load_views(Dataset([camera], [path]))
+    assert capfd.readouterr().err == ""  # no murmur of a decoder
+
+
+def test_every_flipped_bit_of_a_png_is_seen_or_changes_no_pixel(tmp_path):
+    path = noise(tmp_path / "a.png", (8, 8))
+    pixels, whole = read_image(path), path.read_bytes()
+    refused = 0
+    for position in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << (position % 8)
+        path.write_bytes(damaged)
+        try:
+            assert np.array_equal(read_image(path), pixels)
+        except FileFormatError:
+            refused += 1
+    assert refused > 0.9 * len(whole)
+
+
+def chunk(name, data):
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def test_a_picture_beyond_pillows_limit_is_refused_in_one_line(tmp_path):
+    header = struct.pack(">IIBBBBB", 40_000, 40_000, 8, 2, 0, 0, 0)
+    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0"))
+    (tmp_path / "big.png").write_bytes(data + chunk(b"IEND", b""))
+    for read in (read_image, image_size):
+        with pytest.raises(FileFormatError, match=r"big\.png: the picture has more than [\d,]+ px"):
+            read(tmp_path / "big.png")
+
+
+def test_what_is_not_there_or_empty_is_said(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.png: no such file"):
+        read_image(tmp_path / "none.png")
+    (tmp_path / "empty.png").write_bytes(b"")
+    with pytest.raises(FileFormatError, match=r"empty\.png: the file is empty"):
+        image_size(tmp_path / "empty.png")

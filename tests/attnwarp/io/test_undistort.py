@@ -1,0 +1,190 @@
+"""Lens distortion against OpenCV's formulas, and undistorted pictures against COLMAP's own."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from attnwarp import Camera
+from attnwarp.fit import load_views
+from attnwarp.io import (
+    FileFormatError,
+    Lens,
+    read_colmap,
+    read_dataset,
+    read_image,
+    undistort,
+    undistorted_camera,
+    undistorted_image,
+)
+
+SIZE = (64, 48)
+FOCAL = [50.0, 52.0]
+CENTER = [31.0, 25.0]
+
+MODELS = {
+    "SIMPLE_RADIAL": ([-0.1], Lens("brown", (-0.1,))),
+    "RADIAL": ([-0.15, 0.03], Lens("brown", (-0.15, 0.03))),
+    "OPENCV": ([-0.2, 0.05, 0.003, -0.002], Lens("brown", (-0.2, 0.05, 0.003, -0.002))),
+    "FULL_OPENCV": (
+        [0.2, 0.05, 0.003, -0.002, 0.01, 0.1, 0.02, 0.003],
+        Lens("brown", (0.2, 0.05, 0.003, -0.002, 0.01, 0.1, 0.02, 0.003)),
+    ),
+    "SIMPLE_RADIAL_FISHEYE": ([-0.05], Lens("fisheye", (-0.05,))),
+    "RADIAL_FISHEYE": ([-0.05, 0.01], Lens("fisheye", (-0.05, 0.01))),
+    "OPENCV_FISHEYE": ([-0.05, 0.01, 0.002, -0.001], Lens("fisheye", (-0.05, 0.01, 0.002, -0.001))),
+}
+
+
+def params_of(model):
+    focal = FOCAL[:1] if "RADIAL" in model else FOCAL
+    return [*focal, *CENTER, *MODELS[model][0]]
+
+
+def camera_of(model):
+    fy = FOCAL[0] if "RADIAL" in model else FOCAL[1]
+    K = np.array([[FOCAL[0], 0, CENTER[0]], [0, fy, CENTER[1]], [0, 0, 1]])
+    return Camera(K, np.eye(4), *SIZE, "a.png")
+
+
+def smooth(seed=0):
+    pixels = np.random.default_rng(seed).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    return cv2.resize(pixels, SIZE, interpolation=cv2.INTER_CUBIC)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_points_are_distorted_as_by_opencv(model):
+    lens, camera = MODELS[model][1], camera_of(model)
+    xy = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 2))
+    points = np.c_[xy, np.ones(200)]
+    still = np.zeros(3)
+    if lens.kind == "fisheye":
+        k = np.array(lens.coefficients)
+        expected, _ = cv2.fisheye.projectPoints(points[:, None], still, still, camera.K, k)
+    else:
+        k = np.array(lens.coefficients)
+        expected, _ = cv2.projectPoints(points, still, still, camera.K, k)
+    ours = lens.distort(xy) * [camera.K[0, 0], camera.K[1, 1]] + CENTER
+    np.testing.assert_allclose(ours, expected[:, 0], atol=1e-9)
+    # The inverse is judged by OpenCV's forward formula, through the equality above.
+    np.testing.assert_allclose(lens.undistort(lens.distort(xy)), xy, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_pictures_are_those_of_colmaps_own_undistorter(model):
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=params_of(model))
+    pixels = smooth()
+    bitmap, pinhole = pycolmap.undistort_image(
+        pycolmap.UndistortCameraOptions(), pycolmap.Bitmap.from_array(pixels), theirs
+    )
+    fx, fy, cx, cy = pinhole.params
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    target = Camera(K, np.eye(4), pinhole.width, pinhole.height)
+    ours = undistorted_image(pixels, camera_of(model), MODELS[model][1], target)
+    assert ours.any()
+    # One step of 8 bits where a value lies between two of them; pixels at the rim that only one of
+    # the two takes for seen.
+    away = np.abs(ours.astype(int) - bitmap.to_array()).max(axis=2) > 1
+    inside = away[2:-2, 2:-2]
+    assert not inside.any() and away.mean() < 0.01
+    # Their camera is as large, up to the whole pixels that ours keeps.
+    own = undistorted_camera(camera_of(model), MODELS[model][1])
+    assert abs(own.width - pinhole.width) <= 3 and abs(own.height - pinhole.height) <= 3
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_undistorted_camera_sees_no_blank_pixel_and_could_not_be_larger(model):
+    camera, lens = camera_of(model), MODELS[model][1]
+    white = np.full((SIZE[1], SIZE[0], 3), 255, np.uint8)
+    target = undistorted_camera(camera, lens)
+    assert (undistorted_image(white, camera, lens, target) == 255).all()
+    larger = Camera(
+        target.K + np.array([[0, 0, 2], [0, 0, 2], [0, 0, 0]]),
+        np.eye(4),
+        target.width + 4,
+        target.height + 4,
+    )
+    seen = undistorted_image(white, camera, lens, larger)[..., 0] == 255
+    assert not seen.all(axis=0)[[0, -1]].all() or not seen.all(axis=1)[[0, -1]].all()
+
+
+def test_coefficients_that_fold_the_picture_over_are_refused():
+    with pytest.raises(ValueError, match=r"lens: .* fold the picture of camera 'a.png' over"):
+        undistorted_camera(camera_of("OPENCV"), Lens("brown", (-3.0, 0.0)))
+
+
+def test_a_wide_fisheye_is_cut_to_twice_its_size():
+    K = np.array([[20.0, 0, 32], [0, 20.0, 24], [0, 0, 1]])
+    camera = Camera(K, np.eye(4), *SIZE)
+    target = undistorted_camera(camera, Lens("fisheye", ()))
+    assert (target.width, target.height) == (128, 96)
+    np.testing.assert_allclose([target.K[0, 2], target.K[1, 2]], [64, 48], atol=1)
+
+
+def test_a_data_set_is_undistorted_and_then_fitted_on(tmp_path):
+    (tmp_path / "in/images").mkdir(parents=True)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=1).as_matrix()
+    frames = []
+    for name in ("left/a.png", "right/a.png"):
+        (tmp_path / "in" / name).parent.mkdir(exist_ok=True)
+        Image.fromarray(smooth()).save(tmp_path / "in" / name)
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    lens = dict(zip(("k1", "k2", "p1", "p2"), MODELS["OPENCV"][0], strict=True))
+    top = {"w": 64, "h": 48, "fl_x": 50.0, "fl_y": 52.0, "cx": 31.0, "cy": 25.0, **lens}
+    top |= {"train_filenames": ["left/a.png"], "test_filenames": ["right/a.png"]}
+    (tmp_path / "in/transforms.json").write_text(json.dumps({**top, "frames": frames}))
+    with pytest.raises(FileFormatError, match="attnwarp undistort"):
+        read_dataset(tmp_path / "in")
+    data = read_dataset(tmp_path / "in", distorted="keep")
+    with pytest.raises(FileFormatError, match="undistort the data set first"):
+        load_views(data)
+    undistort(data, tmp_path / "out")
+    back = read_dataset(tmp_path / "out")
+    assert back.splits == ["train", "test"] and back.lenses == [None, None]
+    assert [str(p.relative_to(tmp_path / "out")) for p in back.image_paths] == [
+        "images/left/a.png", "images/right/a.png",
+    ]  # fmt: skip
+    np.testing.assert_allclose(back.cameras[0].rotation, data.cameras[0].rotation, atol=1e-12)
+    # A point of the world is where its distorted pixel has gone: the same colour, interpolated.
+    target = back.cameras[0]
+    xy = np.array([20.5, 15.5])
+    source = cv2.projectPoints(
+        target.directions(xy)[None], np.zeros(3), np.zeros(3), data.cameras[0].K,
+        np.array(MODELS["OPENCV"][1].coefficients),
+    )[0][0, 0]  # fmt: skip
+    patch = cv2.getRectSubPix(smooth().astype(np.float32), (1, 1), source - 0.5)[0, 0]
+    shown = read_image(back.image_paths[0])[15, 20]
+    np.testing.assert_allclose(shown, patch, atol=1)
+    assert len(load_views(back)) == 2
+
+
+def test_a_model_that_colmap_writes_is_read_with_its_lens(tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    for model, (_, lens) in MODELS.items():
+        reconstruction = pycolmap.Reconstruction()
+        camera = pycolmap.Camera(
+            camera_id=1, model=model, width=64, height=48, params=params_of(model)
+        )
+        reconstruction.add_camera_with_trivial_rig(camera)
+        turn = Rotation.random(random_state=2).as_quat()
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.array([0.1, -0.2, 3.0]))
+        image = pycolmap.Image(image_id=1, camera_id=1, name="a.png")
+        reconstruction.add_image_with_trivial_frame(image, pose)
+        folder = tmp_path / model
+        folder.mkdir()
+        reconstruction.write(folder)
+        Image.fromarray(smooth()).save(folder / "a.png")
+        data = read_colmap(folder, images=folder, distorted="keep")
+        assert data.lenses == [lens]
+        np.testing.assert_allclose(data.cameras[0].K, camera_of(model).K)
+        point = np.array([0.2, 0.1, 0.4])
+        theirs = reconstruction.image(1).project_point(point)
+        local = data.cameras[0].world_to_camera[:3] @ np.append(point, 1)
+        ours = lens.distort(local[:2] / local[2])
+        K = data.cameras[0].K
+        np.testing.assert_allclose(ours * [K[0, 0], K[1, 1]] + K[:2, 2], theirs, atol=1e-9)

@@ -1,0 +1,249 @@
+"""Tokens against feature maps sampled by torch, and the formula of the blend in float64."""
+
+import dataclasses
+
+import pytest
+import torch
+from closed_forms import orbit, sphere
+
+from attnwarp.render.threads import set_thread_count
+from attnwarp.warp.settings import preset
+from attnwarp.warp.view import Surface, warp_surfaces
+
+
+@pytest.fixture(scope="module")
+def layer():
+    """A sphere seen from two sides at 64 x 48, warped on grids of 16 x 12."""
+    source, target = (orbit(yaw, size=48, width=64, height=h) for yaw, h in ((0, 0.3), (30, 0.0)))
+    surfaces = [Surface(*sphere(camera)) for camera in (target, source)]
+    return warp_surfaces(source, target, *surfaces, preset("corrected", opaque=None)).at((12, 16))
+
+
+def tokens_of(maps):
+    return maps.flatten(2).transpose(1, 2).contiguous()
+
+
+def random_maps(layer, *, batch=2, channels=5, dtype=torch.float32, seed=0):
+    size = (layer.correspondence.source.height, layer.correspondence.source.width)
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(batch, channels, *size, generator=generator).to(dtype)
+
+
+def grid_sampled(layer, maps):
+    """torch's own sampling in float64; 0 where a pixel has no position."""
+    c = layer.correspondence
+    grid = 2 * c.xy / torch.tensor([c.source.width, c.source.height]) - 1
+    grid = torch.where(c.defined[..., None], grid, 0)[None].expand(len(maps), -1, -1, -1)
+    warped = torch.nn.functional.grid_sample(
+        maps.double(), grid, padding_mode="border", align_corners=False
+    )
+    return torch.where(c.defined, warped, 0)
+
+
+def test_tokens_warp_as_torch_samples_their_maps(layer):
+    maps = random_maps(layer)
+    warped = layer.warp_tokens(tokens_of(maps))
+    assert (warped - tokens_of(grid_sampled(layer, maps))).abs().max() < 1e-5
+    assert 0.1 < layer.mask.float().mean() < 0.9
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_the_blend_is_its_formula(layer, alpha):
+    maps, own = random_maps(layer), random_maps(layer, seed=1)
+    new = tokens_of(own)
+    blended = layer.blend_tokens(tokens_of(maps), new, alpha)
+    M = layer.mask.reshape(-1, 1).double()
+    warped = tokens_of(grid_sampled(layer, maps))
+    formula = alpha * (M * warped + (1 - M) * new) + (1 - alpha) * new
+    assert (blended - formula).abs().max() < 1e-5
+    outside = ~layer.mask.reshape(-1)
+    assert torch.equal(blended[:, outside], new[:, outside])
+    again = layer.blend_tokens(tokens_of(maps), new, alpha, in_place=True)
+    assert again is new
+    assert torch.equal(new, blended)
+
+
+# The kernels against the definition: products and sums come in one order, so bits are equal
+
+FLOATS = [torch.float32, torch.float16, torch.bfloat16, torch.float64]
+
+
+def bits(tensor):
+    """Integers of the tensor's own bytes: NaN and signed zeros are compared as they are."""
+    whole = {2: torch.int16, 4: torch.int32, 8: torch.int64}[tensor.element_size()]
+    return tensor.contiguous().view(whole)
+
+
+def both(layer, call):
+    """What the kernels and what the definition gives."""
+    return call(layer), call(dataclasses.replace(layer, backend="reference"))
+
+
+@pytest.mark.parametrize("dtype", FLOATS, ids=str)
+@pytest.mark.parametrize("channels", [1, 5, 40])
+def test_kernels_have_the_bits_of_the_definition(layer, dtype, channels):
+    maps = random_maps(layer, dtype=dtype, channels=channels)
+    maps[0, 0, 3:5, 4:7] = torch.tensor([torch.nan, torch.inf, -torch.inf])
+    maps[1, -1, 6] = 0.0
+    new = tokens_of(random_maps(layer, dtype=dtype, channels=channels, seed=1))
+    rows = tokens_of(maps)
+    for call in (
+        lambda warp: warp.warp(maps),
+        lambda warp: warp.warp(maps[0]),
+        lambda warp: warp.warp_tokens(rows),
+        lambda warp: warp.blend_tokens(rows, new, 0.7),
+        lambda warp: warp.blend_tokens(rows[:1], new, 0.7),
+    ):
+        kernels, definition = both(layer, call)
+        assert kernels.dtype == dtype
+        assert torch.equal(torch.isnan(kernels), torch.isnan(definition))
+        number = ~torch.isnan(definition)
+        assert torch.equal(bits(kernels)[number], bits(definition)[number])
+
+
+def test_maps_of_any_size_and_tokens_that_are_not_contiguous_are_read_right(layer):
+    maps = random_maps(layer, channels=6)
+    larger = torch.nn.functional.interpolate(maps, scale_factor=3)
+    kernels, definition = both(layer, lambda warp: warp.warp(larger))
+    assert torch.equal(kernels, definition)
+    strided = maps.flatten(2).transpose(1, 2)
+    assert not strided.is_contiguous()
+    assert torch.equal(layer.warp_tokens(strided), layer.warp_tokens(strided.contiguous()))
+    own = torch.zeros_like(strided)
+    expected = layer.blend_tokens(strided, own.clone(), 0.4)
+    assert not own.is_contiguous()
+    assert layer.blend_tokens(strided, own, 0.4, in_place=True) is own
+    assert torch.equal(own, expected)
+
+
+def test_taps_of_no_weight_are_never_read_and_undefined_pixels_give_0(layer):
+    # Hard case 36. The identity has one tap of weight 1 a pixel; the others hold NaN.
+    camera = layer.correspondence.target
+    surface = Surface(*sphere(camera))
+    same = warp_surfaces(camera, camera, surface, surface, preset("corrected", opaque=None))
+    identity = same.at((camera.height, camera.width))
+    seen = identity.correspondence.defined.reshape(-1)
+    tokens = torch.full((1, camera.height * camera.width, 3), torch.nan)
+    tokens[:, seen] = torch.arange(3.0) - 1
+    warped = identity.warp_tokens(tokens)
+    assert 0 < seen.sum() < len(seen)
+    assert torch.equal(warped[:, seen], tokens[:, seen])
+    assert (warped[:, ~seen] == 0).all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_rounded_once_from_float32(layer, dtype):
+    # Hard case 29. The oracle is torch's own rounding of the float64 sums.
+    maps = random_maps(layer, dtype=dtype, channels=40)
+    warped = layer.warp_tokens(tokens_of(maps))
+    exact = tokens_of(grid_sampled(layer, maps))
+    step = torch.finfo(dtype).eps
+    assert ((warped.double() - exact).abs() <= 0.51 * step * exact.abs() + 1e-5).all()
+
+
+@pytest.mark.parametrize("dtype", FLOATS, ids=str)
+def test_bits_do_not_depend_on_threads(layer, dtype):
+    def results():
+        source = tokens_of(random_maps(layer, dtype=dtype, channels=1300)).requires_grad_()
+        maps = random_maps(layer, dtype=dtype, channels=70).requires_grad_()
+        new = tokens_of(random_maps(layer, dtype=dtype, channels=1300, seed=1))
+        outputs = [layer.warp_tokens(source), layer.blend_tokens(source, new, 0.6)]
+        outputs.append(layer.warp(maps))
+        torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
+        return [bits(t.detach()) for t in (*outputs, source.grad, maps.grad)]
+
+    try:
+        set_thread_count(1)
+        alone = results()
+        set_thread_count(4)
+        assert all(torch.equal(a, b) for a, b in zip(alone, results(), strict=True))
+    finally:
+        set_thread_count(None)
+
+
+def test_gradients_are_those_of_torchs_own_sampling(layer):
+    maps = random_maps(layer, dtype=torch.float64).requires_grad_()
+    own = random_maps(layer, dtype=torch.float64, seed=1).requires_grad_()
+    weigh = random_maps(layer, dtype=torch.float64, seed=2)
+    M = layer.mask.double()
+    warped = grid_sampled(layer, maps)
+    blend = 0.7 * (M * warped + (1 - M) * own) + (1 - 0.7) * own
+    oracle = {
+        "maps": (warped * weigh).sum(),
+        "tokens": (warped * weigh).sum(),
+        "blend": (blend * weigh).sum(),
+    }
+    ours = {
+        "maps": (layer.warp(maps) * weigh).sum(),
+        "tokens": (layer.warp_tokens(tokens_of(maps)) * tokens_of(weigh)).sum(),
+        "blend": (
+            layer.blend_tokens(tokens_of(maps), tokens_of(own), 0.7) * tokens_of(weigh)
+        ).sum(),
+    }
+    for name, loss in ours.items():
+        gradients = torch.autograd.grad(loss, (maps, own), allow_unused=True)
+        expected = torch.autograd.grad(
+            oracle[name], (maps, own), allow_unused=True, retain_graph=True
+        )
+        for got, want in zip(gradients, expected, strict=True):
+            assert (got is None) == (want is None)
+            if want is not None:
+                # SNAP moves a position by up to 1e-7 px.
+                assert (got - want).abs().max() < 1e-5
+
+
+def test_one_source_for_all_gathers_the_gradient_of_all(layer):
+    source = tokens_of(random_maps(layer, batch=1)).requires_grad_()
+    new = tokens_of(random_maps(layer, batch=3, seed=1))
+    one = layer.blend_tokens(source, new, 0.5).square().sum()
+    three = layer.blend_tokens(source.expand(3, -1, -1), new, 0.5).square().sum()
+    got, expected = (torch.autograd.grad(loss, source)[0] for loss in (one, three))
+    assert (got - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda w, s, n: w.warp_tokens(s[0]),
+            r"source: got shape \(192, 5\), expected \(B, 192, C\)",
+        ),
+        (lambda w, s, n: w.warp_tokens(s[:, 1:]), r"source: got shape \(2, 191, 5\)"),
+        (lambda w, s, n: w.warp_tokens(s.long()), r"source: got torch\.int64, expected a floating"),
+        (
+            lambda w, s, n: w.warp(s.long()[None]),
+            r"features: got torch\.int64, expected a floating",
+        ),
+        (lambda w, s, n: w.warp(s[0]), r"features: got shape \(192, 5\)"),
+        (lambda w, s, n: w.blend_tokens(s, n[:, 1:], 1), r"new: got shape \(2, 191, 5\)"),
+        (lambda w, s, n: w.blend_tokens(s[:, :, 1:], n, 1), r"source: got shape .*for new tokens"),
+        (
+            lambda w, s, n: w.blend_tokens(s, n[:1], 1),
+            r"source: got shape .*expected \(1 or 1, 192, 5",
+        ),
+        (lambda w, s, n: w.blend_tokens(s, n, 1.5), r"alpha: got 1\.5"),
+        (
+            lambda w, s, n: w.blend_tokens(s.clone().requires_grad_(), n, 1, in_place=True),
+            r"in_place: got True where a gradient is recorded",
+        ),
+    ],
+)
+def test_the_doors_for_tokens_say_what_came_and_what_was_expected(layer, call, message):
+    source = tokens_of(random_maps(layer))
+    with pytest.raises(ValueError, match=message):
+        call(layer, source, source.clone())
+
+
+def test_a_layer_makes_its_taps_once(layer, monkeypatch):
+    made = []
+    from attnwarp.warp import features
+
+    original = features.taps_of
+    monkeypatch.setattr(features, "taps_of", lambda *a: made.append(a) or original(*a))
+    fresh = dataclasses.replace(layer, _taps={}, _masks={})
+    for dtype in (torch.float32, torch.float16, torch.float32):
+        rows = tokens_of(random_maps(layer, dtype=dtype))
+        fresh.warp_tokens(rows)
+        fresh.blend_tokens(rows, rows, 0.5)
+        fresh.warp(random_maps(layer, dtype=dtype))
+    assert len(made) == 1
