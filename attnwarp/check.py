@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from attnwarp.errors import suggest
+
 if TYPE_CHECKING:
     import torch
 
@@ -45,11 +47,8 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:
     """Return ``value`` if it is among ``allowed``, else raise ValueError that lists what is."""
     if value not in allowed:
-        import difflib
-
-        near = difflib.get_close_matches(str(value), list(allowed), n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise ValueError(
-            f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}{hint}"
+            f"{name}: got {value!r}, expected one of {', '.join(map(repr, allowed))}"
+            f"{suggest(str(value), allowed)}"
         )
     return value

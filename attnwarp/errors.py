@@ -99,5 +99,10 @@ def suggest(word: str, allowed: Sequence[str]) -> str:
         >>> suggest("lr_mean", ["lr_means", "ssim"])
         "; did you mean 'lr_means'?"
     """
-    near = difflib.get_close_matches(word, allowed, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    near = nearest(word, allowed)
+    return "" if near is None else f"; did you mean {near!r}?"
+
+
+def nearest(word: str, allowed: Sequence[str]) -> str | None:
+    """The allowed word nearest to a misspelt one; None where none is near."""
+    return next(iter(difflib.get_close_matches(word, allowed, n=1)), None)

@@ -9,7 +9,6 @@ Nothing heavy is imported until an encoder is loaded, and nothing is ever fetche
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 from pathlib import Path
@@ -24,7 +23,7 @@ from attnwarp.encoders.base import (
     TextImageEncoder,
     TokenEncoder,
 )
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, nearest
 
 __all__ = [
     "BUNDLED",
@@ -91,8 +90,8 @@ def kind_of(name: str) -> Kind:
             )
         return _SCHEMES[scheme]
     known = [*BUNDLED, *_SCHEMES]
-    close = difflib.get_close_matches((scheme if colon else name).lower(), known, n=1, cutoff=0.5)
-    guess = f"; did you mean {_pattern(close[0])!r}?" if close else "."
+    near = nearest((scheme if colon else name).lower(), known)
+    guess = "." if near is None else f"; did you mean {_pattern(near)!r}?"
     raise InputError(f"encoder {name!r}: unknown{guess} Known are {', '.join([*BUNDLED, *REAL])}")
 
 

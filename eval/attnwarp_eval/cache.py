@@ -1,11 +1,13 @@
-"""Where derived files live, and how they are written so that two processes can share the folder."""
+"""Derived files: where they live, how they are sealed, and how several processes share them."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
+import math
 import os
-import tempfile
-import zipfile
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import remove_abandoned, write_atomically
 from attnwarp_eval.files import digest
 
 
@@ -23,9 +26,9 @@ def cache_dir() -> Path:
 
     Everything in it can be recomputed and may be deleted at any time.
     """
-    named = os.environ.get("ATTNWARP_CACHE")
-    if named:
-        return Path(named).expanduser()
+    folder = os.environ.get("ATTNWARP_CACHE")
+    if folder:
+        return Path(folder).expanduser()
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "attnwarp"
 
@@ -35,40 +38,70 @@ def content_key(*parts: Any) -> str:
     return digest(list(parts))
 
 
+SEAL = b"attnwarp sha256 "
+"""Precedes the checksum at a file's end. Before it is a usual npz, which NumPy also reads with the
+seal behind it.
+"""
+
+_OLD_END = b"PK\x05\x06"
+"""Of a zip file's last record. A file that ends with it has no seal: an earlier version wrote it.
+"""
+
+_warned: set[Path] = set()
+"""Damaged files that this process has named."""
+
+
 def read_arrays(kind: str, key: str) -> dict[str, npt.NDArray[Any]] | None:
-    """The arrays stored under ``kind``/``key``, or None when there are none or the file is
-    damaged."""
+    """The arrays stored under ``kind``/``key``, or None where they must be computed.
+
+    A file whose checksum does not fit its content is named on stderr, once, and counts as none: the
+    caller computes the arrays and :func:`write_arrays` replaces it. zip has a checksum of its own,
+    but NumPy does not read as far as it where the header of an array was changed.
+    """
     path = cache_dir() / kind / f"{key}.npz"
     try:
-        # Opened here, since np.load leaves a damaged file open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        data = path.read_bytes()
+    except OSError:
         return None
+    content, seal = data[:-_SEAL_SIZE], data[-_SEAL_SIZE:]
+    if seal != _seal(kind, key, content):
+        if data[-22:-18] != _OLD_END and path not in _warned:
+            _warned.add(path)
+            print(f"attnwarp-eval: {path}: damaged; it is computed again", file=sys.stderr)
+        return None
+    with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+_SEAL_SIZE = len(SEAL) + hashlib.sha256().digest_size
+
+
+def _seal(kind: str, key: str, content: bytes) -> bytes:
+    """The last bytes of a file, which depend on its name: it cannot stand in for another."""
+    return SEAL + hashlib.sha256(f"{kind}/{key}\n".encode() + content).digest()
 
 
 def write_arrays(kind: str, key: str, arrays: Mapping[str, Any]) -> None:
     """Store ``arrays`` under ``kind``/``key``.
 
-    The file appears under its name only when it is whole (written beside it, then renamed), so a
-    reader never sees half of one and the last of several writers wins. A folder that cannot be
-    written is no error: the value is simply computed again next time.
+    The file appears under its name only when it is whole, so a reader never sees half of one and
+    the last of several writers wins. A folder that cannot be written to is no error: the value is
+    computed again next time.
+
+    Raises:
+        InputError: ``ATTNWARP_CACHE_GB`` is not a number of gigabytes.
     """
+    limit = limit_bytes()
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    content = buffer.getvalue()
+    data = content + _seal(kind, key, content)
     folder = cache_dir() / kind
-    temporary: Path | None = None
-    try:
+    with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{key[:16]}-", suffix=".tmp", dir=folder)
-        temporary = Path(name)
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)
-        size = temporary.stat().st_size
-        temporary.replace(folder / f"{key}.npz")
-        _keep_within_limit(size)
-    except OSError:
-        if temporary is not None:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
+        # Not durable: half a file would fail its checksum, and a mesh takes less time than a flush.
+        write_atomically(folder / f"{key}.npz", lambda stream: stream.write(data), durable=False)
+        _keep_within(limit, len(data))
 
 
 _unseen: float = float("inf")
@@ -77,7 +110,7 @@ first write.
 """
 
 
-def _keep_within_limit(written: int) -> None:
+def _keep_within(limit: int, written: int) -> None:
     """Trim the folder, but look at all of it only after every hundredth of the limit.
 
     To look costs a call for each file: done at every write, keeping thousands of small meshes took
@@ -85,7 +118,6 @@ def _keep_within_limit(written: int) -> None:
     """
     global _unseen
     _unseen += written
-    limit = limit_bytes()
     if _unseen > limit / 100:
         _unseen = 0.0
         trim(limit)
@@ -101,25 +133,25 @@ def limit_bytes() -> int:
     Raises:
         InputError: the variable is not a number of gigabytes.
     """
-    said = os.environ.get("ATTNWARP_CACHE_GB", "")
+    text = os.environ.get("ATTNWARP_CACHE_GB", "")
     try:
-        limit = float(said) if said else DEFAULT_LIMIT_GB
+        limit = 1e9 * (float(text) if text else DEFAULT_LIMIT_GB)
     except ValueError:
-        limit = -1.0
-    if not limit >= 0:
+        limit = math.nan
+    if not 0 <= limit < math.inf:
         raise InputError(
-            f"ATTNWARP_CACHE_GB: got {said!r}, expected a number of gigabytes such as 10"
+            f"ATTNWARP_CACHE_GB: got {text!r}, expected a number of gigabytes such as 10"
         )
-    return int(limit * 1e9)
+    return int(limit)
 
 
 def _files() -> list[tuple[Path, os.stat_result]]:
     """Every stored file with its state; one that another process removes meanwhile is left out."""
-    found = []
+    files = []
     for path in cache_dir().glob("*/*.npz"):
         with contextlib.suppress(OSError):
-            found.append((path, path.stat()))
-    return found
+            files.append((path, path.stat()))
+    return files
 
 
 def usage() -> dict[str, tuple[int, int]]:
@@ -132,12 +164,14 @@ def usage() -> dict[str, tuple[int, int]]:
 
 
 def trim(limit: int) -> int:
-    """Remove the files written longest ago until at most ``limit`` bytes are left; how many bytes
-    went.
+    """Remove the files written longest ago until at most ``limit`` bytes are left; return how many
+    bytes went.
 
-    Safe beside other processes: a reader that has a file open keeps it, and one that comes later
-    computes it again.
+    Temporary files that dead processes left go, too. Safe beside other processes: a reader that has
+    a file open keeps it, and one that comes later computes it again.
     """
+    for folder in cache_dir().glob("*/"):
+        remove_abandoned(folder)
     files = sorted(_files(), key=lambda item: item[1].st_mtime)
     excess = sum(state.st_size for _, state in files) - limit
     removed = 0

@@ -12,12 +12,17 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+T = TypeVar("T")
 
 PACKAGES = (
     "attnwarp",
@@ -42,16 +47,18 @@ class Meter:
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
         self._stages: dict[str, float] = {}
+        self._cpu: dict[str, float] = {}
         self._views: list[float] = []
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Add the time spent inside to stage ``name``."""
-        start = time.perf_counter()
+        start, start_cpu = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - start
+            self._cpu[name] = self._cpu.get(name, 0.0) + time.process_time() - start_cpu
 
     @contextmanager
     def view(self) -> Iterator[None]:
@@ -66,6 +73,16 @@ class Meter:
         """Add to the work counters, such as rays, pairs or taps."""
         self.counters.update({k: int(v) for k, v in counters.items()})
 
+    @property
+    def wall(self) -> dict[str, float]:
+        """Wall seconds by stage."""
+        return dict(self._stages)
+
+    @property
+    def cpu(self) -> dict[str, float]:
+        """CPU seconds of all threads of this process, by stage."""
+        return dict(self._cpu)
+
     def seconds(self) -> dict[str, float | None]:
         """Seconds by stage; ``warm`` is the first view's, ``steady`` the median of the others'
         (None without them).
@@ -73,6 +90,70 @@ class Meter:
         steady = statistics.median(self._views[1:]) if len(self._views) > 1 else None
         warm = self._views[0] if self._views else None
         return {**self._stages, "warm": warm, "steady": steady, "method": sum(self._views)}
+
+
+@dataclass(frozen=True)
+class Turns(Generic[T]):
+    """What contestants that ran in turn gave and took.
+
+    Attributes:
+        results: contestant -> round -> what it returned.
+        seconds: contestant -> round -> wall seconds.
+        again: round -> seconds of the first contestant's second run.
+    """
+
+    results: list[list[T]]
+    seconds: list[list[float]]
+    again: list[float]
+
+
+AGAIN = 10_000
+"""Added to the round that the first contestant's second run is given, so that it draws other noise.
+"""
+
+
+def in_turn(
+    contestants: Sequence[Callable[[int], T]],
+    rounds: int,
+    *,
+    seed: int = 0,
+    before: Callable[[int], None] = lambda _: None,
+) -> Turns[T]:
+    """Time contestants round by round in one process, each round in an order drawn anew.
+
+    The speed of a machine drifts. Contestants of one round see the same machine, so the ratio of
+    two within a round can be trusted where two separate means cannot. The first contestant runs
+    twice a round: the ratio of it to itself is what noise alone does on this machine. One more
+    round comes first, which compiles and fills caches; it is not kept.
+
+    Args:
+        contestants: at least one; called with the number of the round, from 1.
+        rounds: how many are kept.
+        seed: of the order.
+        before: called, untimed, with the index of the contestant that comes next.
+
+    >>> turns = in_turn([lambda turn: "a", lambda turn: "b"], rounds=3)
+    >>> turns.results
+    [['a', 'a', 'a'], ['b', 'b', 'b']]
+    >>> len(turns.seconds[1]), len(turns.again)
+    (3, 3)
+    """
+    count = len(contestants)
+    rng = np.random.default_rng(seed)
+    results: list[list[T]] = [[] for _ in contestants]
+    seconds: list[list[float]] = [[] for _ in range(count + 1)]
+    for turn in range(rounds + 1):
+        for place in rng.permutation(count + 1):
+            index, again = int(place) % count, place == count
+            before(index)
+            start = time.perf_counter()
+            result = contestants[index](turn + AGAIN if again else turn)
+            taken = time.perf_counter() - start
+            if turn:
+                seconds[place].append(taken)
+                if not again:
+                    results[index].append(result)
+    return Turns(results, seconds[:count], seconds[count])
 
 
 def peak_memory_mb() -> float:

@@ -144,14 +144,14 @@ def render_world(
     looks = looks_of(seed, world.thing, split)
     if split.path_traced:
         from attnwarp_eval.colors import to_srgb
-        from attnwarp_eval.truth import mitsuba
+        from attnwarp_eval.truth.mitsuba import build, render_plan
         from attnwarp_eval.truth.plan import plan
 
         # Baking textures as finely as truth wants them takes ten times as long as the small picture
         # itself.
-        mitsuba.TEXELS = TEXELS
+        build.TEXELS = TEXELS
         scene = world.scene(looks[0], size)
-        image = to_srgb(mitsuba.render_plan(scene, scene.source, plan(scene, SPP), seed))
+        image = to_srgb(render_plan(scene, scene.source, plan(scene, SPP), seed))
         yield np.rint(255 * image).astype(np.uint8), attributes(world.thing, looks[0]), 0, 0
         return
     for view in range(world.views):

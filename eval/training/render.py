@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec, SkySpec, SunSpec
-from attnwarp_eval.scene.textures import albedo, linear_rgb
+from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.raycast import Hits
 from attnwarp_eval.truth.shading import hemisphere, sky_radiance, sun_direction

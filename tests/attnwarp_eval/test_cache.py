@@ -9,8 +9,15 @@ import pytest
 from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import write_atomically
 from attnwarp_eval import cache
 from attnwarp_eval.cli.main import app
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
+    return tmp_path
 
 
 def test_arrays_read_back_bit_for_bit_and_a_damaged_file_is_no_file(tmp_path, monkeypatch):
@@ -22,6 +29,103 @@ def test_arrays_read_back_bit_for_bit_and_a_damaged_file_is_no_file(tmp_path, mo
     assert cache.read_arrays("kind", "other") is None
     (tmp_path / "kind" / "key.npz").write_bytes(b"PK half a file")
     assert cache.read_arrays("kind", "key") is None
+
+
+ARRAYS = {
+    "floats": {"x": np.array([[0.1, -2.0], [3.5, 1e-300]])},
+    "several kinds": {
+        "ids": np.array([3, -1], np.int32),
+        "valid": np.array([True, False]),
+        "origin": np.float64(7.25),
+    },
+    "an empty and a small one": {"none": np.zeros((0, 3)), "rgb": np.array([1, 2, 3], np.uint8)},
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_no_flipped_bit_gives_another_number_and_a_damaged_file_is_named_once(name, folder, capsys):
+    arrays = ARRAYS[name]
+    cache.write_arrays("kind", "key", arrays)
+    path = folder / "kind" / "key.npz"
+    whole = path.read_bytes()
+    with path.open("r+b", buffering=0) as file:
+        for bit in range(8 * len(whole)):
+            byte = bit // 8
+            os.pwrite(file.fileno(), bytes([whole[byte] ^ 1 << bit % 8]), byte)
+            assert cache.read_arrays("kind", "key") is None, f"bit {bit} of {len(whole)} bytes"
+            os.pwrite(file.fileno(), whole[byte : byte + 1], byte)
+    warning = f"attnwarp-eval: {path}: damaged; it is computed again\n"
+    assert capsys.readouterr().err == warning
+    # The run goes on: the same file is written anew and read.
+    cache.write_arrays("kind", "key", arrays)
+    assert path.read_bytes() == whole
+    stored = cache.read_arrays("kind", "key")
+    assert stored.keys() == arrays.keys()
+    for key, value in arrays.items():
+        assert stored[key].dtype == value.dtype and np.array_equal(stored[key], value)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_file_cut_short_lengthened_or_under_another_name_is_not_read(folder, capsys):
+    cache.write_arrays("kind", "key", {"x": np.arange(4.0)})
+    path = folder / "kind" / "key.npz"
+    whole = path.read_bytes()
+    for size in range(0, len(whole), 7):
+        path.write_bytes(whole[:size])
+        assert cache.read_arrays("kind", "key") is None
+    path.write_bytes(whole + b"\0")
+    assert cache.read_arrays("kind", "key") is None
+    (folder / "kind" / "other.npz").write_bytes(whole)
+    assert cache.read_arrays("kind", "other") is None
+    assert capsys.readouterr().err.count("damaged") == 2
+
+
+def test_a_file_of_an_earlier_version_is_computed_again_without_a_word(folder, capsys):
+    (folder / "kind").mkdir()
+    np.savez(folder / "kind" / "key.npz", x=np.arange(3))
+    assert cache.read_arrays("kind", "key") is None
+    assert capsys.readouterr().err == ""
+
+
+def test_a_damaged_file_leaves_the_meshes_of_a_scene_as_they_are(folder, capsys):
+    from attnwarp_eval.scene.file import load_scene
+
+    def vertices():
+        return [s.vertices for s in load_scene("bear").shapes() if hasattr(s, "vertices")]
+
+    expected = vertices()
+    path = min((folder / "meshes").glob("*.npz"), key=lambda p: p.stat().st_size)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 16
+    path.write_bytes(data)
+    assert all(map(np.array_equal, vertices(), expected))
+    assert capsys.readouterr().err.count(f"{path}: damaged") == 1
+    assert all(map(np.array_equal, vertices(), expected))
+    assert capsys.readouterr().err == ""
+
+
+def test_a_folder_that_cannot_be_written_to_is_no_error(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "file"))
+    cache.write_arrays("kind", "key", {"x": np.zeros(3)})
+    assert cache.read_arrays("kind", "key") is None
+
+
+def test_temporary_files_of_a_dead_process_are_swept_up(folder, monkeypatch):
+    # A process that ends at once; its number is free again when it was waited for.
+    process = multiprocessing.get_context("spawn").Process(target=os.getpid)
+    process.start()
+    process.join()
+    cache.write_arrays("kind", "key", {"x": np.zeros(3)})
+    names = []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "getpid", lambda: process.pid)
+        patch.setattr(type(folder), "replace", lambda self, target: names.append(self))
+        write_atomically(folder / "kind" / "other.npz", lambda stream: stream.write(b"half"))
+    (left,) = names
+    assert left.read_bytes() == b"half"
+    cache.trim(10**9)
+    assert [p.name for p in (folder / "kind").iterdir()] == ["key.npz"]
 
 
 def _write(folder, value):
@@ -37,8 +141,8 @@ def test_two_processes_that_write_at_once_leave_one_whole_file(tmp_path, monkeyp
     for writer in writers:
         writer.start()
     while any(writer.is_alive() for writer in writers):
-        found = cache.read_arrays("kind", "key")
-        assert found is None or len(set(found["x"])) == 1
+        stored = cache.read_arrays("kind", "key")
+        assert stored is None or len(set(stored["x"])) == 1
     for writer in writers:
         writer.join()
         assert writer.exitcode == 0
@@ -62,10 +166,16 @@ def test_the_oldest_files_go_when_the_folder_is_over_its_limit(tmp_path, monkeyp
     assert cache.usage() == {}
 
 
-def test_a_limit_that_is_no_number_is_refused(monkeypatch):
-    monkeypatch.setenv("ATTNWARP_CACHE_GB", "ten")
-    with pytest.raises(InputError, match="got 'ten', expected a number of gigabytes"):
+@pytest.mark.parametrize("text", ["ten", "inf", "-inf", "nan", "-1", "1e300", "1e999"])
+def test_a_limit_that_is_no_number_of_gigabytes_is_refused(folder, monkeypatch, text):
+    monkeypatch.setenv("ATTNWARP_CACHE_GB", text)
+    message = f"ATTNWARP_CACHE_GB: got '{text}', expected a number of gigabytes"
+    with pytest.raises(InputError, match=message):
         cache.limit_bytes()
+    with pytest.raises(InputError, match=message):
+        cache.write_arrays("kind", "key", {"x": np.zeros(3)})
+    refused = CliRunner().invoke(app, ["cache", "info"])
+    assert refused.exit_code == 2 and "expected a number of gigabytes" in refused.output
 
 
 def test_many_small_writes_do_not_each_look_at_every_file_and_stay_within_a_hundredth_of_the_limit(

@@ -134,9 +134,9 @@ def test_moved_things_keep_their_surface_and_change_ground_and_time():
     ("finish", "time"), [("plain", "day"), ("striped", "cloudy"), ("marble", "sunset")]
 )
 def test_the_ray_caster_draws_what_mitsuba_draws(finish, time, monkeypatch):
-    from attnwarp_eval.truth import mitsuba
+    from attnwarp_eval.truth.mitsuba import build
 
-    monkeypatch.setattr(mitsuba, "TEXELS", 1024)
+    monkeypatch.setattr(build, "TEXELS", 1024)
     rng = np.random.default_rng(5)
     world = draw_world(31, thing=OBJECTS.index("bear"))
     two = COLORS.index("blue") if finish == "striped" else -1

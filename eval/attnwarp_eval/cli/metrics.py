@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, progress
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, progress, resumable
 
 
 def metrics(
@@ -71,18 +71,20 @@ def metrics(
     from rich.console import Console
 
     with clear_errors():
+        from attnwarp_eval.study.store import Store
         from attnwarp_eval.user_images import measure, write
 
         inputs = measure.Inputs(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
         )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
-        with progress() as show:
+        with progress() as show, resumable(lambda: "finished views are kept"):
             measured = measure.measure(
                 inputs,
                 kinds,
                 device=device,
                 progress=show,
+                store=Store(out),
             )
         paths = write.write(measured, out)
     if as_json:

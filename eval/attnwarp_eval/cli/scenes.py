@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
@@ -159,10 +159,11 @@ def effects(
     with clear_errors():
         from attnwarp_eval.effects import detect as light
         from attnwarp_eval.effects.proof import prove as hold
+        from attnwarp_eval.effects.saving import measure
         from attnwarp_eval.scene.file import load_scene
 
         loaded = load_scene(str(scene))
-        about = light.report(loaded, cost=light.measure(loaded))
+        about = light.report(loaded, cost=measure(loaded))
         proof = hold(loaded, seconds=budget) if prove else None
     if proof is not None:
         about["proof"] = proof.to_dict()
@@ -176,7 +177,8 @@ def effects(
 
 def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
     with clear_errors():
-        from attnwarp_eval.effects.table import Settings, collect, proof_words
+        from attnwarp_eval.effects.table import Settings, proof_words
+        from attnwarp_eval.experiments.effects import collect
         from attnwarp_eval.scene.file import list_scenes
 
         scenes = list_scenes()
@@ -184,11 +186,7 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
             progress(len(scenes), lines=True) as show,
             resumable(lambda: "finished scenes are kept"),
         ):
-
-            def watch(text: str, done: int) -> None:
-                show(done, len(scenes), text)
-
-            entries = collect(scenes, out, Settings(prove=prove, budget=budget), watch)
+            entries = collect(scenes, out, Settings(prove=prove, budget=budget), show)
     typer.echo(out / "effects.md")
     doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
                 and e["proof"]["verdict"] != "certified"]  # fmt: skip
@@ -211,11 +209,52 @@ def accuracy(
     refinement, visibility.
     """
     with clear_errors():
-        from attnwarp_eval.experiments import accuracy as truth
+        from attnwarp_eval.experiments.accuracy import measure
+        from attnwarp_eval.experiments.accuracy.write import write
 
-        with progress() as show:
-            panels = truth.measure(scenes or (), rounds=rounds, progress=show.step)
-        for path in truth.write(panels, out):
+        with progress() as show, resumable(lambda: "finished panels are kept"):
+            panels = list(measure(scenes or (), out=out, rounds=rounds, progress=show))
+        for path in write(panels, out):
+            typer.echo(path)
+
+
+@app.command()
+def flow(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="bear, dinosaur, person; all if left out.")
+    ] = None,
+    yaws: Annotated[
+        str, typer.Option(help="Degrees from the source (comma-separated).")
+    ] = "2,5,10,20,30,60",
+    size: Annotated[int, typer.Option(min=16, max=4096, help="Of the pictures, px.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 32,
+    method: Annotated[str, typer.Option(help="Of OpenCV's flow: dis or farneback.")] = "dis",
+    out: Annotated[
+        Path, typer.Option(help="Folder for report.md, its figures, flow.json and pictures.")
+    ] = Path("runs/flow"),
+    pictures: Annotated[bool, typer.Option(help="Keep the pictures of each pair.")] = True,
+) -> None:
+    """How far consistency along optical flow is from that at exact correspondences."""
+    with clear_errors():
+        from attnwarp.errors import InputError
+        from attnwarp_eval.experiments import flow as study
+        from attnwarp_eval.experiments import flow_report
+
+        try:
+            angles = [float(yaw) for yaw in names(yaws) or []]
+        except ValueError as error:
+            raise InputError(f"--yaws: {error}; expected degrees such as 5,20") from None
+        options = study.Options(size, spp, cast(study.Method, method), pictures)
+        with (
+            progress(lines=True) as show,
+            resumable(lambda: "finished pairs are kept"),
+        ):
+            chosen = scenes or list(study.SCENES)
+            rows = list(study.measure(chosen, angles, out, options, progress=show))
+        if not rows:
+            raise InputError("--yaws: got none, expected degrees such as 5,20")
+        typer.echo(flow_report.table(rows))
+        for path in flow_report.write(rows, out, size=size, spp=spp):
             typer.echo(path)
 
 
@@ -240,9 +279,9 @@ def time_(
     import json
 
     from rich.console import Console
-    from rich.table import Table
 
     with clear_errors():
+        from attnwarp_eval.document.write import terminal
         from attnwarp_eval.experiments import suite
         from attnwarp_eval.scene.file import list_scenes
 
@@ -254,7 +293,7 @@ def time_(
                 size=size,
                 spp=spp,
                 geometry_size=geometry_size,
-                progress=show.step,
+                progress=show,
             ):
                 times.append(taken)
                 # All of them take minutes, so each is printed as soon as it is measured.
@@ -262,8 +301,4 @@ def time_(
     if as_json:
         typer.echo(json.dumps(suite.to_dict(times), indent=1))
         return
-    columns, rows = suite.columns_and_rows(times)
-    table = Table(*columns, caption="wall, with CPU in brackets")
-    for row in rows:
-        table.add_row(*row)
-    Console(width=160).print(table)
+    Console(width=160).print(terminal(suite.table(times)))

@@ -7,11 +7,15 @@ import html
 import mimetypes
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from attnwarp_eval.document.model import Report
+from attnwarp_eval.document.model import Report, Table
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
 
 _CLASSES = {
     "seen": "holds",
@@ -47,6 +51,17 @@ def _embedder(root: Path):  # type: ignore[no-untyped-def]
         return f"data:{kind};base64,{base64.b64encode((root / path).read_bytes()).decode()}"
 
     return embed
+
+
+def terminal(table: Table) -> RichTable:
+    """A table for a terminal; its cells are plain text, without markup."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    grid = RichTable(*table.columns, caption=table.caption or None)
+    for row in table.rows:
+        grid.add_row(*map(Text, row))
+    return grid
 
 
 def markdown(report: Report) -> str:

@@ -1,4 +1,4 @@
-"""Which light transport a scene needs, and what its plan costs against everything on.
+"""Which light transport a scene needs.
 
 :func:`detect` looks at the file, at the graph handed to Mitsuba (plugin names) and at what Mitsuba
 made of it (BSDF flags, emitter flags, media, textures by class name), and refuses to go on where
@@ -8,25 +8,18 @@ on. docs/effects.md has the reasons.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from attnwarp_eval.effects.saving import Cost
 from attnwarp_eval.scene import transport
 from attnwarp_eval.scene.materials import EFFECTS, NOT_SIMULATED, Effect
 from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.truth.llvm import LLVM, variant
-from attnwarp_eval.truth.mitsuba import graph, render_plan
+from attnwarp_eval.truth.mitsuba import graph
 from attnwarp_eval.truth.plan import convex, everything_on, plan, sampler, small_lights
-
-Array = npt.NDArray[np.float64]
-
-# Detection
-# --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -214,202 +207,8 @@ def _varies(texture: Any) -> bool:
     return bool(np.ptp(data.reshape(-1, data.shape[-1]), axis=0).max() > 1e-6)
 
 
-# Cost and words
+# Words
 # --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Cap:
-    """What a scene's own cap on bounces cuts off, and what everything on costs within it.
-
-    Attributes:
-        bounces: the cap.
-        bias: mean light of the plan's pictures over that of everything on without a cap, less 1.
-        bias_interval: its 95 %, by Welch's test on the logarithms of the rounds' means; both None
-            for a black picture.
-        seconds, variance: of everything on within the cap, as :class:`Cost` has them.
-        faster: how many times longer it takes for the same samples.
-        at_equal_error: how many times longer for the same noise, which is the same error, since its
-            pictures have the plan's mean; infinite where the plan has no noise.
-        interval: 95 % of that; None where the plan has no noise.
-    """
-
-    bounces: int
-    bias: float | None
-    bias_interval: tuple[float, float] | None
-    seconds: float
-    variance: float
-    faster: float
-    at_equal_error: float
-    interval: tuple[float, float] | None
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What everything on would cost, against the plan, measured on one small picture of the source.
-
-    Everything on follows light until roulette ends it. Where the scene caps its bounces that is
-    light that the plan leaves out, so that the two pictures have other means: equal noise is not
-    equal error there, and ``cap`` says what is.
-
-    Attributes:
-        size, spp: of the measurement.
-        seconds: (plan, everything on) medians.
-        faster: how many times longer everything on takes for the same samples: the median over
-            rounds, in each of which both were rendered one after the other.
-        variance: (plan, everything on), mean over pixels and channels, relative to the squared
-            mean.
-        rounds: pictures of each, taken in turn.
-        interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None where the plan has
-            no noise.
-        cap: None where the scene has no cap.
-    """
-
-    size: int
-    spp: int
-    rounds: int
-    seconds: tuple[float, float]
-    faster: float
-    variance: tuple[float, float]
-    interval: tuple[float, float] | None
-    cap: Cap | None = None
-
-    @property
-    def at_equal_noise(self) -> float:
-        """How many times longer everything on takes for the same noise; infinite where the plan has
-        none.
-        """
-        return (
-            self.faster * self.variance[1] / self.variance[0]
-            if self.variance[0] > 0
-            else float("inf")
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON, where infinity is null."""
-        out = asdict(self) | {"at_equal_noise": _finite(self.at_equal_noise)}
-        if self.cap is not None:
-            out["cap"]["at_equal_error"] = _finite(self.cap.at_equal_error)
-        return out
-
-
-def measure(
-    scene: Scene,
-    *,
-    size: int | None = None,
-    spp: int | None = None,
-    rounds: int = 7,
-    seed: int = 7000,
-) -> Cost:
-    """Render plan and everything on in turn and time both, after one unmeasured picture each.
-
-    Where the scene caps its bounces, everything on within the cap is a third.
-
-    Args:
-        size, spp: of the picture; if left out as large as needed for tracing, not starting, to take
-            most of the time.
-    """
-    size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
-    small = scene.with_size(size, size)
-    contestants = [plan(small, spp), everything_on(small, spp, capped=False)]
-    bounces = scene.spec.appearance.bounces
-    if bounces != "unlimited":
-        contestants.append(everything_on(small, spp))
-    pictures: list[list[Any]] = [[] for _ in contestants]
-    seconds: list[list[float]] = [[] for _ in contestants]
-    for turn in range(rounds + 1):
-        for step in range(len(contestants)):
-            k = (step + turn) % len(contestants)
-            start = time.perf_counter()
-            picture = render_plan(small, small.source, contestants[k], seed + turn)
-            if turn:
-                seconds[k].append(time.perf_counter() - start)
-                pictures[k].append(picture)
-    scale = float(np.mean(pictures[1])) ** 2
-    taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
-    variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
-    medians = [float(np.median(s)) for s in seconds]
-    interval = _ratio_interval(taken[0], taken[1], seconds[0], seconds[1])
-    cap = None
-    if bounces != "unlimited":
-        faster = _slower(seconds[0], seconds[2])
-        bias, between = _cut(taken[0].mean(1), taken[1].mean(1))
-        cap = Cap(
-            bounces, bias, between, medians[2], variance[2], faster,
-            faster * variance[2] / variance[0] if variance[0] > 0 else float("inf"),
-            _ratio_interval(taken[0], taken[2], seconds[0], seconds[2]),
-        )  # fmt: skip
-    faster = _slower(seconds[0], seconds[1])
-    return Cost(
-        size,
-        spp,
-        rounds,
-        (medians[0], medians[1]),
-        faster,
-        (variance[0], variance[1]),
-        interval,
-        cap,
-    )
-
-
-def _slower(ours: list[float], other: list[float]) -> float:
-    """Median of the ratios of rounds, as the interval of :func:`_ratio_interval` has it: two rounds
-    are paired in time.
-    """
-    return float(np.median(np.array(other) / np.array(ours)))
-
-
-def _cut(ours: Array, full: Array) -> tuple[float | None, tuple[float, float] | None]:
-    """Relative difference of two means with its 95 % interval, from the means of independent
-    pictures.
-    """
-    from scipy import stats
-
-    if min(ours.min(), full.min()) <= 0 or len(ours) < 2:
-        return None, None
-    # Logarithms, so that the noise of the reference counts as well.
-    a, b = np.log(ours), np.log(full)
-    middle, parts = float(a.mean() - b.mean()), [float(x.var(ddof=1)) / len(x) for x in (a, b)]
-    # Rounding aside: pictures without noise differ by exactly what they differ by.
-    if sum(parts) < 1e-20:
-        return float(np.expm1(middle)), (float(np.expm1(middle)), float(np.expm1(middle)))
-    freedom = sum(parts) ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(parts, (a, b), strict=True))
-    reach = float(stats.t.ppf(0.975, freedom)) * float(np.sqrt(sum(parts)))
-    return float(np.expm1(middle)), (
-        float(np.expm1(middle - reach)),
-        float(np.expm1(middle + reach)),
-    )
-
-
-def _ratio_interval(
-    ours: Array, other: Array, ours_seconds: list[float], other_seconds: list[float]
-) -> tuple[float, float] | None:
-    """95 % of the ratio of variance times time, by resampling rounds; None where ``ours`` has no
-    noise.
-    """
-    rounds = len(ours)
-    if not ours.var(0).any():
-        return None
-    # What else the machine does slows both of a round.
-    ratio = np.array(other_seconds) / np.array(ours_seconds)
-    # Squared distances between rounds: the variance of a resample is the mean over its pairs of
-    # different rounds.
-    apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in (ours, other)]
-    draws = np.random.default_rng(0).integers(0, rounds, (1000, rounds))
-    spread = [np.array([_between(a, d) for d in draws]) for a in apart]
-    known = (spread[0] > 0) & (spread[1] > 0)
-    if not known.any():
-        return None
-    low, high = np.percentile(
-        np.median(ratio[draws], axis=1)[known] * spread[1][known] / spread[0][known], [2.5, 97.5]
-    )
-    return float(low), float(high)
-
-
-def _between(apart: Array, drawn: npt.NDArray[np.int64]) -> float:
-    """Mean of ``apart`` over the pairs of different rounds among those drawn."""
-    different = drawn[:, None] != drawn[None]
-    return float(apart[np.ix_(drawn, drawn)][different].mean()) if different.any() else 0.0
 
 
 def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
@@ -427,10 +226,6 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
     if cost is not None:
         out["cost"] = cost.to_dict()
     return out
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
@@ -473,6 +268,8 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
                 else f"{equal:.1f} times{_span(cost['interval'])}"
             )
         )
+        low, high = cost["again"]
+        yield f"  the plan's time against itself: {low:.2f} to {high:.2f}"
         if cap := cost["cap"]:
             if cap["bias"] is not None:
                 low, high = cap["bias_interval"]

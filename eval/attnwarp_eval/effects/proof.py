@@ -12,7 +12,7 @@ that can certify.
 
 No difference found is not yet equality: only the equivalence test certifies, and it refuses when
 the noise is too great for it. What neither side simulates no comparison can find: a scene that
-calls for it is never certified. The statistics are pure functions of stacks of pictures.
+calls for it is never certified. The tests are those of :mod:`attnwarp_eval.statistics.equivalence`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,13 @@ import numpy.typing as npt
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
+from attnwarp_eval.statistics.equivalence import (
+    ONE_SIDED,
+    equivalence,
+    paired_test,
+    sidak,
+    welch,
+)
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
 from attnwarp_eval.truth.plan import (
     Lens,
@@ -48,75 +55,14 @@ Verdict = Literal["certified", "refused", "can't tell"]
 MARGIN = 0.01
 """Two pictures count as equal when their means differ by less than this share of the mean."""
 
-ONE_SIDED = 2.33
-"""Normal quantile of 1 %: |d| + 2.33 SE < margin is two one-sided tests at 1 % each."""
-
 ALPHA = 0.01
 """Chance that the whole ladder refuses a plan that drops nothing; the rungs share it."""
 
 BLOCK = 8
 
-ROUNDING = 1e-5
-"""Relative differences below this are float32 sums taken in another order, not light."""
 
-
-# Statistics
+# Statistics of pictures
 # --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Welch:
-    """Welch's test of two means with unequal variances, value by value.
-
-    Attributes:
-        difference: mean(b) - mean(a).
-        error: its standard error.
-        freedom: Satterthwaite's degrees of freedom.
-        p: two-sided probability of a difference this large if there were none.
-    """
-
-    difference: Array
-    error: Array
-    freedom: Array
-    p: Array
-
-
-def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
-    """Welch (1947) with Satterthwaite's degrees of freedom, along the first axis.
-
-    Args:
-        a, b: (n, ...) and (m, ...) independent samples, n, m >= 2. Where neither varies, p is 1 for
-            equal values (within ``ROUNDING``) and 0 for others.
-    """
-    from scipy import stats
-
-    first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    if len(first) < 2 or len(second) < 2:
-        raise ValueError(
-            f"a, b: got {len(first)} and {len(second)} samples, expected at least 2 of each"
-        )
-    va, vb = first.var(0, ddof=1) / len(first), second.var(0, ddof=1) / len(second)
-    difference, variance = second.mean(0) - first.mean(0), va + vb
-    floor = (ROUNDING * np.maximum(np.abs(first).mean(0), np.abs(second).mean(0))) ** 2
-    still = variance <= floor
-    with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(
-            still, np.inf, variance**2 / (va**2 / (len(first) - 1) + vb**2 / (len(second) - 1))
-        )
-        t = np.abs(difference) / np.sqrt(variance)
-        p = np.where(
-            still,
-            np.where(difference**2 <= floor, 1.0, 0.0),
-            2 * stats.t.sf(t, np.minimum(freedom, 1e9)),
-        )
-    return Welch(difference, np.sqrt(variance), freedom, p)
-
-
-def sidak(alpha: float, tests: int) -> float:
-    """The level of each of ``tests`` independent tests at which all together refuse a truth with
-    chance ``alpha``.
-    """
-    return -math.expm1(math.log1p(-alpha) / max(tests, 1))
 
 
 def blocks(pictures: npt.ArrayLike, size: int = BLOCK) -> Array:
@@ -194,79 +140,6 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
             )
         )
     return out
-
-
-@dataclass(frozen=True)
-class Equivalence:
-    """Two one-sided tests (Schuirmann 1987) of the pictures' means.
-
-    Attributes:
-        difference, error: of the means, as shares of the mean.
-        margin: the share that counts as equal.
-    """
-
-    difference: float
-    error: float
-    margin: float
-
-    @property
-    def bound(self) -> float:
-        """|difference| + 2.33 standard errors: with 99 % on either side the true difference is
-        smaller.
-        """
-        return abs(self.difference) + ONE_SIDED * self.error
-
-    @property
-    def equal(self) -> bool:
-        """Whether the means are shown to be equal within the margin."""
-        return self.bound < self.margin
-
-
-def equivalence(a: npt.ArrayLike, b: npt.ArrayLike, *, margin: float = MARGIN) -> Equivalence:
-    """Whether the means of two stacks of pictures are equal within ``margin`` of the mean of ``b``,
-    the reference.
-    """
-    first, second = (
-        np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1)[:, None] for x in (a, b)
-    )
-    result, scale = welch(first, second), max(abs(float(second.mean())), 1e-300)
-    return Equivalence(float(result.difference[0]) / scale, float(result.error[0]) / scale, margin)
-
-
-@dataclass(frozen=True)
-class Paired:
-    """A t-test on differences of means under common seeds.
-
-    Attributes:
-        difference, error: shares of the mean.
-        p: two-sided.
-        pairs: how many.
-    """
-
-    difference: float
-    error: float
-    p: float
-    pairs: int
-
-
-def paired(a: npt.ArrayLike, b: npt.ArrayLike) -> Paired:
-    """Student's t-test on mean(b_k) - mean(a_k): pictures (n, ...) whose k-th seeds are the
-    same."""
-    from scipy import stats
-
-    first, second = (
-        np.asarray(x, np.float64).reshape(len(np.asarray(x)), -1).mean(1) for x in (a, b)
-    )
-    scale = max(abs(float(second.mean())), 1e-300)
-    d = (second - first) / scale
-    error = float(d.std(ddof=1) / math.sqrt(len(d)))
-    mean = float(d.mean())
-    p = (
-        float(2 * stats.t.sf(abs(mean) / error, len(d) - 1))
-        if error > ROUNDING
-        else float(abs(mean) <= ROUNDING)
-    )
-    return Paired(mean, error, p, len(d))
 
 
 # The ladder
@@ -438,7 +311,7 @@ def climb(
         )
         return Climb("certified", tuple(rungs), {"any": 0.0})
     rungs.append(Rung("same seed", None, "the pictures differ, as those of different paths do"))
-    common = paired(a, b)
+    common = paired_test(a, b)
     bad = common.p < share
     rungs.append(
         Rung(
@@ -468,7 +341,7 @@ def climb(
                 asdict(level),
             )
         )
-    same = equivalence(a, b)
+    same = equivalence(a, b, margin=MARGIN)
     rungs.append(
         Rung(
             "equivalence", True if same.equal else None,

@@ -4,9 +4,6 @@ what it looks like.
 
 from __future__ import annotations
 
-import functools
-import json
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,18 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.cache import content_key
-from attnwarp_eval.effects.detect import detect, measure
+from attnwarp_eval.effects.detect import detect
+from attnwarp_eval.effects.saving import measure
 from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
+from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.plan import everything_on, plan
 
 if TYPE_CHECKING:
     from attnwarp_eval.document.model import Table
-
-PROTOCOL = 2
-"""Raised whenever an entry would come out otherwise."""
 
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
@@ -64,104 +59,41 @@ class Settings:
     pictures: bool = True
 
 
-def collect(
-    names: Sequence[str],
-    out: Path,
-    settings: Settings,
-    progress: Callable[[str, int], None] = lambda *_: None,
-) -> list[dict[str, Any]]:
-    """Make the table's entries and write them, with their pictures, below ``out``; what is there
-    already is kept.
-
-    Entries are kept by the scene's content, the settings and Mitsuba's version and variant: after
-    an interruption, or when one scene has changed, only what is missing is made.
+def measure_entry(
+    scene: Scene, settings: Settings, progress: Callable[[str], None]
+) -> dict[str, Any]:
+    """What one scene calls for, what its plan costs, and the proof, as JSON.
 
     Args:
-        names: scenes' names or paths.
-        out: folder of ``effects.json``, ``effects.md`` and ``<scene>.jpg``.
-        progress: told what is at work and how many scenes are done.
-
-    Returns:
-        The entries, as they stand in ``effects.json``.
-
-    Raises:
-        InputError: a scene that is unknown or contradicts itself, or an ``effects.json`` of
-            something else.
+        scene: the scene.
+        settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
+        progress: told what is at work.
     """
-    import mitsuba
-
-    from attnwarp_eval.scene.file import load_scene
-    from attnwarp_eval.truth.llvm import variant
-    from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, forget
-
-    known = _read(out / "effects.json")
-    entries = []
-    for number, name in enumerate(names):
-        scene = load_scene(name)
-        key = content_key(
-            "effects",
-            PROTOCOL,
-            APPEARANCE_PROTOCOL,
-            mitsuba.__version__,
-            variant(),
-            scene.content_hash,
-            settings.prove,
-            settings.budget,
-            settings.rounds,
-        )
-        entry = known.get(scene.name)
-        if (
-            entry is None
-            or entry["key"] != key
-            or (settings.pictures and not (out / entry["picture"]).is_file())
-        ):
-            entry = {"key": key} | _entry(
-                scene, out, settings, functools.partial(_told, progress, number)
-            )
-            known[scene.name] = entry
-        entries.append(entry)
-        # Scenes of an earlier call stay in the file; the table is of those asked for, as far as
-        # they are done.
-        _write(out, known, entries)
-        forget()
-    return entries
-
-
-def _entry(
-    scene: Scene, out: Path, settings: Settings, progress: Callable[[str], None]
-) -> dict[str, Any]:
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
     progress(f"{scene.name}: effects")
-    found = detect(scene)
-    planned = plan(scene)
+    findings = detect(scene)
     entry: dict[str, Any] = {
         "scene": scene.name,
         "title": scene.title,
         "content": scene.content_hash,
         "variant": variant(),
-        "needed": [name for name in found if found[name].needed and found[name].simulated],
-        "left_out": [name for name in found if found[name].source == "said"],
+        "needed": [name for name, one in findings.items() if one.needed and one.simulated],
+        "left_out": [name for name, one in findings.items() if one.source == "said"],
         "not_simulated": [
-            name for name in found if found[name].needed and not found[name].simulated
+            name for name, one in findings.items() if one.needed and not one.simulated
         ],
-        "plan": planned.to_dict(),
+        "plan": plan(scene).to_dict(),
         "everything_on": everything_on(scene, capped=False).to_dict(),
         "picture": f"{scene.name}.jpg",
     }
     if settings.rounds:
         progress(f"{scene.name}: time against everything on")
-        cost = measure(scene, rounds=settings.rounds)
-        entry["cost"] = cost.to_dict()
+        entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
     if settings.prove:
         progress(f"{scene.name}: proof")
-        proof = prove(scene, seconds=settings.budget)
-        entry["proof"] = proof.to_dict()
-    if settings.pictures:
-        progress(f"{scene.name}: pictures")
-        out.mkdir(parents=True, exist_ok=True)
-        entry |= side_by_side(scene, out / entry["picture"])
+        entry["proof"] = prove(scene, seconds=settings.budget).to_dict()
     return entry
 
 
@@ -172,10 +104,9 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
     Returns:
         "largest_difference": of an 8 x 8 block of the displayed pictures, in [0, 1].
     """
-    import cv2
-
     from attnwarp_eval.colors import to_srgb
     from attnwarp_eval.effects.proof import blocks
+    from attnwarp_eval.files import write_picture
     from attnwarp_eval.truth.mitsuba import comparable, render_plan
 
     small = scene.with_size(PICTURE_SIZE, PICTURE_SIZE)
@@ -185,56 +116,12 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
         for k, made in enumerate((plan(small, PLAN_SAMPLES), everything_on(small, FULL_SAMPLES)))
     )
     difference = ours.astype(np.float64) - full
-    shown = np.clip(0.5 + AMPLIFIED / 2 * difference, 0, 1)
+    amplified = np.clip(0.5 + AMPLIFIED / 2 * difference, 0, 1)
     gap = np.ones((PICTURE_SIZE, 4, 3))
-    row = np.concatenate([ours, gap, full, gap, shown], axis=1)
-    pixels = np.clip(np.rint(row * 255), 0, 255).astype(np.uint8)
-    if not cv2.imwrite(str(path), pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88]):
-        raise OSError(f"{path}: could not be written")
+    row = np.concatenate([ours, gap, full, gap, amplified], axis=1)
+    write_picture(path, row, quality=88, chroma="420")
     largest: npt.NDArray[np.float64] = np.abs(blocks(difference[None]))
     return {"largest_difference": float(largest.max())}
-
-
-def _read(path: Path) -> dict[str, dict[str, Any]]:
-    from attnwarp.errors import InputError
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return {}
-    try:
-        return {
-            entry["scene"]: entry
-            for entry in json.loads(text)["scenes"]
-            if entry["key"] and entry["picture"]
-        }
-    except (ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{path}: it is not a table of effects; name another folder with --out, or remove the"
-            " file"
-        ) from None
-
-
-def _told(progress: Callable[[str, int], None], number: int, text: str) -> None:
-    progress(text, number)
-
-
-def _write(out: Path, known: Mapping[str, Any], shown: Sequence[Mapping[str, Any]]) -> None:
-    from attnwarp_eval.cost import environment
-
-    data: dict[str, Any] = {
-        "environment": environment(),
-        "scenes": [known[name] for name in sorted(known)],
-    }
-    _replace(out / "effects.json", json.dumps(data, indent=1, allow_nan=False) + "\n")
-    _replace(out / "effects.md", _page(shown, data["environment"]))
-
-
-def _replace(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
 
 
 # Words
@@ -294,8 +181,11 @@ def _bound(proof: Mapping[str, Any] | None) -> str:
         return "–"
     if "any" in proof["detectable"]:
         return "same bits"
-    found = [rung["numbers"] for rung in proof["rungs"] if rung["name"] == "equivalence"]
-    return f"{abs(found[0]['difference']) + 2.33 * found[0]['error']:.2%}" if found else "–"
+    for rung in proof["rungs"]:
+        if rung["name"] == "equivalence":
+            means = rung["numbers"]
+            return f"{Equivalence(means['difference'], means['error'], means['margin']).bound:.2%}"
+    return "–"
 
 
 def _smallest(proof: Mapping[str, Any] | None) -> str:
@@ -336,7 +226,8 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def _page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
+def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
+    """The table as Markdown, with the pictures side by side; ``about`` is the environment."""
     from attnwarp_eval.document.model import Gallery, Picture, Report, Section
     from attnwarp_eval.document.write import markdown
 

@@ -1,17 +1,17 @@
-"""What the truth of the scenes costs from nothing: meshes, geometry and pictures, timed with an
-empty cache.
-"""
+"""What the truth of the scenes costs from an empty cache: meshes, geometry and pictures."""
 
 from __future__ import annotations
 
 import os
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from attnwarp_eval.cost import Meter
+from attnwarp_eval.document.model import Table
+from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.file import load_scene
 
 STAGES = ("meshes", "geometry", "first picture", "other pictures")
@@ -38,7 +38,7 @@ class SceneTime:
 
 @contextmanager
 def empty_cache() -> Iterator[None]:
-    """Derived files go to a folder that is new and gone afterwards, here and in child processes."""
+    """Use a temporary folder for derived files, here and in child processes."""
     before = os.environ.get("ATTNWARP_CACHE")
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
         os.environ["ATTNWARP_CACHE"] = folder
@@ -58,9 +58,9 @@ def measure(
     geometry_size: int = 512,
     size: int = 256,
     spp: int = 64,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
 ) -> Iterator[SceneTime]:
-    """Make each scene's truth from nothing, one after the other, and say what it took.
+    """Make each scene's truth from an empty cache, one after the other, and time it.
 
     Args:
         names: scenes' names or paths.
@@ -68,7 +68,7 @@ def measure(
             fewer.
         geometry_size, size: of the square images of depth and ids, and of the pictures.
         spp: samples a pixel of the pictures.
-        progress: told what is at work.
+        progress: told of each step of each scene.
     """
     from attnwarp_eval.truth import Geometry, appearance
     from attnwarp_eval.truth.llvm import variant
@@ -78,36 +78,34 @@ def measure(
     warm = load_scene("spheres").with_size(16, 16)
     Geometry(warm).trace(warm.source)
     appearance(warm, warm.source, spp=1)
-    for name in names:
-        wall, cpu = dict.fromkeys(STAGES, 0.0), dict.fromkeys(STAGES, 0.0)
+    for number, name in enumerate(names):
+        meter = Meter()
 
-        @contextmanager
-        def stage(
-            key: str, wall: dict[str, float] = wall, cpu: dict[str, float] = cpu
-        ) -> Iterator[None]:
-            start, start_cpu = time.perf_counter(), time.process_time()
-            yield
-            wall[key] += time.perf_counter() - start
-            cpu[key] += time.process_time() - start_cpu
+        def tell(step: str, number: int = number) -> None:
+            progress(number, len(names), step)
 
-        progress(f"{name}: meshes")
+        tell(f"{name}: meshes")
         with empty_cache():
-            with stage("meshes"):
+            with meter.stage("meshes"):
                 scene = load_scene(name)
                 scene.shapes()
             cameras = scene.with_size(geometry_size, geometry_size).cameras[:views]
-            progress(f"{name}: geometry of {len(cameras)} views")
-            with stage("geometry"):
+            tell(f"{name}: geometry of {len(cameras)} views")
+            with meter.stage("geometry"):
                 geometry = Geometry(scene)
                 for camera in cameras:
                     geometry.trace(camera)
             del geometry
             small = scene.with_size(size, size)
-            for number, camera in enumerate(small.cameras[:views]):
-                progress(f"{name}: picture {number + 1} of {len(cameras)}")
-                with stage("other pictures" if number else "first picture"):
+            for k, camera in enumerate(small.cameras[:views]):
+                tell(f"{name}: picture {k + 1} of {len(cameras)}")
+                with meter.stage("other pictures" if k else "first picture"):
                     appearance(small, camera, spp=spp)
         forget()
+        wall, cpu = (
+            {stage: seconds.get(stage, 0.0) for stage in STAGES}
+            for seconds in (meter.wall, meter.cpu)
+        )
         yield SceneTime(scene.name, len(cameras), wall, cpu, variant())
 
 
@@ -120,8 +118,8 @@ def to_dict(times: Sequence[SceneTime]) -> dict[str, Any]:
     return {"scenes": [asdict(t) for t in times], "total": total}
 
 
-def columns_and_rows(times: Sequence[SceneTime]) -> tuple[list[str], list[list[str]]]:
-    """A table of seconds: wall, with CPU in brackets."""
+def table(times: Sequence[SceneTime]) -> Table:
+    """Seconds by scene and stage: wall, with CPU in brackets."""
     columns = ["scene", "views", *(f"{stage}, s" for stage in STAGES), "variant"]
     rows = [
         [t.scene, str(t.views), *(f"{t.wall[s]:.1f} ({t.cpu[s]:.1f})" for s in STAGES), t.variant]
@@ -129,4 +127,5 @@ def columns_and_rows(times: Sequence[SceneTime]) -> tuple[list[str], list[list[s
     ]
     total = to_dict(times)["total"]
     sums = [f"{total['wall'][s]:.1f} ({total['cpu'][s]:.1f})" for s in STAGES]
-    return columns, [*rows, ["all", str(sum(t.views for t in times)), *sums, ""]]
+    rows.append(["all", str(sum(t.views for t in times)), *sums, ""])
+    return Table(columns, rows, "wall, with CPU in brackets")

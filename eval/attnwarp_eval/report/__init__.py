@@ -7,9 +7,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from attnwarp_eval.document.write import markdown, page
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.results import lines, read_results
-from attnwarp_eval.study.store import Store, write_atomic
+from attnwarp_eval.study.store import Store
 
 __all__ = ["problems", "read_results", "write_report"]
 

@@ -11,12 +11,19 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from attnwarp_eval.scene import shapes
-from attnwarp_eval.scene.textures import LATER, Color, Spec, lattice_noise, linear_rgb
-
-Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
-Width = Annotated[float, Field(ge=0)]
+from attnwarp_eval.scene import solids
+from attnwarp_eval.scene.base import (
+    LATER,
+    Color,
+    Coordinate,
+    Length,
+    Positive,
+    Spec,
+    Vector,
+    linear_rgb,
+)
+from attnwarp_eval.scene.shapes import Mesh
+from attnwarp_eval.scene.textures import lattice_noise
 
 
 class RingSpec(Spec):
@@ -28,10 +35,10 @@ class RingSpec(Spec):
     """
 
     count: int = Field(ge=1, le=500)
-    about: tuple[float, float] = (0.0, 0.0)
+    about: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     sweep: float = 360.0
     jitter: float = Field(0.0, ge=0, le=1)
-    lift: float = 0.0
+    lift: Coordinate = 0.0
     seed: int = 0
 
 
@@ -45,7 +52,7 @@ class _PartSpec(Spec):
 
     mirror: bool = False
     color: Color = "#ffffff"
-    blend: bool | Width = True
+    blend: bool | Length = True
     carve: bool = Field(False, json_schema_extra=LATER)
     ring: RingSpec | None = Field(None, json_schema_extra=LATER)
 
@@ -78,7 +85,7 @@ class BlockPart(_TurnedPart):
 
     type: Literal["block"]
     size: tuple[Positive, Positive, Positive]
-    round: float = Field(0.0, ge=0)
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> BlockPart:
@@ -96,7 +103,7 @@ class DiscPart(_TurnedPart):
     type: Literal["disc"]
     radius: Positive
     height: Positive
-    round: float = Field(0.0, ge=0)
+    round: Length = 0.0
 
     @model_validator(mode="after")
     def _room_for_the_edges(self) -> DiscPart:
@@ -155,7 +162,7 @@ class BodySpec(Spec):
 
     type: Literal["body"]
     parts: tuple[PartSpec, ...] = Field(min_length=1)
-    blend: float = Field(0.1, ge=0)
+    blend: Length = 0.1
     resolution: int = Field(128, ge=8, le=512)
     position: Vector = (0.0, 0.0, 0.0)
     yaw: float = 0.0
@@ -170,28 +177,28 @@ class BodySpec(Spec):
             )
         return self
 
-    def solid(self) -> list[shapes.Part]:
+    def solid(self) -> list[solids.Part]:
         """The parts, copies and mirror images included."""
         return [
             copy for spec in self.parts for part in _parts(spec) for copy in _ring(part, spec.ring)
         ]
 
-    def surface(self) -> shapes.Relief | None:
+    def surface(self) -> solids.Relief | None:
         """The relief."""
-        return shapes.Relief(**self.relief.model_dump()) if self.relief else None
+        return solids.Relief(**self.relief.model_dump()) if self.relief else None
 
-    def mesh(self) -> shapes.Mesh:
+    def mesh(self) -> Mesh:
         """The surface as triangles, in the body's own coordinates."""
-        return shapes.mesh_body(self.solid(), self.blend, self.resolution, self.surface())
+        return solids.mesh_body(self.solid(), self.blend, self.resolution, self.surface())
 
     def contains(self, point: npt.NDArray[np.float64]) -> bool:
         """Whether a (3,) point in the body's own coordinates is inside; needs no meshing."""
         return bool(
-            shapes.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0
+            solids.body_distance(self.solid(), self.blend, point[None], self.surface())[0] < 0
         )
 
 
-def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
+def _parts(spec: PartSpec) -> Iterator[solids.Part]:
     color, blend, carve = linear_rgb(spec.color), spec.blend, spec.carve
     for side in (1.0, -1.0) if spec.mirror else (1.0,):
 
@@ -205,7 +212,7 @@ def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
                 else (spec.points, spec.radii)
             )
             for k in range(len(points) - 1):
-                yield shapes.Capsule(
+                yield solids.Capsule(
                     flip(points[k]), flip(points[k + 1]), (radii[k], radii[k + 1]),
                     color=color, blend=blend, carve=carve,
                 )  # fmt: skip
@@ -213,15 +220,15 @@ def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
         center, pitch, yaw, roll = flip(spec.center), spec.pitch, spec.yaw * side, spec.roll * side
         match spec:
             case EllipsoidPart():
-                yield shapes.Ellipsoid(
+                yield solids.Ellipsoid(
                     center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
                 )
             case TorusPart():
-                yield shapes.Torus(
+                yield solids.Torus(
                     center, spec.radii, pitch, yaw, roll, color=color, blend=blend, carve=carve
                 )
             case BlockPart():
-                yield shapes.Block(
+                yield solids.Block(
                     center,
                     spec.size,
                     spec.round,
@@ -233,13 +240,13 @@ def _parts(spec: PartSpec) -> Iterator[shapes.Part]:
                     carve=carve,
                 )
             case DiscPart():
-                yield shapes.Disc(
+                yield solids.Disc(
                     center, spec.radius, spec.height, spec.round, pitch, yaw, roll,
                     color=color, blend=blend, carve=carve,
                 )  # fmt: skip
 
 
-def _ring(part: shapes.Part, ring: RingSpec | None) -> Iterator[shapes.Part]:
+def _ring(part: solids.Part, ring: RingSpec | None) -> Iterator[solids.Part]:
     if ring is None:
         yield part
         return
@@ -264,14 +271,14 @@ def _ring(part: shapes.Part, ring: RingSpec | None) -> Iterator[shapes.Part]:
             return (ring.about[0] + c * x - s * y, ring.about[1] + s * x + c * y, v[2] + lift)
 
         match part:
-            case shapes.Capsule():
+            case solids.Capsule():
                 yield replace(
                     part,
                     start=turn(part.start),
                     end=turn(part.end),
                     radii=(part.radii[0] * size, part.radii[1] * size),
                 )
-            case shapes.Ellipsoid():
+            case solids.Ellipsoid():
                 x, y, z = part.radii
                 yield replace(
                     part,

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.materials import TEXTURED
 from attnwarp_eval.scene.spec import AnswerSpec, EditSpec, ObjectChange, ObjectSpec, SceneSpec
-from attnwarp_eval.scene.textures import linear_rgb
 from attnwarp_eval.scene.transport import contradictions
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -12,11 +13,13 @@ from pydantic import BaseModel, ValidationError
 
 from attnwarp.camera import Camera
 from attnwarp.errors import suggest
-from attnwarp_eval.scene import edits, shapes
+from attnwarp_eval.scene import edits
+from attnwarp_eval.scene.meshes import MESH_SUFFIXES
 from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, view_name
 from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec, SkySpec
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 from attnwarp_eval.scene.transport import contradictions
+from attnwarp_eval.scene.yaml import YamlError, read_yaml
 
 
 def scene_folders() -> list[Path]:
@@ -66,19 +69,10 @@ def _read(path: Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"cannot be read: {error}", path) from error
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        if root is None:
-            raise SceneError("the file is empty; docs/scenes.md has an example to start from", path)
-        _refuse_duplicate_keys(root, path)
-        data = yaml.safe_load(text)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = mark.line + 1 if mark else None
-        raise SceneError(
-            f"not valid YAML: {error.problem or error}; check indentation and quotes", path, line
-        ) from error
-    except yaml.YAMLError as error:
-        raise SceneError(f"not valid YAML: {error}", path) from error
+        root, data = read_yaml(text)
+    except YamlError as error:
+        hint = "" if error.line else "; docs/scenes.md has an example to start from"
+        raise SceneError(f"{error}{hint}", path, error.line) from error
     try:
         spec = SceneSpec.model_validate(data)
     except ValidationError as error:
@@ -93,25 +87,6 @@ def _read(path: Path) -> Scene:
     scene = Scene(spec, path)
     _check(scene, root)
     return scene
-
-
-def _refuse_duplicate_keys(node: yaml.Node, path: Path) -> None:
-    """YAML itself lets the last of two equal keys win, silently."""
-    if isinstance(node, yaml.MappingNode):
-        seen: dict[str, int] = {}
-        for key, value in node.value:
-            line = key.start_mark.line + 1
-            if key.value in seen:
-                raise SceneError(
-                    f"the key {key.value!r} stands here and on line {seen[key.value]}; keep one",
-                    path,
-                    line,
-                )
-            seen[key.value] = line
-            _refuse_duplicate_keys(value, path)
-    elif isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _refuse_duplicate_keys(item, path)
 
 
 def _line(node: yaml.Node, loc: Sequence[int | str]) -> int:
@@ -159,7 +134,7 @@ def _explain(problem: Any) -> str:
         return f"{place}: says no type; add 'type: ...' (docs/scenes.md lists the types)"
     message = problem["msg"].removeprefix("Value error, ")
     if not message.startswith("got "):
-        message = f"got {came!r}, but {message[0].lower() + message[1:]}"
+        message = f"got {reprlib.repr(came)}, but {message[0].lower() + message[1:]}"
     return f"{place or 'the file'}: {message}"
 
 
@@ -243,11 +218,11 @@ def _check(scene: Scene, root: yaml.Node) -> None:
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
             where = ("objects", k, "shape", "file")
-            if path.suffix.lower() not in shapes.MESH_SUFFIXES:
-                near = suggest(path.suffix.lower(), shapes.MESH_SUFFIXES)
+            if path.suffix.lower() not in MESH_SUFFIXES:
+                near = suggest(path.suffix.lower(), MESH_SUFFIXES)
                 refuse(
                     f"objects[{k}].shape.file: {item.shape.file!r} is not of a known mesh"
-                    f" format{near}; one of {', '.join(shapes.MESH_SUFFIXES)}",
+                    f" format{near}; one of {', '.join(MESH_SUFFIXES)}",
                     *where,
                 )
             if not path.is_file():

@@ -11,10 +11,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from attnwarp_eval.scene.textures import Color, Spec
-
-Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0)]
+from attnwarp_eval.scene.base import Color, Positive, Spec, Vector
 
 # Materials
 # --------------------------------------------------------------------------------------------------
@@ -245,7 +242,5 @@ __all__ = [
     "MirrorMaterial",
     "PlasticMaterial",
     "PointSpec",
-    "Positive",
     "SpotSpec",
-    "Vector",
 ]

@@ -15,11 +15,12 @@ import numpy.typing as npt
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError, suggest
 from attnwarp_eval.cache import content_key
-from attnwarp_eval.scene import shapes
+from attnwarp_eval.scene.base import FARTHEST, Vector
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.edits import apply, pick
-from attnwarp_eval.scene.materials import Vector
-from attnwarp_eval.scene.shapes import MESHING_PROTOCOL, Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.meshes import READER_PROTOCOL, read_mesh
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
+from attnwarp_eval.scene.solids import MESHING_PROTOCOL
 from attnwarp_eval.scene.spec import (
     BoxSpec,
     CamerasSpec,
@@ -174,8 +175,22 @@ class Scene:
     def shapes(self) -> list[Shape]:
         """Everything that has a surface, in world coordinates, each with its object's index as
         ``object_id``.
+
+        Raises:
+            SceneError: an object reaches farther than coordinates may, or a mesh file is damaged.
         """
-        return [shape for k, item in enumerate(self.spec.objects) for shape in self._build(item, k)]
+        shapes = []
+        for k, item in enumerate(self.spec.objects):
+            for shape in self._build(item, k):
+                reach = float(np.abs(shape.bounds()).max())
+                if not reach <= FARTHEST:
+                    raise SceneError(
+                        f"object {item.name!r} reaches {reach:.3g} from the origin, expected at"
+                        f" most {FARTHEST:g}; make its scale or position smaller",
+                        self.path,
+                    )
+                shapes.append(shape)
+        return shapes
 
     def _build(self, item: ObjectSpec, object_id: int) -> Iterator[Shape]:
         spec = item.shape
@@ -203,7 +218,7 @@ class Scene:
             case MeshSpec():
                 path = self.mesh_path(spec)
                 try:
-                    mesh = shapes.read_mesh(path)
+                    mesh = read_mesh(path)
                 except ValueError as error:
                     raise SceneError(str(error), self.path) from error
                 upright = (
@@ -243,7 +258,9 @@ class Scene:
             if isinstance(item.shape, MeshSpec)
         }
         said = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
-        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, said, files)
+        # Scenes without mesh files keep the names that they had before meshes had a reader of ours.
+        reader = (READER_PROTOCOL,) if files else ()
+        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, said, files, *reader)
 
     @functools.cached_property
     def content_hash(self) -> str:

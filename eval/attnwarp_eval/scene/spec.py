@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from attnwarp_eval.scene.base import LATER, Color, Coordinate, Direction, Positive, Spec, Vector
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.materials import (
     TEXTURED,
@@ -20,12 +21,10 @@ from attnwarp_eval.scene.materials import (
     Material,
     MediumSpec,
     PointSpec,
-    Positive,
     SpotSpec,
-    Vector,
 )
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
-from attnwarp_eval.scene.textures import LATER, Color, Direction, Plain, Spec, Texture
+from attnwarp_eval.scene.textures import Plain, Texture
 
 
 class SphereSpec(Spec):
@@ -128,7 +127,7 @@ class SunSpec(Spec):
     type: Literal["sun"]
     elevation: float = Field(gt=0, le=90)
     azimuth: float
-    irradiance: float = Field(gt=0)
+    irradiance: Positive
     color: Color = "#ffffff"
 
 
@@ -140,10 +139,13 @@ class SkySpec(Spec):
     type: Literal["sky"]
     horizon: Color
     zenith: Color
-    radiance: float = Field(1.0, gt=0)
+    radiance: Positive = 1.0
 
 
 LightSpec = Annotated[SunSpec | SkySpec | PointSpec | SpotSpec, Field(discriminator="type")]
+
+
+Pixels = Annotated[int, Field(le=65536)]
 
 
 class ViewSpec(Spec):
@@ -153,7 +155,7 @@ class ViewSpec(Spec):
         None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"
     )  # it becomes part of file names
     yaw: float
-    height: float
+    height: Coordinate
     radius: Positive | None = None
     fov: float | None = Field(None, gt=0, lt=180)
     look_at: Vector | None = None
@@ -167,7 +169,7 @@ class CamerasSpec(Spec):
     look_at: Vector
     radius: Positive
     fov: float = Field(45.0, gt=0, lt=180)
-    size: tuple[int, int] = (512, 512)
+    size: tuple[Pixels, Pixels] = (512, 512)
     source: ViewSpec
     targets: tuple[ViewSpec, ...] = Field(min_length=1)
     lens: LensSpec | None = Field(None, json_schema_extra=LATER)

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from attnwarp_eval.scene.base import Color, Coordinate, Positive, Spec, Vector, linear_rgb
 from attnwarp_eval.scene.shapes import Mesh
-from attnwarp_eval.scene.textures import Color, Spec, fractal_noise, lattice_noise, linear_rgb
+from attnwarp_eval.scene.textures import fractal_noise, lattice_noise
 
 Array = npt.NDArray[np.float64]
-Positive = Annotated[float, Field(gt=0)]
 Height = Callable[[Array], Array]
 """(N, 2) places to (N,) heights."""
 
@@ -30,12 +30,12 @@ class TerrainSpec(Spec):
     middle."""
 
     type: Literal["terrain"]
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    center: Vector = (0.0, 0.0, 0.0)
     size: tuple[Positive, Positive]
     height: Positive
     feature: Positive
     octaves: int = Field(4, ge=1, le=8)
-    level: tuple[float, float] = (0.0, 0.0)
+    level: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     seed: int = 0
     resolution: int = Field(320, ge=2, le=2048)
 
@@ -103,8 +103,8 @@ class ScatterSpec(Spec):
     count: int = Field(ge=1, le=20000)
     size: tuple[Positive, Positive]
     radius: tuple[Annotated[float, Field(ge=0)], Positive]
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    avoid: tuple[tuple[float, float, Positive], ...] = ()
+    center: Vector = (0.0, 0.0, 0.0)
+    avoid: tuple[tuple[Coordinate, Coordinate, Positive], ...] = ()
     colors: tuple[Color, ...] = ("#ffffff",)
     on: str | None = None
     seed: int = 0

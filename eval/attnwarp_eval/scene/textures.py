@@ -11,81 +11,18 @@ from typing import Annotated, Any, Literal
 import numba
 import numpy as np
 import numpy.typing as npt
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    JsonValue,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-)
+from pydantic import Field
 
-from attnwarp_eval.colors import to_linear
+from attnwarp_eval.scene.base import Color, Coordinate, Direction, Positive, Spec, linear_rgb
 
 Array = npt.NDArray[np.float64]
-
-
-def _hex(value: Any) -> str:
-    if value is None:
-        raise ValueError(
-            "got nothing; an unquoted # starts a YAML comment, so write the colour in quotes:"
-            " '#c08040'"
-        )
-    text = str(value)
-    if len(text) != 7 or text[0] != "#" or any(c not in "0123456789abcdefABCDEF" for c in text[1:]):
-        raise ValueError(f"got {value!r}, expected an sRGB colour in quotes such as '#c08040'")
-    return text.lower()
-
-
-def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    if not any(value):
-        raise ValueError("got [0, 0, 0], expected a direction")
-    return value
-
-
-Direction = Annotated[tuple[float, float, float], AfterValidator(_direction)]
-"""A vector of any length but zero."""
-
-Color = Annotated[str, BeforeValidator(_hex)]
-
-
-def linear_rgb(color: str) -> tuple[float, float, float]:
-    """Linear RGB of an sRGB colour written '#rrggbb'."""
-    r, g, b = to_linear(np.array([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]))
-    return float(r), float(g), float(b)
-
-
-LATER: dict[str, JsonValue] = {"later": True}
-"""``Field(default, json_schema_extra=LATER)``: a key that the format did not have at first. While
-it keeps its default it is left out of what is hashed, so that files written before it mean, and are
-called, what they always did."""
-
-
-class Spec(BaseModel):
-    """Base of everything a scene file says: unknown keys and numbers that are not finite are
-    refused.
-    """
-
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True
-    )
-
-    @model_serializer(mode="wrap")
-    def _leave_out_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        said: dict[str, Any] = handler(self)
-        for name, about in type(self).model_fields.items():
-            if about.json_schema_extra == LATER and getattr(self, name) == about.default:
-                said.pop(name, None)
-        return said
 
 
 class _Texture(Spec):
     variation: float = Field(
         0.0, ge=0, le=1
     )  # share by which a fine noise brightens or darkens the colour
-    grain: float = Field(0.1, gt=0)  # size of that noise, scene units
+    grain: Positive = 0.1  # size of that noise, scene units
 
 
 class Plain(_Texture):
@@ -100,7 +37,7 @@ class Checker(_Texture):
 
     type: Literal["checker"]
     colors: tuple[Color, Color]
-    size: float = Field(gt=0)
+    size: Positive
 
 
 class Stripes(_Texture):
@@ -108,7 +45,7 @@ class Stripes(_Texture):
 
     type: Literal["stripes"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
+    size: Positive
     direction: Direction = (0.0, 0.0, 1.0)
     wobble: float = Field(0.0, ge=0)  # how far noise bends the layers, in layers
 
@@ -118,7 +55,7 @@ class Noise(_Texture):
 
     type: Literal["noise"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
+    size: Positive
     octaves: int = Field(4, ge=1, le=8)
 
 
@@ -130,8 +67,8 @@ class Bricks(_Texture):
     type: Literal["bricks"]
     colors: tuple[Color, ...] = Field(min_length=1)
     mortar: Color
-    size: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
-    joint: float = Field(0.02, gt=0)
+    size: tuple[Positive, Positive]
+    joint: Positive = 0.02
 
 
 class Rings(_Texture):
@@ -141,8 +78,8 @@ class Rings(_Texture):
 
     type: Literal["rings"]
     colors: tuple[Color, ...] = Field(min_length=2)
-    size: float = Field(gt=0)
-    center: tuple[float, float] = (0.0, 0.0)
+    size: Positive
+    center: tuple[Coordinate, Coordinate] = (0.0, 0.0)
     wobble: float = Field(0.0, ge=0)  # how far noise bends the rings, in rings
 
 

@@ -181,13 +181,11 @@ def export(
         points, noise, seed: see :func:`first_points`.
         progress: told in words what is done next.
     """
-    import cv2
-
     from attnwarp.io import Dataset, write_transforms
+    from attnwarp_eval.files import write_picture
 
     tell = progress or (lambda text: None)
     folder = Path(folder)
-    (folder / "images").mkdir(parents=True, exist_ok=True)
     tell("points")
     cloud = first_points(scene, points, noise=noise, seed=seed)
     cameras = orbit(scene, views, size)
@@ -195,10 +193,7 @@ def export(
     for k, camera in enumerate(cameras):
         tell(f"view {k + 1} of {views}")
         path = folder / "images" / f"{camera.name}.png"
-        image = cv2.cvtColor(picture(scene, camera, spp), cv2.COLOR_RGB2BGR)
-        if not cv2.imwrite(str(path), image):
-            raise SceneError(f"{path}: could not be written")
-        paths.append(path)
+        paths.append(write_picture(path, picture(scene, camera, spp)))
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]
     dataset = Dataset(cameras, paths, cloud.points, cloud.colors, splits)
     write_transforms(folder, dataset, points_name="points.ply")

@@ -5,14 +5,13 @@ What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from attnwarp import check
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, suggest
 from attnwarp.warp import PRESETS, WarpSettings
 
 if TYPE_CHECKING:
@@ -202,5 +201,4 @@ def check_distinct(values: list[Any], key: str) -> None:
 def did_you_mean(name: str, available: Iterable[str]) -> str:
     """The end of an error message: the nearest available name, or all of them."""
     names = list(available)
-    near = difflib.get_close_matches(name, names, n=1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(map(repr, names))}"
+    return suggest(name, names) or f"; there are {', '.join(map(repr, names))}"

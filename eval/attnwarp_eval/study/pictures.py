@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from attnwarp.io.picture import encode_picture
 from attnwarp.warp import Surface, WarpedView, sample
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
@@ -106,16 +107,7 @@ def jpeg(image: Image) -> bytes:
     if pixels.shape[1] > WIDTH:
         height = round(pixels.shape[0] * WIDTH / pixels.shape[1])
         pixels = cv2.resize(pixels, (WIDTH, height), interpolation=cv2.INTER_AREA)
-    parameters = [
-        cv2.IMWRITE_JPEG_QUALITY,
-        85,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-    ]
-    done, data = cv2.imencode(".jpg", pixels[..., ::-1], parameters)
-    if not done:
-        raise RuntimeError(f"JPEG encoding failed for an image of shape {pixels.shape}")
-    return data.tobytes()
+    return encode_picture(pixels, ".jpg")
 
 
 def rgb(color: str) -> npt.NDArray[np.float32]:

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
+from attnwarp_eval.files import without_nan
+
 Json = dict[str, Any]
 
 
@@ -220,10 +222,7 @@ class Failure:
 
 def finite(figures: Mapping[str, float]) -> dict[str, float | int | None]:
     """Numbers that JSON has: null for NaN and infinities."""
-    return {
-        name: value if isinstance(value, int) else (float(value) if math.isfinite(value) else None)
-        for name, value in figures.items()
-    }
+    return dict(without_nan(figures))
 
 
 def with_nan(figures: Mapping[str, float | int | None]) -> dict[str, float]:

@@ -6,15 +6,15 @@ import contextlib
 import fcntl
 import hashlib
 import json
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from attnwarp.errors import InputError
-from attnwarp_eval.files import digest
+from attnwarp.io.file import remove_abandoned
+from attnwarp_eval.files import digest, write_json
 
 FORMAT = 1
 """Version of the layout of a cell's file; a reader refuses others."""
@@ -22,24 +22,6 @@ FORMAT = 1
 
 class StoreError(InputError):
     """A run's folder that cannot be used; the message says which and what to do."""
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write so that ``path`` either keeps its old content or has all of ``data``, even after a
-    power cut.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 @dataclass
@@ -79,11 +61,17 @@ class Store:
                     f"{self.root}: another run is writing to this folder; wait for it, or name"
                     " another with --out"
                 ) from None
+            self._sweep()
             yield
+
+    def _sweep(self) -> None:
+        """Remove the temporary files of runs that were killed."""
+        for folder in (self.root, self.cells, self.failed, *self.pictures.glob("*/")):
+            remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
         """Write the resolved study and its expected cells. Cells of a former study stay."""
-        self.write_json(self.root / "study.json", study)
+        write_json(self.root / "study.json", study)
 
     def read_study(self) -> dict[str, Any]:
         """The resolved study.
@@ -107,13 +95,6 @@ class Store:
             f"{path}: damaged; run the study again with --out {self.root}, which writes it anew"
         )
 
-    @staticmethod
-    def write_json(path: Path, value: Any) -> None:
-        """Atomic, readable JSON."""
-        write_atomic(
-            path, (json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
-        )
-
     def path(self, cell_id: str) -> Path:
         """The path of a cell's record."""
         return self.cells / f"{cell_id}.json"
@@ -130,12 +111,12 @@ class Store:
         """
         sealed = {**record, "format": FORMAT}
         sealed["sha256"] = digest(sealed)
-        self.write_json(self.path(record["id"]), sealed)
+        write_json(self.path(record["id"]), sealed)
         (self.failed / f"{record['id']}.json").unlink(missing_ok=True)
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
         """Write why a cell failed; the next run tries it again."""
-        self.write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
+        write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
 
     def failures(self) -> list[dict[str, Any]]:
         """Failures of cells that have no record."""
@@ -165,6 +146,34 @@ class Store:
         if problem:
             raise StoreError(f"{path}: {problem}; delete it and run again")
         return record
+
+    def resumed(
+        self, spec: dict[str, Any], compute: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """The record of a cell: read where it is finished and whole, else computed and written.
+
+        Args:
+            spec: everything that decides the result, and nothing else; its hash is the cell's id.
+            compute: makes the rest of the record, as JSON.
+
+        Returns:
+            The record, as it is read back, so that a resumed run cannot differ from a whole one.
+        """
+        cell_id = digest(spec)
+        if self.path(cell_id).is_file():
+            with contextlib.suppress(StoreError):  # a damaged record is computed again
+                record = self.read(cell_id)
+                if not self._damaged_pictures(record):
+                    return record
+        self.write({"id": cell_id, "spec": spec, **compute()})
+        return self.read(cell_id)
+
+    def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
+        """What a record says of a picture that was written below the folder: ``about``, its path
+        and its SHA-256.
+        """
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        return {**about, "path": path.relative_to(self.root).as_posix(), "sha256": sha256}
 
     def _problem(self, cell_id: str, record: dict[str, Any]) -> str | None:
         if record.get("format") != FORMAT:

@@ -7,10 +7,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.yaml import YamlError, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.parts import (
     Ablation,
@@ -173,9 +173,10 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             " file's path"
         )
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path}: not YAML: {error}") from None
+        _, data = read_yaml(path.read_text(encoding="utf-8"))
+    except (YamlError, UnicodeDecodeError) as error:
+        line = f":{error.line}" if isinstance(error, YamlError) and error.line else ""
+        raise StudyError(f"{path}{line}: {error}") from None
     if not isinstance(data, dict):
         raise StudyError(
             f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
@@ -185,20 +186,6 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         return parse_study(data)
     except ValidationError as error:
         raise StudyError(f"{path}: {explain(error)}") from None
-
-
-class _Loader(yaml.SafeLoader):
-    """Refuses a key that stands twice in one mapping, where YAML lets the last one win."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = set()
-        for key, _ in node.value:
-            if key.value in keys:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key.value!r} stands twice", key.start_mark
-                )
-            keys.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

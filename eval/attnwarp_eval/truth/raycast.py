@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval._open3d import open3d
+from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.truth.analytic import nearest_hit
@@ -72,6 +73,8 @@ class Geometry:
         shapes = list(scene) if isinstance(scene, Sequence) else scene.shapes()
         if not shapes:
             raise ValueError("scene: got no shapes, expected at least one")
+        if isinstance(scene, Scene):
+            warn_of_strays(scene, shapes)
         bounds = np.stack([shape.bounds() for shape in shapes])
         low, high = bounds[:, 0].min(0), bounds[:, 1].max(0)
         self.center: Array = (low + high) / 2

@@ -19,11 +19,12 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.materials import PointSpec, SpotSpec
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.scene.spec import SkySpec, SunSpec
-from attnwarp_eval.scene.textures import albedo, linear_rgb
+from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth.raycast import Geometry
 
 Array = npt.NDArray[np.float64]

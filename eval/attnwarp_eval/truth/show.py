@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval.scene.extent import extent
+from attnwarp_eval.scene.meshes import read_mesh_file
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.shapes import MeshNotice
+from attnwarp_eval.scene.spec import MeshSpec
 from attnwarp_eval.truth.plan import plan
 
 Image = npt.NDArray[Any]
@@ -29,6 +34,16 @@ def describe(scene: Scene) -> str:
     lines.append(f"objects ({len(spec.objects)})")
     for index, item in enumerate(spec.objects):
         lines.append(f"  {index:2} {item.name:16} {item.shape.type:10} {item.texture.type}")
+    for item in spec.objects:
+        if isinstance(item.shape, MeshSpec):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MeshNotice)  # the line itself says it
+                lines.append(f"  {item.shape.file}: {read_mesh_file(scene.mesh_path(item.shape))}")
+    reach = extent(scene)
+    sides = " x ".join(f"{side:.4g}" for side in reach.high - reach.low)
+    lines.append(f"extent: {sides} {spec.units}, made by {', '.join(reach.makers)}")
+    if reach.notice:
+        lines.append(f"  {reach.notice}")
     lines.append(f"lights: {', '.join(light.type for light in spec.lights)}")
     lines.append(
         f"cameras ({1 + len(scene.targets)}), {scene.source.width} x {scene.source.height} px,"
@@ -63,11 +78,11 @@ def render_views(
         The files, as they are written; the sheet, ``sheet.png``, last.
     """
     from attnwarp_eval.colors import to_srgb
+    from attnwarp_eval.files import write_picture
     from attnwarp_eval.truth import Geometry, appearance
 
     cameras = scene.cameras if views is None else [scene.camera(name) for name in views]
     geometry = Geometry(scene)
-    out.mkdir(parents=True, exist_ok=True)
     rows = []
     for camera in cameras:
         if progress:
@@ -80,9 +95,9 @@ def render_views(
             "normal": normal_picture(hits.normal, camera),
         }
         for what, picture in pictures.items():
-            yield _write(out / f"{camera.name}-{what}.png", picture)
+            yield write_picture(out / f"{camera.name}-{what}.png", picture)
         rows.append(np.concatenate(list(pictures.values()), axis=1))
-    yield _write(out / "sheet.png", np.concatenate(rows))
+    yield write_picture(out / "sheet.png", np.concatenate(rows))
 
 
 def depth_picture(depth: npt.NDArray[np.float64]) -> Image:
@@ -106,12 +121,3 @@ def normal_picture(normal: npt.NDArray[np.float64], camera: Camera) -> Image:
     """
     local = normal @ camera.rotation.T * np.array([1, -1, -1])
     return np.where(np.isfinite(local), 0.5 + 0.5 * np.nan_to_num(local), 0.5)
-
-
-def _write(path: Path, image: Image) -> Path:
-    import cv2
-
-    pixels = np.clip(np.rint(np.asarray(image) * 255), 0, 255).astype(np.uint8)
-    if not cv2.imwrite(str(path), pixels[..., ::-1]):
-        raise OSError(f"{path}: could not be written")
-    return path

@@ -7,9 +7,12 @@ alone.
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,9 @@ import numpy.typing as npt
 from attnwarp.encoders import EncoderInfo, Kind, load_encoder
 from attnwarp.errors import InputError
 from attnwarp_eval import metrics
+from attnwarp_eval.files import without_nan
+from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.study.store import Store
 
 Picture = npt.NDArray[np.float32]
 Embedding = npt.NDArray[np.float64]
@@ -149,13 +155,13 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
 
-Progress = Callable[[int, int, str], None]
-"""Called with views done, views in all, and the view at work."""
+PROTOCOL = 1
+"""Raised whenever the same pictures would give other figures."""
 
 
 def measure(
     inputs: Inputs, encoders: Mapping[Kind, str | None] | None = None, *, device: str = "cpu",
-    progress: Progress = lambda done, total, view: None,
+    progress: Progress = silent, store: Store | None = None,
 ) -> Measured:  # fmt: skip
     """Measure a person's pictures: every figure of the paper's table that they allow.
 
@@ -166,6 +172,8 @@ def measure(
             figures are left out where there is none.
         device: "cpu" or "cuda", for real encoders.
         progress: told of each view.
+        store: finished views are read from there and written there, so that a call that was killed
+            goes on where it was. Views are known by the content of their files.
 
     Raises:
         InputError: nothing can be computed (the message says why, figure by figure), a picture that
@@ -197,8 +205,11 @@ def measure(
     source = None
     if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
         source = read_picture(inputs.source_edit, inputs.background)  # before the long part
-    kept = _gather(inputs, folders, views, loaded, progress)
-    _rows(inputs, source, views, loaded, kept, done)
+    gathered = _Gathered()
+    with nullcontext() if store is None else store.lock():
+        for batch, part in _gather(inputs, folders, views, loaded, progress, store, device):
+            gathered.add(batch, part)
+    _rows(inputs, source, views, loaded, gathered, done)
     return done
 
 
@@ -379,6 +390,35 @@ class _Gathered:
     dino: dict[str, Embedding] = field(default_factory=dict)
     before: dict[str, Embedding] = field(default_factory=dict)  # CLIP, of the originals
 
+    def to_json(self) -> dict[str, Any]:
+        """As JSON, where an undefined number is null; an infinite PSNR follows from its MSE, 0."""
+        return {
+            "errors": without_nan({name: mse for name, (mse, _) in self.errors.items()}),
+            "psnr": without_nan({name: psnr for name, (_, psnr) in self.errors.items()}),
+            "distances": without_nan(self.distances),
+            **{
+                name: {view: row.tolist() for view, row in getattr(self, name).items()}
+                for name in ("clip", "dino", "before")
+            },
+        }
+
+    def add(self, views: Iterable[str], data: Mapping[str, Mapping[str, Any]]) -> None:
+        """Add some views from the JSON of :meth:`to_json`."""
+        for view in views:
+            if view in data["errors"]:
+                mse = _number(data["errors"][view])
+                psnr = np.inf if mse == 0 else _number(data["psnr"][view])
+                self.errors[view] = (mse, psnr)
+            if view in data["distances"]:
+                self.distances[view] = _number(data["distances"][view])
+            for name in ("clip", "dino", "before"):
+                if view in data[name]:
+                    getattr(self, name)[view] = np.array(data[name][view], dtype=np.float64)
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
+
 
 def _gather(
     inputs: Inputs,
@@ -386,9 +426,10 @@ def _gather(
     views: Mapping[_Figure, Sequence[str]],
     loaded: Mapping[Kind, Any],
     progress: Progress,
-) -> _Gathered:
-    """Read every picture once and keep what the figures need of it."""
-    kept = _Gathered()
+    store: Store | None,
+    device: str,
+) -> Iterator[tuple[list[str], dict[str, Any]]]:
+    """Read every picture once: some views, and what the figures need of them as JSON."""
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
@@ -413,9 +454,9 @@ def _gather(
     needed = [
         name for name in folders["renders"] if any(name in names for names in members.values())
     ]
-    for start in range(0, len(needed), BATCH):
-        batch = needed[start : start + BATCH]
-        progress(start, len(needed), batch[0])
+
+    def gather(batch: Sequence[str]) -> _Gathered:
+        kept = _Gathered()
         renders = read("renders", batch)
         encode("clip", renders, kept.clip)
         encode("dino", renders, kept.dino)
@@ -438,8 +479,41 @@ def _gather(
                     )
                 except ValueError as error:
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
+        return kept
+
+    # Encoders take a batch at once and round differently in another one: a batch is the cell.
+    for start in range(0, len(needed), BATCH):
+        batch = needed[start : start + BATCH]
+        progress(start, len(needed), batch[0])
+        if store is None:
+            yield batch, gather(batch).to_json()
+            continue
+        spec = {
+            "probe": "user images",
+            "protocol": PROTOCOL,
+            "files": {
+                group: {name: _sha256(files[name]) for name in batch if name in files}
+                for group, files in folders.items()
+            },
+            "figures": {
+                figure.title: [name for name in batch if name in members[figure]]
+                for figure in FIGURES
+            },
+            "encoders": {kind: loaded[kind].about.to_dict() for kind in sorted(loaded)},
+            "background": list(inputs.background),
+            "device": device,
+        }
+        yield batch, store.resumed(spec, partial(_plain, gather, batch))["views"]
     progress(len(needed), len(needed), "")
-    return kept
+
+
+def _plain(gather: Callable[[Sequence[str]], _Gathered], batch: Sequence[str]) -> dict[str, Any]:
+    return {"views": gather(batch).to_json()}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _rows(

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from attnwarp_eval.files import without_nan, write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
-from attnwarp_eval.study.store import write_atomic
 from attnwarp_eval.user_images.measure import Measured, Row, natural
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def to_dict(measured: Measured) -> dict[str, Any]:
         "metrics": {
             row.key: {
                 "title": row.title,
-                "value": _plain(row.value),
+                "value": _number(row.value),
                 "unit": _spec(row).unit,
                 "direction": _spec(row).direction,
                 "version": _spec(row).version,
@@ -59,7 +59,7 @@ def to_dict(measured: Measured) -> dict[str, Any]:
                 "n": len(row.views) - len(row.undefined),
                 "undefined": row.undefined,
                 "identical": row.identical,
-                "views": {name: _plain(value) for name, value in row.views.items()},
+                "views": {name: _number(value) for name, value in row.views.items()},
             }
             for row in measured.rows
         },
@@ -184,10 +184,9 @@ def _value(row: Row, value: float) -> str:
     return f"{value:.3f} dB" if _spec(row).unit == "dB" else f"{value:.3f}"
 
 
-def _plain(value: float) -> float | str | None:
-    if math.isnan(value):
-        return None
-    return "inf" if math.isinf(value) else value
+def _number(value: float) -> Any:
+    """As JSON: NaN is null, and an infinite PSNR, of equal pictures, is "inf"."""
+    return "inf" if math.isinf(value) else without_nan(value)
 
 
 def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

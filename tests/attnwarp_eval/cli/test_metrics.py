@@ -14,6 +14,7 @@ from attnwarp.encoders import load_encoder
 from attnwarp.errors import InputError
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.metrics.registry import metric
+from attnwarp_eval.user_images import measure
 from attnwarp_eval.user_images.measure import BATCH, inside, read_picture
 
 VIEWS = ("view1", "view2", "view10")
@@ -472,7 +473,9 @@ def test_a_bad_picture_is_wrong_input_and_is_named(data, models, spoil, complain
     spoil(folder)
     done = everything(folder, models)
     assert done.exit_code == 2 and re.search(complaint, done.stderr), done.output
-    assert len(done.stderr.strip().splitlines()) == 1 and not (folder / "out").exists()
+    assert len(done.stderr.strip().splitlines()) == 1 and not list(
+        (folder / "out").glob("metrics.*")
+    )
 
 
 def cut(path):
@@ -653,3 +656,46 @@ def test_a_bundled_encoder_s_figures_come_with_a_warning(data, models, monkeypat
         done.exit_code == 0
         and "clip-small is small and was trained on random rendered scenes" in done.stderr
     )
+
+
+def test_a_measurement_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(
+    tmp_path, models, monkeypatch
+):
+    random = np.random.default_rng(8)
+    names = [f"v{k}" for k in range(BATCH + 2)]
+    for name in names:
+        for group in ("renders", "edited"):
+            write(tmp_path / group / f"{name}.png", random_picture(random))
+    write(tmp_path / "edited" / "v1.png", cv2.imread(str(tmp_path / "renders/v1.png"))[..., ::-1])
+    real, read = measure.read_picture, []
+
+    def reading(path, *more):
+        read.append(path.stem)
+        if path.stem == names[-1] and read.count(path.stem) == 1:
+            raise KeyboardInterrupt
+        return real(path, *more)
+
+    monkeypatch.setattr(measure, "read_picture", reading)
+
+    def run(out):
+        read_before = len(read)
+        folders = [f"--{group}={tmp_path / group}" for group in ("renders", "edited")]
+        encoders = [f"--clip={models['clip']}", "--perceptual=none", "--prompt=a bear"]
+        command = ["metrics", *folders, *encoders, "--out", str(tmp_path / out)]
+        return CliRunner().invoke(app, command), set(read[read_before:])
+
+    killed, _ = run("a")
+    assert killed.exit_code == 130 and "finished views are kept" in killed.stderr
+    done, views = run("a")
+    assert done.exit_code == 0, done.output
+    assert views == set(names[BATCH:])
+    _, views = run("b")
+    assert views == set(names)
+    for file in ("metrics.json", "metrics.md"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    values = json.loads((tmp_path / "a" / "metrics.json").read_text())["metrics"]
+    assert values["edit.psnr_mean"]["identical"] == ["v1"]
+    # Another picture of the same name is another cell.
+    write(tmp_path / "renders" / "v0.png", random_picture(random))
+    changed, views = run("a")
+    assert changed.exit_code == 0 and views == set(names[:BATCH])

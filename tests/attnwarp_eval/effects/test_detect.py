@@ -14,14 +14,14 @@ from typer.testing import CliRunner
 
 from attnwarp.camera import Camera
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.effects import detect, proof
+from attnwarp_eval.effects import detect, proof, saving
 from attnwarp_eval.scene import transport
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SceneSpec
-from attnwarp_eval.scene.textures import linear_rgb
-from attnwarp_eval.truth import Geometry
-from attnwarp_eval.truth import mitsuba as renderer
+from attnwarp_eval.truth import Geometry, mitsuba
+from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.plan import Pass, Plan, beam, plan
 from attnwarp_eval.truth.shading import emitted, irradiance, object_albedo
 
@@ -156,7 +156,7 @@ def test_the_command_line_ends_with_3_and_names_what_is_not_simulated(monkeypatc
     scene = make([FLOOR, ball() | {"velocity": [1, 0, 0]}], [SKY], size=8)
     monkeypatch.setattr("attnwarp_eval.scene.file.load_scene", lambda name: scene)
     monkeypatch.setattr(
-        detect, "measure", functools.partial(detect.measure, size=8, spp=4, rounds=2)
+        saving, "measure", functools.partial(saving.measure, size=8, spp=4, rounds=2)
     )
     result = CliRunner().invoke(app, ["scenes", "effects", "moving", "--prove"])
     assert result.exit_code == 3, result.output
@@ -313,7 +313,7 @@ def looking_down(objects, lights, *, size=8, height=4.0, fov=5.0, **rest):
     """A narrow view of the origin from above, and the mean of its picture."""
     scene = make(objects, lights, spp=64, **rest)
     camera = Camera.look_at((0, 0, height), (0, 1e-6, 0), width=size, height=size, fov_y=fov)
-    return renderer.render_plan(scene, camera, plan(scene), 0).mean((0, 1))
+    return mitsuba.render_plan(scene, camera, plan(scene), 0).mean((0, 1))
 
 
 WHITE = FLOOR | {"texture": {"type": "plain", "color": "#bcbcbc"}}
@@ -344,7 +344,7 @@ def test_a_square_lamp_gives_the_irradiance_of_its_form_factor():
     factor = 4 * corner / (2 * math.pi)
     scene = make([WHITE, LAMP], [], spp=256)
     camera = Camera.look_at((2, 0, 1), (0, 0, 0), width=8, height=8, fov_y=1)
-    got = renderer.render_plan(scene, camera, plan(scene), 0).mean()
+    got = mitsuba.render_plan(scene, camera, plan(scene), 0).mean()
     assert got == pytest.approx(
         ALBEDO * 4.0 * factor, rel=0.01
     )  # 16,384 samples of a lamp seen whole: noise 0.1 %
@@ -353,9 +353,9 @@ def test_a_square_lamp_gives_the_irradiance_of_its_form_factor():
 def test_a_lamp_shines_where_it_faces_and_is_black_behind():
     scene = make([FLOOR, LAMP], [], spp=16)
     up = Camera.look_at((0, 0, 0.5), (0, 1e-3, 3), width=8, height=8, fov_y=5)
-    assert np.allclose(renderer.render_plan(scene, up, plan(scene), 0), 4.0, rtol=1e-5)
+    assert np.allclose(mitsuba.render_plan(scene, up, plan(scene), 0), 4.0, rtol=1e-5)
     down = Camera.look_at((0, 0, 5), (0, 1e-3, 0), width=8, height=8, fov_y=5)
-    assert (renderer.render_plan(scene, down, plan(scene), 0) == 0).all()
+    assert (mitsuba.render_plan(scene, down, plan(scene), 0) == 0).all()
 
 
 def test_fog_takes_light_as_beer_and_lambert_say():
@@ -372,7 +372,7 @@ def test_fog_takes_light_as_beer_and_lambert_say():
 
 def test_without_a_box_fog_holds_all_objects_and_cameras():
     scene = make([FLOOR, ball()], [POINT], 4, medium={"sigma_t": 0.1})
-    low, high = renderer.fog_box(scene)
+    low, high = build.fog_box(scene)
     assert (low < [-3, -3, 0]).all() and (high > [3, 3, 2.8]).all()
     for camera in scene.cameras:
         assert ((camera.position > low) & (camera.position < high)).all()
@@ -413,7 +413,7 @@ def test_a_glass_ball_bends_rays_as_snell_says():
     }
     scene = make([left | {"emission": {"radiance": 1.0}}, ball(GLASS, (0, 0, 0), 0.5)], [], 8)
     camera = Camera.look_at((4, 0, 0), (0, 0, 0), width=64, height=64, fov_y=30)
-    image = renderer.render_plan(scene, camera, plan(scene, 16), 0).mean(-1)
+    image = mitsuba.render_plan(scene, camera, plan(scene, 16), 0).mean(-1)
     owner = Geometry(scene).trace(camera).object_id
     bright = image > 0.5
     # Seen directly the lit half is the one toward -y; through the ball it is the other.
@@ -438,7 +438,7 @@ def test_a_lens_blurs_a_far_dot_over_its_circle_of_confusion():
 
     def spread(focus):
         scene = make([dot], [], cameras={"lens": {"aperture": aperture, "focus": focus}})
-        image = renderer.render_plan(scene, camera, plan(scene, 1024), 0).mean(-1)
+        image = mitsuba.render_plan(scene, camera, plan(scene, 1024), 0).mean(-1)
         rows, columns = np.nonzero(image)
         return (np.ptp(columns) + 1 + np.ptp(rows) + 1) / 2, image.sum()
 
@@ -454,7 +454,7 @@ def test_without_a_focus_what_the_cameras_look_at_is_sharp():
     scene = make([FLOOR, ball()], [SUN], cameras={"lens": {"aperture": 0.1}})
     for camera in scene.cameras:
         expected = np.linalg.norm(camera.position - scene.center)
-        assert renderer.focus_distance(scene, camera) == pytest.approx(expected, rel=1e-9)
+        assert build.focus_distance(scene, camera) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_lens_refuses_a_principal_point_off_the_middle():
@@ -462,7 +462,7 @@ def test_a_lens_refuses_a_principal_point_off_the_middle():
     K = scene.source.K.copy()
     K[0, 2] += 3
     with pytest.raises(ValueError, match=r"principal point .* but a lens needs it there"):
-        renderer.render_plan(
+        mitsuba.render_plan(
             scene, Camera(K, scene.source.world_to_camera, 32, 32), plan(scene, 1), 0
         )
 
@@ -481,7 +481,7 @@ def test_light_paths_and_camera_paths_agree_on_a_caustic_that_both_can_find():
         (),
     )
     a, b = (
-        np.stack([renderer.render_plan(scene, scene.source, made, first + k) for k in range(12)])
+        np.stack([mitsuba.render_plan(scene, scene.source, made, first + k) for k in range(12)])
         for made, first in ((both, 0), (camera_paths, 100))
     )
     assert not any(level.differs for level in proof.levels(a, b, alpha=0.001))
@@ -502,7 +502,7 @@ def test_following_only_the_beam_upon_the_glass_shows_the_same_caustic_with_less
         (),
     )
     a, b = (
-        np.stack([renderer.render_plan(scene, scene.source, made, first + k) for k in range(12)])
+        np.stack([mitsuba.render_plan(scene, scene.source, made, first + k) for k in range(12)])
         for made, first in ((narrow, 0), (whole, 100))
     )
     assert not any(level.differs for level in proof.levels(a, b, alpha=0.001))
@@ -545,7 +545,7 @@ def test_pictures_lit_by_lamps_converge_to_the_light_that_ray_casting_finds(name
     }[name]
     scene = make([FLOOR, ball(), *objects], lights, size=32)
     geometry, camera = Geometry(scene), scene.source
-    image = renderer.render_plan(scene, camera, plan(scene, 64), 0)
+    image = mitsuba.render_plan(scene, camera, plan(scene, 64), 0)
     hits = geometry.trace(camera)
     flat = [
         a.reshape(-1, *a.shape[2:])[hits.valid.ravel()]
@@ -568,7 +568,7 @@ def test_geometry_of_glass_is_its_first_surface():
         a.depth, b.depth, equal_nan=True
     )
     foggy = make([FLOOR, ball()], [SKY], medium={"sigma_t": 0.1})
-    position, object_id = renderer.position_and_shape(foggy, foggy.source)
+    position, object_id = mitsuba.position_and_shape(foggy, foggy.source)
     assert np.array_equal(object_id, a.object_id) or (object_id == a.object_id).mean() > 0.995
     assert np.isfinite(position[object_id >= 0]).all()
 
@@ -577,7 +577,10 @@ def test_geometry_of_glass_is_its_first_surface():
 # --------------------------------------------------------------------------------------------------
 
 
-def test_the_command_line_prints_effects_and_plan_for_people_and_as_json():
+def test_the_command_line_prints_effects_and_plan_for_people_and_as_json(monkeypatch):
+    monkeypatch.setattr(
+        saving, "measure", functools.partial(saving.measure, size=16, spp=4, rounds=2)
+    )
     runner = CliRunner()
     out = json.loads(runner.invoke(app, ["scenes", "effects", "spheres", "--json"]).stdout)
     assert out["effects"]["textures"]["needed"] and not out["effects"]["medium"]["needed"]

@@ -9,50 +9,41 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from effect_scenes import FLOOR, GLASS, LAMP, MIRROR, POINT, SCENES, SKY, SUN, WALL, ball, make
-from scipy import stats
 
 from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.transport import called_for
+from attnwarp_eval.statistics.equivalence import equivalence
 from attnwarp_eval.truth.mitsuba import render_plan
 from attnwarp_eval.truth.plan import DROPPABLE, Lens, everything_on, plan, without
 
 SHAPE = (12, 16, 16, 3)
 
 
+# Of every second pixel the noise is 1e-8 to 1e-4 of its light, as that of a smooth sky; the pixels
+# of one column do not vary at all.
+QUIET = np.where(
+    np.arange(16)[None, :, None] % 2,
+    1.0,
+    np.geomspace(1e-7, 1e-3, 16)[:, None, None] * (np.arange(16)[None, :, None] > 0),
+)
+
+
+def grain(rng, kind, shape):
+    """Noise of mean 0: normal, skewed like few samples of a bright light (skewness 2), or normal
+    with a sky that hardly varies.
+    """
+    if kind == "skewed":
+        return rng.gamma(1.0, 1.0, shape) - 1
+    return rng.standard_normal(shape) * (QUIET if kind == "sky" else 1.0)
+
+
 def noise(rng, kind="normal", size=0.1):
-    # Pictures of mean 1: pixels with normal noise, or skewed like few samples of a bright light
-    # (skewness 2).
-    return 1 + size * (
-        rng.standard_normal(SHAPE) if kind == "normal" else rng.gamma(1.0, 1.0, SHAPE) - 1
-    )
-
-
-def test_welch_agrees_with_scipy_where_spreads_and_numbers_differ():
-    rng = np.random.default_rng(0)
-    a, b = rng.normal(1, 0.5, (11, 40)), rng.normal(1.1, 2.0, (17, 40))
-    ours, theirs = proof.welch(a, b), stats.ttest_ind(b, a, equal_var=False)
-    assert np.allclose(ours.p, theirs.pvalue, rtol=1e-9) and np.allclose(
-        ours.freedom, theirs.df, rtol=1e-9
-    )
-    assert np.allclose(ours.difference / ours.error, theirs.statistic, rtol=1e-9)
-
-
-def test_values_without_noise_are_compared_exactly_up_to_rounding():
-    a = np.ones((10, 3))
-    b = np.ones((10, 3)) * [1.0, 1 + 1e-7, 1.01]
-    assert proof.welch(a, b).p.tolist() == [1.0, 1.0, 0.0]
+    return 1 + size * grain(rng, kind, SHAPE)
 
 
 def test_too_few_samples_are_refused():
-    with pytest.raises(ValueError, match="got 1 and 5 samples, expected at least 2"):
-        proof.welch(np.ones((1, 2)), np.ones((5, 2)))
     with pytest.raises(ValueError, match="seeds: got 9, expected at least 10"):
         proof.prove(SCENES["diffuse"](), seeds=9)
-
-
-def test_sidak_makes_independent_tests_refuse_together_at_the_level():
-    for tests in (1, 3, 1024):
-        assert math.isclose(1 - (1 - proof.sidak(0.05, tests)) ** tests, 0.05, rel_tol=1e-9)
 
 
 def test_blocks_are_means_over_squares_and_over_what_is_left_at_the_border():
@@ -63,7 +54,7 @@ def test_blocks_are_means_over_squares_and_over_what_is_left_at_the_border():
         assert np.allclose(got[:, i, j], data[:, 8 * i : 8 * i + 8, 8 * j : 8 * j + 8].mean((1, 2)))
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed"])
+@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
 def test_over_200_true_nulls_it_refuses_at_its_stated_rate(kind):
     rng = np.random.default_rng(2)
     refused = 0
@@ -93,7 +84,7 @@ def test_a_difference_of_two_percent_is_found_every_time_and_never_certified():
         picture = proof.levels(a, b)[-1]
         # The difference's standard error is 0.1 / sqrt(12 * 768) * sqrt 2 = 0.15 %: 2 % is fourteen
         # of them.
-        assert picture.differs and not proof.equivalence(a, b).equal
+        assert picture.differs and not equivalence(a, b, margin=proof.MARGIN).equal
 
 
 def test_a_difference_in_one_block_only_is_found_where_the_whole_picture_hides_it():
@@ -109,8 +100,10 @@ def test_a_difference_in_one_block_only_is_found_where_the_whole_picture_hides_i
 
 def test_equivalence_certifies_the_equal_and_hardly_ever_what_lies_on_its_margin():
     rng = np.random.default_rng(6)
-    equal = [proof.equivalence(noise(rng), noise(rng)).equal for _ in range(200)]
-    edge = [proof.equivalence(1.01 * noise(rng), noise(rng)).equal for _ in range(200)]
+    equal = [equivalence(noise(rng), noise(rng), margin=proof.MARGIN).equal for _ in range(200)]
+    edge = [
+        equivalence(1.01 * noise(rng), noise(rng), margin=proof.MARGIN).equal for _ in range(200)
+    ]
     # 2.33 is the normal quantile; with 22 degrees of freedom 1.5 % lie beyond it. Binomial, 99.9 %:
     # at most 9.
     assert sum(equal) > 195 and sum(edge) <= 9
@@ -119,7 +112,7 @@ def test_equivalence_certifies_the_equal_and_hardly_ever_what_lies_on_its_margin
 def test_noise_too_great_for_the_margin_is_not_certified_though_nothing_differs():
     rng = np.random.default_rng(7)
     a, b = (1 + 3 * rng.standard_normal(SHAPE) for _ in range(2))
-    assert not proof.equivalence(a, b).equal and not any(
+    assert not equivalence(a, b, margin=proof.MARGIN).equal and not any(
         level.differs for level in proof.levels(a, b)
     )
 
@@ -141,19 +134,23 @@ def synthetic(trial, kind="normal", brighter=1.0):
         out = []
         for k in range(count):
             rng = np.random.default_rng((trial, side, first + k, spp))
-            grain = (
-                rng.standard_normal(SHAPE[1:])
-                if kind == "normal"
-                else rng.gamma(1.0, 1.0, SHAPE[1:]) - 1
-            )
-            out.append((brighter if side else 1.0) * (1 + 0.3 / math.sqrt(spp) * grain))
+            light = 1 + 0.3 / math.sqrt(spp) * grain(rng, kind, SHAPE[1:])
+            # Pictures are float32, which rounds the two sides each in its own way.
+            out.append((brighter if side else 1.0) * light.astype(np.float32).astype(float))
         return np.stack(out)
 
     return pictures
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed"])
-@pytest.mark.parametrize(("alpha", "range_"), [(0.01, (0, 8)), (0.05, (1, 21)), (0.2, (14, 59))])
+@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
+@pytest.mark.parametrize(
+    ("alpha", "range_"),
+    [
+        pytest.param(0.01, (0, 8), marks=pytest.mark.slow),
+        (0.05, (1, 21)),
+        pytest.param(0.2, (14, 59), marks=pytest.mark.slow),
+    ],
+)
 def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, alpha, range_):
     found = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
     # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same
@@ -163,18 +160,11 @@ def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, a
     assert found.count("certified") == 200 - found.count("refused")
 
 
-@pytest.mark.parametrize("kind", ["normal", "skewed"])
+@pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
 def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
     found = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
     assert {one.verdict for one in found} == {"refused"}
     assert all(any(rung.passed is False for rung in one.rungs) for one in found)
-
-
-def test_the_paired_test_agrees_with_scipy():
-    rng = np.random.default_rng(9)
-    a, b = rng.random((24, 4, 4, 3)), rng.random((24, 4, 4, 3)) + 0.02
-    ours, theirs = proof.paired(a, b), stats.ttest_rel(b.mean((1, 2, 3)), a.mean((1, 2, 3)))
-    assert math.isclose(ours.p, theirs.pvalue, rel_tol=1e-9)
 
 
 # On real pictures
@@ -313,7 +303,7 @@ def test_a_light_two_percent_too_bright_is_refused():
         for scene, seed in ((right, 0), (wrong, 100))
     ]
     assert proof.levels(*pictures)[-1].differs
-    assert not proof.equivalence(*pictures).equal
+    assert not equivalence(*pictures, margin=proof.MARGIN).equal
 
 
 def test_too_little_time_ends_in_cannot_tell_and_says_what_could_have_been_seen():

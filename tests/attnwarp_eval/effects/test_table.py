@@ -12,9 +12,15 @@ from effect_scenes import FLOOR, SKY, SUN, ball, make
 from scipy import stats
 from typer.testing import CliRunner
 
+from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.effects import detect, table
-from attnwarp_eval.effects.table import Settings, collect, side_by_side
+from attnwarp_eval.colors import to_linear
+from attnwarp_eval.effects import detect, saving, table
+from attnwarp_eval.effects.table import Settings, side_by_side
+from attnwarp_eval.experiments import effects
+from attnwarp_eval.experiments.effects import collect
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.truth import mitsuba
 from attnwarp_eval.truth.plan import plan
 
 
@@ -23,14 +29,14 @@ def small(monkeypatch):
     monkeypatch.setattr(table, "PICTURE_SIZE", 16)
     monkeypatch.setattr(table, "PLAN_SAMPLES", 16)
     monkeypatch.setattr(table, "FULL_SAMPLES", 16)
-    monkeypatch.setattr(table, "measure", functools.partial(detect.measure, size=16, spp=4))
+    monkeypatch.setattr(table, "measure", functools.partial(saving.measure, size=16, spp=4))
 
 
 def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, tmp_path):
     made = []
-    real = table._entry
+    real = effects.measure_entry
     monkeypatch.setattr(
-        table, "_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
+        effects, "measure_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
     )
     quick = Settings(prove=False, rounds=2)
     collect(["spheres", "glass"], tmp_path, quick)
@@ -48,9 +54,33 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
     assert text.count(".jpg)") == 3 and "3 scenes, 0 of their plans certified" in text
     # Another setting is another entry; a picture that is gone is drawn again.
     collect(["glass"], tmp_path, Settings(prove=False, rounds=3))
+    picture = (tmp_path / "mirror.jpg").read_bytes()
     (tmp_path / "mirror.jpg").unlink()
     collect(["mirror"], tmp_path, quick)
-    assert made[3:] == ["glass", "mirror"] and (tmp_path / "mirror.jpg").is_file()
+    assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
+
+
+def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monkeypatch, tmp_path):
+    real, made = effects.measure_entry, []
+
+    def interrupted(scene, *more):
+        made.append(scene.name)
+        if made == ["spheres", "glass"]:
+            raise KeyboardInterrupt
+        return real(scene, *more)
+
+    monkeypatch.setattr(effects, "measure_entry", interrupted)
+    quick = Settings(prove=False, rounds=2, pictures=False)
+    with pytest.raises(KeyboardInterrupt):
+        collect(["spheres", "glass"], tmp_path, quick)
+    (first,) = json.loads((tmp_path / "effects.json").read_text())["scenes"]
+    entries = collect(["spheres", "glass"], tmp_path, quick)
+    # Seconds are among the entry's figures: measured again they would differ.
+    assert entries[0] == first and made == ["spheres", "glass", "glass"]
+    (cell,) = (c for c in (tmp_path / "cells").iterdir() if '"name": "glass"' in c.read_text())
+    cell.write_bytes(cell.read_bytes()[:-9])
+    assert collect(["spheres", "glass"], tmp_path, quick)[0] == first
+    assert made[3:] == ["glass"]
 
 
 def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
@@ -71,10 +101,10 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
     # Synthetic renderings: the capped ones have mean 0.8, those without a cap 1; noise and time are
     # planted.
     scene = make([FLOOR, ball()], [SKY], 1, size=8)
-    free = detect.everything_on(scene.with_size(8, 8), 4, capped=False)
-    full = detect.everything_on(scene.with_size(8, 8), 4)
+    free = saving.everything_on(scene.with_size(8, 8), 4, capped=False)
+    full = saving.everything_on(scene.with_size(8, 8), 4)
     clock = [0.0]
-    monkeypatch.setattr(detect.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
 
     def render(scene, camera, made, seed):
         mean, noise, seconds = (
@@ -87,42 +117,42 @@ def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeyp
         clock[0] += seconds * (1 + seed % 5)  # the machine is slow in some rounds, for all alike
         return mean + noise * np.random.default_rng((seed, int(seconds))).standard_normal((8, 8, 3))
 
-    monkeypatch.setattr(detect, "render_plan", render)
-    cost = detect.measure(scene, size=8, spp=4, rounds=40)
-    low, high = cost.cap.bias_interval
+    monkeypatch.setattr(saving, "render_plan", render)
+    measured = saving.measure(scene, size=8, spp=4, rounds=40)
+    low, high = measured.cap.bias_interval
     # 40 pictures of 192 values: the ratio's standard error is sqrt(.025^2 + .04^2) / sqrt(40 * 192)
     # = 0.054 %.
     assert (
-        cost.cap.bias == pytest.approx(-0.2, abs=0.0025)
+        measured.cap.bias == pytest.approx(-0.2, abs=0.0025)
         and low < -0.2 < high
         and high - low < 0.003
     )
-    assert cost.faster == pytest.approx(3) and cost.cap.faster == pytest.approx(2)
-    assert cost.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
-    assert cost.interval[0] < cost.at_equal_noise < cost.interval[1]
+    assert measured.faster == pytest.approx(3) and measured.cap.faster == pytest.approx(2)
+    assert measured.at_equal_noise == pytest.approx(3 * 4, rel=0.1)
+    assert measured.interval[0] < measured.at_equal_noise < measured.interval[1]
     assert (
-        cost.cap.at_equal_error == pytest.approx(2 * 2.25, rel=0.1)
-        and cost.cap.interval[0] < 4.5 < cost.cap.interval[1]
+        measured.cap.at_equal_error == pytest.approx(2 * 2.25, rel=0.1)
+        and measured.cap.interval[0] < 4.5 < measured.cap.interval[1]
     )
-    about = detect.report(scene, cost=cost) | {"cost": cost.to_dict()}
+    about = detect.report(scene, cost=measured) | {"cost": measured.to_dict()}
     text = "\n".join(detect.describe(scene, about))
     assert (
         "not for the same error: the scene's cap of 1 bounces changes the picture's light by -20"
         in text
     )
-    row = table._times(json.loads(json.dumps(cost.to_dict())))
+    row = table._times(json.loads(json.dumps(measured.to_dict())))
     assert row[2].startswith("-20") and row[1] != row[4] and row[4].startswith("4.")
-    endless = detect.measure(
+    endless = saving.measure(
         make([FLOOR, ball()], [SKY], "unlimited", size=8), size=8, spp=4, rounds=3
     )
     assert endless.cap is None and table._times(endless.to_dict())[2] == "no cap"
 
 
 def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak_of():
-    bias, (low, high) = detect._cut(np.full(5, 0.5), np.full(5, 1.0))
+    bias, (low, high) = saving._cut(np.full(5, 0.5), np.full(5, 1.0))
     assert bias == low == high == pytest.approx(-0.5, rel=1e-12)
-    assert detect._cut(np.zeros(5), np.ones(5)) == (None, None)
-    assert detect._cut(np.ones(1), np.ones(1)) == (None, None)
+    assert saving._cut(np.zeros(5), np.ones(5)) == (None, None)
+    assert saving._cut(np.ones(1), np.ones(1)) == (None, None)
 
 
 def test_the_interval_of_the_light_cut_off_is_scipys():
@@ -131,11 +161,13 @@ def test_the_interval_of_the_light_cut_off_is_scipys():
         np.random.default_rng(1).uniform(0.95, 1.05, 9),
     )
     theirs = stats.ttest_ind(np.log(a), np.log(b), equal_var=False).confidence_interval(0.95)
-    bias, ours = detect._cut(a, b)
+    bias, ours = saving._cut(a, b)
     assert np.allclose(np.expm1(theirs), ours, rtol=1e-9) and ours[0] < bias < ours[1]
 
 
-def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, tmp_path):
+def test_a_dropped_light_shows_eight_times_as_strong_about_grey(small, monkeypatch, tmp_path):
+    written, write = [], cv2.imwrite
+    monkeypatch.setattr(cv2, "imwrite", lambda *a: written.append(a[1]) or write(*a))
     scene = make([FLOOR], [SUN, SKY])
     same = side_by_side(scene, tmp_path / "same.jpg")["largest_difference"]
 
@@ -146,6 +178,12 @@ def test_a_dropped_light_shows_in_the_pictures_side_by_side(small, monkeypatch, 
     monkeypatch.setattr(table, "plan", without_sky)
     dark = side_by_side(scene, tmp_path / "dark.jpg")["largest_difference"]
     assert same < 0.01 < 0.1 < dark
+    # As written, before JPEG: eight times (ours - full) / 2 about grey.
+    for rows in written:
+        ours, full, difference = (rows[:, k : k + 16, ::-1].astype(float) for k in (0, 20, 40))
+        expected = np.clip(127.5 + 4 * (ours - full), 0, 255)
+        assert np.abs(difference - expected).max() <= 4.5  # each picture is rounded to a level
+    assert len(written) == 2 and np.ptp(written[1][:, 40:56]) > 50
     picture = cv2.imread(str(tmp_path / "dark.jpg"))
     assert picture.shape == (16, 3 * 16 + 8, 3)
     assert (
@@ -167,5 +205,16 @@ def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_
         assert result.exit_code == 2 and words in " ".join(result.output.split())
 
 
-def test_differences_are_shown_about_grey():
-    assert np.isclose(0.5 + table.AMPLIFIED / 2 * 0.125, 1.0)
+def test_differences_are_drawn_about_grey_and_eight_times_stronger(small, monkeypatch, tmp_path):
+    # sRGB 0.50 and 0.47 on the two sides, planted as the linear values that they are made from.
+    values = iter([0.50, 0.47])
+
+    def planted(scene, camera, made, seed, made_by):
+        return to_linear(np.full((16, 16, 3), next(values)))
+
+    monkeypatch.setattr(mitsuba, "render_plan", planted)
+    about = side_by_side(load_scene("spheres"), tmp_path / "planted.jpg")
+    assert about["largest_difference"] == pytest.approx(0.03, abs=1e-12)
+    panels = cv2.imread(str(tmp_path / "planted.jpg"))[:, [8, 28, 48]].mean((0, 2)) / 255
+    # 0.03, eight times stronger, half of it to either side of grey. JPEG keeps flat areas to 2/255.
+    assert panels == pytest.approx([0.50, 0.47, 0.5 + 8 * 0.03 / 2], abs=2.5 / 255)

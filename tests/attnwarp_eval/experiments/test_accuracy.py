@@ -9,6 +9,9 @@ from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import accuracy, suite
+from attnwarp_eval.experiments.accuracy import geometry
+from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
+from attnwarp_eval.experiments.accuracy.write import write
 from attnwarp_eval.scene.file import load_scene
 
 
@@ -20,9 +23,9 @@ def test_the_brute_force_finds_hits_known_in_closed_form():
     origins = np.array([[0.2, 0.2, 0], [0.8, 0.8, 0], [0.2, 0.2, 0], [0.2, 0.2, 2.5], [50, 50, 0]])
     directions = np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, 0.5], [0, 0, 1], [0, 0, 1]])
     endless = np.full(5, np.inf)
-    t = accuracy.every_triangle(origins, directions, np.stack([far, near]), endless)
+    t = geometry.every_triangle(origins, directions, np.stack([far, near]), endless)
     assert t.tolist() == [2.0, 3.0, 4.0, 0.5, np.inf]
-    t = accuracy.every_triangle(
+    t = geometry.every_triangle(
         origins, directions, np.stack([far, near]), np.array([2.0, 3.5, 9, 0.1, 1])
     )
     assert t.tolist() == [3.0, 3.0, 4.0, np.inf, np.inf] or t.tolist() == [
@@ -32,22 +35,6 @@ def test_the_brute_force_finds_hits_known_in_closed_form():
         np.inf,
         np.inf,
     ]
-
-
-def test_all_works_run_in_every_round_and_the_first_one_twice():
-    calls = []
-    works = [lambda turn, k=k: calls.append((k, turn)) or k for k in range(3)]
-    before = []
-    results, seconds = accuracy.in_turn(works, 4, before=before.append)
-    assert [len(r) for r in results] == [len(s) for s in seconds] == [4] * 4
-    assert results == [[0] * 4, [1] * 4, [2] * 4, [0] * 4]
-    # A first round is not kept, and the first work's second run has other noise.
-    assert sorted(calls) == sorted(
-        [(k, t) for k in range(3) for t in range(5)] + [(0, t + 10_000) for t in range(5)]
-    )
-    assert before == [k for k, _ in calls]
-    orders = {tuple(k for k, _ in calls[i : i + 4]) for i in range(0, 20, 4)}
-    assert len(orders) > 1
 
 
 def test_the_error_of_a_picture_falls_with_the_square_root_of_its_samples():
@@ -71,7 +58,7 @@ def test_the_error_of_a_picture_falls_with_the_square_root_of_its_samples():
 
 
 def test_refinement_takes_the_error_of_float32_away_and_the_worlds_offset_does_not_matter_then():
-    panel = accuracy.depth(load_scene("far"), size=64, rays=60, rounds=3)
+    panel = geometry.depth(load_scene("far"), size=64, rays=60, rounds=3)
     refined, recentred, raw = panel.contestants
     assert refined.error[0] < 1e-13 and refined.more["wrong"] == 0
     # float32 has 6e-8; at coordinates of 2e6 its steps are 0.125 m.
@@ -80,7 +67,7 @@ def test_refinement_takes_the_error_of_float32_away_and_the_worlds_offset_does_n
 
 
 def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent():
-    panel = accuracy.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
+    panel = geometry.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
     rays, nearest, bilinear = panel.contestants
     # Clopper & Pearson: none of 150 excludes a share above 1 - 0.025^(1 / 150).
     assert (
@@ -100,24 +87,24 @@ def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
     for bilinear in (False, True):
         for stretch, expected in ((1.0, 1.0), (0.97, 1.0), (1.05, 0.0)):
             points = (stretch * local) @ camera.rotation + camera.position
-            answer = accuracy._seen_in_map(depth, camera, points, bilinear)
+            answer = geometry._seen_in_map(depth, camera, points, bilinear)
             assert (answer == expected).all()
 
 
 def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio(tmp_path):
     def panel(scene):
-        slow = accuracy.Contestant(
+        slow = Contestant(
             "slow", (0.5, 0.4, 0.6), (2.0, 2.2, 2.4), {"median": 0.1, "p99": 0.2, "wrong": 0.0}
         )
-        fast = accuracy.Contestant(
+        fast = Contestant(
             "fast", (0.0, 0.0, 0.0), (1.0, 1.1, 1.2), {"median": 0.0, "p99": 0.0, "wrong": 0.25}
         )
-        return accuracy.Panel(
+        return Panel(
             "depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4)
         )
 
-    accuracy.write([panel("one")], tmp_path)
-    accuracy.write([panel("two")], tmp_path)
+    write([panel("one")], tmp_path)
+    write([panel("two")], tmp_path)
     text = (tmp_path / "accuracy.md").read_text()
     assert (
         "**one**" in text
@@ -142,9 +129,12 @@ def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
 
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path / "mine"))
     told = []
-    (first,) = suite.measure(
-        ["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=told.append
-    )
+
+    def tell(done, total, step):
+        assert (done, total) == (0, 1)
+        told.append(step)
+
+    (first,) = suite.measure(["spheres"], views=2, geometry_size=16, size=16, spp=1, progress=tell)
     assert os.environ["ATTNWARP_CACHE"] == str(tmp_path / "mine")
     assert (
         first.views == 2
@@ -159,7 +149,39 @@ def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(
     ]
     # Only the first, unmeasured picture is in the person's own cache.
     assert len(list((tmp_path / "mine" / "appearance").glob("*.npz"))) == 1
-    columns, rows = suite.columns_and_rows([first, first])
-    assert rows[-1][0] == "all" and rows[-1][1] == "4" and len(rows[0]) == len(columns)
+    table = suite.table([first, first])
+    assert table.rows[-1][:2] == ["all", "4"] and len(table.rows[0]) == len(table.columns)
     total = suite.to_dict([first, first])["total"]["wall"]["geometry"]
     assert total == pytest.approx(2 * first.wall["geometry"])
+
+
+def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monkeypatch):
+    asked = []
+
+    def short(name, failing=False):
+        real = getattr(geometry, name)
+
+        def question(scene, *, rounds, tell):
+            asked.append(name)
+            if failing and asked.count(name) == 1:
+                raise KeyboardInterrupt
+            size = {"depth": {"rays": 20}, "visibility": {"points": 20, "maps": (8,)}}[name]
+            return real(scene, size=16, rounds=rounds, tell=tell, **size)
+
+        question.__name__ = name
+        monkeypatch.setattr(accuracy, name, question)
+
+    short("depth")
+    short("visibility", failing=True)
+    monkeypatch.setattr(accuracy, "PICTURE_SCENES", ())
+    monkeypatch.setattr(accuracy, "GEOMETRY_SCENES", ("far",))
+    call = ["scenes", "accuracy", "--rounds", "3", "--out", str(tmp_path)]
+    killed = CliRunner().invoke(app, call)
+    assert killed.exit_code == 130 and "finished panels are kept" in killed.stderr
+    (record,) = (json.loads(path.read_text()) for path in (tmp_path / "cells").iterdir())
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 0 and asked == ["depth", "visibility", "visibility"]
+    # Seconds are among a panel's figures: measured again they would differ.
+    panels = json.loads((tmp_path / "accuracy.json").read_text())["panels"]
+    assert panels[0] == record["panel"] and [p["question"] for p in panels] == ["depth", asked[1]]
+    assert CliRunner().invoke(app, call).exit_code == 0 and len(asked) == 3

@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from attnwarp_eval.experiments import flow
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.experiments import flow, flow_report
 from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.scene.file import load_scene
 
@@ -23,20 +25,13 @@ def test_a_turned_camera_keeps_the_point_it_looks_at_and_its_distance():
     np.testing.assert_allclose(quarter.project(middle)[0], [32, 32], atol=1e-9)
 
 
-def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path, capsys):
-    arguments = [
-        "--scenes",
-        "bear",
-        "--yaws",
-        "5",
-        "--size",
-        "48",
-        "--spp",
-        "4",
-        "--out",
-        str(tmp_path),
-    ]
-    flow.main(arguments)
+def run(out, *more):
+    arguments = ["scenes", "flow", "bear", "--size", "48", "--spp", "4", "--out", str(out)]
+    return CliRunner().invoke(app, [*arguments, *more])
+
+
+def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
+    result = run(tmp_path, "--yaws", "5")
     (row,) = json.loads((tmp_path / "flow.json").read_text())
     assert (row["scene"], row["yaw"], row["method"]) == ("bear", 5, "dis")
     exact = {kind: row["figures"][kind]["consistency.delta_e"] for kind in flow.PAIRS}
@@ -49,29 +44,73 @@ def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path, capsy
     assert sorted(path.name for path in tmp_path.glob("*.png")) == sorted(
         f"bear-5-{kind}.png" for kind in flow.PAIRS
     )
-    printed = capsys.readouterr().out.splitlines()
+    printed = result.stdout.splitlines()
     assert printed[2].startswith("| bear | 5 | ") and printed[3:] == [str(tmp_path / "report.md")]
-    said = (tmp_path / "report.md").read_text()
+    text = (tmp_path / "report.md").read_text()
     assert (
-        printed[2] in said.splitlines()
-        and "48 x 48 px, 4 samples a pixel; flow by OpenCV's dis" in said
+        printed[2] in text.splitlines()
+        and "48 x 48 px, 4 samples a pixel; flow by OpenCV's dis" in text
     )
     by_flow = {kind: row["figures"][kind]["consistency.flow_delta_e"] for kind in flow.PAIRS}
     one = by_flow["one_answer"] / exact["one_answer"]
-    (summary,) = (line for line in said.splitlines() if line.startswith("| 5 | "))
+    (summary,) = (line for line in text.splitlines() if line.startswith("| 5 | "))
     assert summary.split(" | ")[2] == f"{one:.1f} to {one:.1f}"
     for name in ("consistency", "flow"):
         assert (
-            f"(figures/{name}.svg)" in said
+            f"(figures/{name}.svg)" in text
             and (tmp_path / "figures" / f"{name}.svg").stat().st_size > 2000
         )
+
+
+def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_path, monkeypatch):
+    real, measured = flow.measure_pair, []
+
+    def interrupted(name, edit, yaw, *more):
+        if yaw == 20:
+            raise KeyboardInterrupt
+        return real(name, edit, yaw, *more)
+
+    def counted(name, edit, yaw, *more):
+        measured.append(yaw)
+        return real(name, edit, yaw, *more)
+
+    monkeypatch.setattr(flow, "measure_pair", interrupted)
+    first = run(tmp_path / "a", "--yaws", "5,20")
+    assert first.exit_code == 130 and "finished pairs are kept" in first.stderr
+    assert not (tmp_path / "a" / "report.md").exists()
+    monkeypatch.setattr(flow, "measure_pair", counted)
+    assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0 and measured == [20]
+    assert run(tmp_path / "b", "--yaws", "5,20").exit_code == 0 and measured == [20, 5, 20]
+    for name in ("flow.json", "report.md", "figures/flow.svg", "bear-20-slip.png"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    # A picture that is gone is drawn again; a cell that was changed is measured again.
+    (tmp_path / "a" / "bear-5-slip.png").unlink()
+    cell = next(c for c in (tmp_path / "a" / "cells").iterdir() if '"yaw": 20.0' in c.read_text())
+    cell.write_text(cell.read_text().replace("consistency", "consistence", 1))
+    assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0
+    assert measured == [20, 5, 20, 5, 20] and (tmp_path / "a" / "bear-5-slip.png").is_file()
+    assert (tmp_path / "a" / "flow.json").read_bytes() == (tmp_path / "b/flow.json").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--yaws", "x"], "could not convert string to float: 'x'"),
+        (["--yaws", ","], "--yaws: got none"),
+        (["--method", "diss"], "--method: got 'diss', expected one of dis, farneback"),
+        (["fog"], "scene 'fog': expected one of bear, dinosaur, person"),
+    ],
+)
+def test_wrong_options_are_one_clear_line(tmp_path, arguments, words):
+    result = CliRunner().invoke(app, ["scenes", "flow", "--out", str(tmp_path), *arguments])
+    assert result.exit_code == 2 and words in result.stderr and "Traceback" not in result.stderr
 
 
 def test_an_edit_with_one_result_is_refused():
     with pytest.raises(
         ValueError, match="edit 'polar' of 'bear': got one result, expected at least two answers"
     ):
-        next(flow.study("bear", "polar", size=16, spp=1, yaws=[5]))
+        flow.measure_pair("bear", "polar", 5, flow.Options(size=16, spp=1))
 
 
 def row(scene, yaw, *, exact, by_flow):
@@ -91,16 +130,16 @@ def row(scene, yaw, *, exact, by_flow):
 def test_the_report_gives_the_least_and_the_largest_ratio_over_the_scenes(tmp_path):
     rows = [row("bear", 5.0, exact=1.0, by_flow=2.0), row("person", 5.0, exact=2.0, by_flow=3.0)]
     rows += [row("bear", 60.0, exact=1.0, by_flow=float("nan"))]
-    flow.write_report(rows, tmp_path, size=64, spp=2)
-    said = (tmp_path / "report.md").read_text().splitlines()
+    flow_report.write(rows, tmp_path, size=64, spp=2)
+    text = (tmp_path / "report.md").read_text().splitlines()
     # truth 3/2 to 2; one answer alike; at the exact figure's pixels flow over twice the exact; slip
     # 3/2 of one answer.
-    assert "| 5 | 1.5 to 2.0 | 1.5 to 2.0 | 0.8 to 1.0 | 1.5 to 1.5 | 1.5 to 1.5 |" in said
-    assert "| 60 | undefined | undefined | undefined | 1.5 to 1.5 | undefined |" in said
+    assert "| 5 | 1.5 to 2.0 | 1.5 to 2.0 | 0.8 to 1.0 | 1.5 to 1.5 | 1.5 to 1.5 |" in text
+    assert "| 60 | undefined | undefined | undefined | 1.5 to 1.5 | undefined |" in text
     assert (
-        said[2].endswith("the second turned around the scene by yaw degrees.")
-        and "bear, person; 64 x 64 px" in said[2]
+        text[2].endswith("the second turned around the scene by yaw degrees.")
+        and "bear, person; 64 x 64 px" in text[2]
     )
     again = {path.name: path.read_bytes() for path in (tmp_path / "figures").iterdir()}
-    flow.write_report(rows, tmp_path, size=64, spp=2)
+    flow_report.write(rows, tmp_path, size=64, spp=2)
     assert again == {path.name: path.read_bytes() for path in (tmp_path / "figures").iterdir()}

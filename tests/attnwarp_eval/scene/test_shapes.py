@@ -1,23 +1,12 @@
-import json
 import multiprocessing
-import struct
 import warnings
 
 import numpy as np
 import pytest
 
 from attnwarp_eval import cache
-from attnwarp_eval.scene.shapes import (
-    Box,
-    Capsule,
-    Ellipsoid,
-    Mesh,
-    MeshNotice,
-    Sphere,
-    body_distance,
-    mesh_body,
-    read_mesh,
-)
+from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Sphere
+from attnwarp_eval.scene.solids import Capsule, Ellipsoid, body_distance, mesh_body
 
 BALL = [Ellipsoid((0.3, -0.2, 1.0), (0.5, 0.5, 0.5))]
 
@@ -118,99 +107,11 @@ def test_degenerate_triangles_are_dropped_with_a_notice_that_counts_them():
         Mesh(np.where(np.arange(4)[:, None] == 2, np.nan, vertices), faces[:1]).cleaned("scan")
 
 
-def glb(vertices, faces, **node):
-    """The bytes of a minimal glTF 2.0 binary file; the one that Open3D writes lacks its BIN
-    chunk."""
-    points, index = vertices.astype("<f4"), faces.astype("<u2")
-    blob = points.tobytes() + index.tobytes()
-    document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **node}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "buffers": [{"byteLength": len(blob)}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": points.nbytes},
-            {"buffer": 0, "byteOffset": points.nbytes, "byteLength": index.nbytes},
-        ],
-        "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": 5126,
-                "count": len(points),
-                "type": "VEC3",
-                "min": points.min(0).tolist(),
-                "max": points.max(0).tolist(),
-            },
-            {"bufferView": 1, "componentType": 5123, "count": index.size, "type": "SCALAR"},
-        ],
-    }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    blob += b"\0" * (-len(blob) % 4)
-    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob))
-    return (
-        head
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(blob), b"BIN\0")
-        + blob
-    )
-
-
-def write_mesh(path, vertices, faces):
-    if path.suffix == ".glb":
-        path.write_bytes(glb(vertices, faces))
-    elif path.suffix == ".obj":
-        lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [
-            f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces
-        ]
-        path.write_text("\n".join(lines) + "\n")
-    else:
-        head = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}"]
-        head += [f"property double {axis}" for axis in "xyz"]
-        head += [
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header",
-        ]
-        lines = [f"{x} {y} {z}" for x, y, z in vertices] + [f"3 {a} {b} {c}" for a, b, c in faces]
-        path.write_text("\n".join(head + lines) + "\n")
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
-def test_a_mesh_file_comes_back_as_it_was_written(tmp_path, suffix):
-    cube = Box(np.array([0.5, 0.25, -1]), np.array([1, 2, 3.0])).mesh()
-    path = tmp_path / f"cube{suffix}"
-    write_mesh(path, cube.vertices, cube.faces)
-    back = read_mesh(path)
-    # Readers may split or merge vertices, so corners are compared triangle by triangle; glb stores
-    # float32.
-    assert np.allclose(back.vertices[back.faces], cube.vertices[cube.faces], rtol=0, atol=1e-6)
-
-
-def test_the_placement_of_a_node_in_a_glb_file_is_applied(tmp_path):
-    cube = Box(np.zeros(3), np.ones(3)).mesh()
-    (tmp_path / "cube.glb").write_bytes(
-        glb(cube.vertices, cube.faces, translation=[10, 0, 0], scale=[2, 2, 2])
-    )
-    assert np.allclose(read_mesh(tmp_path / "cube.glb").bounds(), [[8, -2, -2], [12, 2, 2]])
-
-
-def test_a_file_that_is_no_mesh_is_refused_with_the_remedy(tmp_path):
-    write_mesh(tmp_path / "points.ply", np.zeros((1, 3)), np.zeros((0, 3), int))
-    with pytest.raises(ValueError, match="holds no triangles"):
-        read_mesh(tmp_path / "points.ply")
-    with pytest.raises(ValueError, match=r"mesh format '.step' is not read; use one of .ply, .obj"):
-        read_mesh(tmp_path / "part.step")
-
-
 def test_a_body_is_meshed_once_and_read_back_bit_for_bit(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     first = mesh_body(BALL, 0.0, 16)
     assert len(list((tmp_path / "meshes").iterdir())) == 1
-    monkeypatch.setattr("attnwarp_eval.scene.shapes._march", lambda *_: pytest.fail("meshed again"))
+    monkeypatch.setattr("attnwarp_eval.scene.solids._march", lambda *_: pytest.fail("meshed again"))
     second = mesh_body(BALL, 0.0, 16)
     assert np.array_equal(first.vertices, second.vertices) and np.array_equal(
         first.faces, second.faces

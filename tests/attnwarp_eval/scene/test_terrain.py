@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from attnwarp_eval.scene import shapes
+from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.bodies import BodySpec
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import SceneError
-from attnwarp_eval.scene.shapes import Block, Capsule, Disc, Ellipsoid, Relief, Torus, body_distance
+from attnwarp_eval.scene.solids import Block, Capsule, Disc, Ellipsoid, Relief, Torus, body_distance
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 
 
@@ -115,16 +115,16 @@ def test_a_tube_is_its_rods_and_a_mirrored_turned_part_mirrors_its_turn():
 
 def test_relief_stays_within_its_depth_and_is_felt():
     ball = [Ellipsoid((0, 0, 0), (1, 1, 1))]
-    mesh = shapes.mesh_body(ball, 0, 48, Relief(0.05, 0.3, 3, 2))
+    mesh = solids.mesh_body(ball, 0, 48, Relief(0.05, 0.3, 3, 2))
     radius = np.linalg.norm(mesh.vertices, axis=-1)
     assert radius.min() > 0.95 - 1e-3 and radius.max() < 1.05 + 1e-3 and np.ptp(radius) > 0.04
 
 
 def test_sampling_near_the_surface_alone_gives_the_mesh_of_sampling_everywhere(monkeypatch):
     parts = load_scene("face").spec.objects[2].shape.solid()
-    sparse = shapes._march(parts, 0.09, 64, None)
-    monkeypatch.setattr(shapes, "BLOCK", 10**4)  # one block, which is near the surface
-    full = shapes._march(parts, 0.09, 64, None)
+    sparse = solids._march(parts, 0.09, 64, None)
+    monkeypatch.setattr(solids, "BLOCK", 10**4)  # one block, which is near the surface
+    full = solids._march(parts, 0.09, 64, None)
     for name, values in full.items():
         assert np.array_equal(sparse[name], values), name
 

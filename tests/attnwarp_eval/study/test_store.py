@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from attnwarp_eval.files import canonical_json
+from attnwarp_eval.files import canonical_json, write_atomic
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.store import Store, StoreError, write_atomic
+from attnwarp_eval.study.store import Store, StoreError
 
 SPEC = {"probe": "depth", "scene": "abc", "seed": 0}
 

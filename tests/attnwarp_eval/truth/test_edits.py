@@ -8,10 +8,10 @@ import pytest
 
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.scene import edits
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SceneSpec
-from attnwarp_eval.scene.textures import linear_rgb
 from attnwarp_eval.truth import Geometry, appearance
 from attnwarp_eval.truth import edits as shown
 from attnwarp_eval.truth.shading import object_albedo
@@ -122,7 +122,7 @@ def test_paint_keeps_lightness_and_what_it_is_told_to_keep():
 
 
 def test_a_painted_body_is_the_mesh_it_was(monkeypatch):
-    from attnwarp_eval.scene import shapes
+    from attnwarp_eval.scene import solids
 
     scene = shipped("bear")
     index = scene.object_names.index("bear")
@@ -131,7 +131,7 @@ def test_a_painted_body_is_the_mesh_it_was(monkeypatch):
     def refuse(*_):
         raise AssertionError("meshed again")
 
-    monkeypatch.setattr(shapes, "_march", refuse)
+    monkeypatch.setattr(solids, "_march", refuse)
     after = scene.edited("polar").spec.objects[index].shape.mesh()
     assert np.array_equal(before.vertices, after.vertices) and np.array_equal(
         before.faces, after.faces

@@ -11,22 +11,37 @@ import pytest
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.effects import detect
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import DiffuseMaterial, PlasticMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SphereSpec
-from attnwarp_eval.scene.textures import albedo, linear_rgb
+from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import Geometry, two_view
-from attnwarp_eval.truth.mitsuba import render_plan
+from attnwarp_eval.truth.mitsuba import build, render_plan
 from attnwarp_eval.truth.plan import plan
 from attnwarp_eval.truth.shading import sun_direction
 
 SIX = ["bear", "dinosaur", "face", "garden", "person", "stump"]
+QUICK = ["bear", "person"]
+PARTLY_SLOW = [
+    pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in SIX
+]
 SIZE = 160
 LARGE = 80  # pixels that a ball covers; on smaller ones a highlight is less than a pixel
 
 
-@functools.lru_cache(maxsize=1)  # the tests of one scene come one after the other
+@pytest.fixture(scope="module", autouse=True)
+def coarse_textures():
+    """Textures baked for pictures of 160, not 512 rows, which takes a tenth of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "TEXELS", 640)
+        build.forget()
+        yield
+        build.forget()
+
+
+@functools.lru_cache(maxsize=6)
 def world(name):
     scene = load_scene(name).with_size(SIZE, SIZE)
     return scene, Geometry(scene)
@@ -77,7 +92,7 @@ def spot(scene, geometry, ball, camera):
     return (x / z, y / z) if abs(seen.t[0] - 1) < 1e-6 and not lit.valid[0] and inside else None
 
 
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", PARTLY_SLOW)
 def test_the_six_call_for_gloss_and_no_edit_takes_it_away(name):
     scene, _ = world(name)
     found = detect.detect(scene)["glossy"]
@@ -104,7 +119,7 @@ def test_a_highlight_is_seen_from_the_source_and_most_targets(name):
     ]
 
 
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", PARTLY_SLOW)
 def test_the_highlight_is_brighter_than_any_paint_and_lies_where_optics_puts_it(name):
     scene, geometry = world(name)
     owner = geometry.trace(scene.source).object_id

@@ -1,15 +1,16 @@
 """Mitsuba's pictures and geometry against Open3D, closed forms and the ray-cast shading."""
 
+import importlib
+
 import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
+from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
-from attnwarp_eval.scene.textures import linear_rgb
-from attnwarp_eval.truth import Geometry, appearance
-from attnwarp_eval.truth import mitsuba as renderer
+from attnwarp_eval.truth import Geometry, appearance, mitsuba
 from attnwarp_eval.truth.plan import Pass, Plan, plan
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
 
@@ -18,6 +19,8 @@ FLOOR = {
     "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [40, 40]},
     "texture": {"type": "plain", "color": "#b08040"},
 }
+
+MODULE = importlib.import_module("attnwarp_eval.truth.mitsuba.appearance")
 
 
 def world(lights, objects=None, **appearance_):
@@ -47,7 +50,7 @@ def test_mitsuba_and_the_exact_geometry_hit_the_same_objects_at_the_same_places(
     scene = load_scene(name).with_size(128, 96)
     geometry = Geometry(scene)
     for camera in (scene.source, scene.camera("yaw150")):
-        position, object_id = renderer.position_and_shape(scene, camera)
+        position, object_id = mitsuba.position_and_shape(scene, camera)
         hits = geometry.trace(camera)
         # Two float32 ray tracers may disagree on a ray that grazes an outline.
         agree = object_id == hits.object_id
@@ -66,7 +69,7 @@ def test_a_scene_far_from_the_origin_is_rendered_as_sharply_as_at_home():
     }
     scene = world([SUN], [ball])
     camera = Camera.look_at((1e6 + 4, -1e6 + 1, 2), (1e6, -1e6, 1), width=48, height=48, fov_y=40)
-    position, object_id = renderer.position_and_shape(scene, camera)
+    position, object_id = mitsuba.position_and_shape(scene, camera)
     hits = Geometry(scene).trace(camera)
     assert (object_id == hits.object_id).mean() > 0.999
     both = hits.valid & (object_id == 0)
@@ -80,7 +83,7 @@ def test_any_principal_point_means_the_same_in_both():
     K = source.K.copy()
     K[:2, 2] = [11.0, 80.0]
     camera = Camera(K, source.world_to_camera, 96, 64)
-    position, object_id = renderer.position_and_shape(scene, camera)
+    position, object_id = mitsuba.position_and_shape(scene, camera)
     hits = Geometry(scene).trace(camera)
     assert (object_id == hits.object_id).mean() > 0.999
     both = hits.valid & (object_id == hits.object_id)
@@ -154,18 +157,18 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
 def test_the_same_seed_gives_the_same_bits_and_another_seed_other_noise(monkeypatch, tmp_path):
     scene = load_scene("spheres").with_size(32, 32)
     planned = plan(scene, 2)
-    first = renderer.render_plan(scene, scene.source, planned, 5)
+    first = mitsuba.render_plan(scene, scene.source, planned, 5)
     assert first.dtype == np.float32 and np.isfinite(first).all()
-    assert np.array_equal(first, renderer.render_plan(scene, scene.source, planned, 5))
-    assert not np.array_equal(first, renderer.render_plan(scene, scene.source, planned, 6))
+    assert np.array_equal(first, mitsuba.render_plan(scene, scene.source, planned, 5))
+    assert not np.array_equal(first, mitsuba.render_plan(scene, scene.source, planned, 6))
 
 
 def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     scene = world([SUN, SKY], spp=1).with_size(16, 16)
     calls = []
-    real = renderer.render_plan
-    monkeypatch.setattr(renderer, "render_plan", lambda *a: calls.append(a) or real(*a))
+    real = mitsuba.render_plan
+    monkeypatch.setattr(MODULE, "render_plan", lambda *a: calls.append(a) or real(*a))
     first = appearance(scene, scene.source)
     assert np.array_equal(first, appearance(scene, scene.source, spp=1)) and len(calls) == 1
     appearance(scene, scene.source, seed=1)
@@ -197,9 +200,9 @@ def test_the_plan_of_one_bounce_and_a_path_tracer_of_one_bounce_agree():
     # The two passes add up to what one path-traced picture of all lights converges to.
     scene = load_scene("fence").with_size(48, 48)
     path = Plan((Pass((0, 1), "path", 2, 1, 1, 64),), ())
-    reference = np.stack([renderer.render_plan(scene, scene.source, path, k) for k in range(4)])
+    reference = np.stack([mitsuba.render_plan(scene, scene.source, path, k) for k in range(4)])
     ours = np.stack(
-        [renderer.render_plan(scene, scene.source, plan(scene, 16), k) for k in range(4)]
+        [mitsuba.render_plan(scene, scene.source, plan(scene, 16), k) for k in range(4)]
     )
     error = np.sqrt(reference.var(0, ddof=1) / 4 + ours.var(0, ddof=1) / 4).mean()
     difference = reference.mean(0) - ours.mean(0)

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
-from attnwarp_eval.scene.shapes import Box, Ellipsoid, Mesh, Rectangle, Sphere, mesh_body
+from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
+from attnwarp_eval.scene.solids import Ellipsoid, mesh_body
 from attnwarp_eval.truth import Geometry
 from attnwarp_eval.truth.analytic import nearest_hit
 

@@ -7,7 +7,8 @@ import pytest
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.scene.shapes import Box, Capsule, Ellipsoid, Rectangle, Sphere, mesh_body
+from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
+from attnwarp_eval.scene.solids import Capsule, Ellipsoid, mesh_body
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Geometry, edge_band, two_view
 
 GROUND = Rectangle(np.zeros(3), np.array([4.0, 0, 0]), np.array([0, 4.0, 0]), object_id=0)

@@ -13,13 +13,13 @@ from typing import Any, ClassVar, Generic, TypeVar
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import spread
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
 from attnwarp_eval.study.results import Outcome, Results
-from attnwarp_eval.study.store import write_atomic
 from attnwarp_eval.world import World
 
 E = TypeVar("E", bound=Extra)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +20,7 @@ from attnwarp.encoders import Kind, kind_of, load_encoder
 from attnwarp.errors import InputError
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.cost import in_turn
 from attnwarp_eval.document import figures
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
@@ -439,16 +439,9 @@ def _rounds(
         contestants["embedding.dino_image"] = lambda: metrics.image_similarity(
             prompts.dino_source, dino.images([picture])
         )
-    names = list(contestants)
-    taken: dict[str, list[float]] = {name: [] for name in names}
-    rng = np.random.default_rng(spec["seed"])
-    for turn in range(spec["rounds"] + 1):
-        for index in rng.permutation(len(names)):
-            start = time.perf_counter()
-            contestants[names[index]]()
-            if turn:
-                taken[names[index]].append(time.perf_counter() - start)
-    return taken
+    works = [lambda _, work=work: work() for work in contestants.values()]
+    turns = in_turn(works, spec["rounds"], seed=spec["seed"])
+    return dict(zip(contestants, turns.seconds, strict=True))
 
 
 def _has(values: Values, key: str) -> bool:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 
-import numpy as np
-
 from attnwarp.warp import WarpSettings, render_surface, warp_view
+from attnwarp_eval.cost import in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.parts import Study
@@ -75,13 +73,7 @@ class Timing(Probe[Rounds]):
                 yield Cell(spec, name, "all", self.name, seed, tuple(names))
 
     def compute(self, work: Work) -> Rounds:
-        """Time every contestant in every round, in an order drawn anew each round.
-
-        The machine's speed drifts; contestants of one round see the same machine, so their ratio
-        within a round can be trusted where two separate means cannot. The first contestant runs
-        twice a round: the ratio of it to itself is what noise alone does here. A first round, which
-        compiles and fills caches, is not counted.
-        """
+        """Time every contestant in every round; see :func:`attnwarp_eval.cost.in_turn`."""
         spec, world = work.spec, work.world
         target = world.targets[spec["views"][0]]
         contestants = [
@@ -91,27 +83,25 @@ class Timing(Probe[Rounds]):
             )
             for contestant in spec["contestants"]
         ]
-        contestants.append(contestants[0])
         sources = [render_surface(model, world.source, settings) for model, settings in contestants]
-        rng = np.random.default_rng(spec["seed"])
-        seconds = Rounds([[] for _ in contestants], [[] for _ in contestants])
-        for turn in range(spec["rounds"] + 1):
-            for index in rng.permutation(len(contestants)):
-                model, settings = contestants[index]
-                start = time.perf_counter()
-                render_surface(model, target, settings)
-                rendered = time.perf_counter()
-                view = warp_view(
-                    model, world.source, target, settings, source_surface=sources[index]
-                )
-                for layer in spec["feature_sizes"]:
-                    view.at((layer, layer))
-                done = time.perf_counter()
-                if turn:
-                    seconds.render[index].append(rendered - start)
-                    seconds.pair[index].append(done - rendered)
-        work.meter.count(rounds=spec["rounds"], contestants=len(contestants))
-        return seconds
+
+        def render(index: int) -> None:
+            model, settings = contestants[index]
+            render_surface(model, target, settings)
+
+        def pair(index: int) -> None:
+            model, settings = contestants[index]
+            view = warp_view(model, world.source, target, settings, source_surface=sources[index])
+            for layer in spec["feature_sizes"]:
+                view.at((layer, layer))
+
+        def timed(stage: Callable[[int], None]) -> list[list[float]]:
+            works = [lambda _, index=index: stage(index) for index in range(len(contestants))]
+            turns = in_turn(works, spec["rounds"], seed=spec["seed"])
+            return [*turns.seconds, turns.again]
+
+        work.meter.count(rounds=spec["rounds"], contestants=len(contestants) + 1)
+        return Rounds(timed(render), timed(pair))
 
     def read_extra(self, data: Json) -> Rounds:
         """From the record's cost."""

@@ -1,13 +1,4 @@
-"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.plan` plans them.
-
-Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else
-``scalar_rgb``, which works
-everywhere: see :mod:`attnwarp_eval.truth.llvm`.
-
-Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64
-first. Its cameras look along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1,
--1, 1).
-"""
+"""A scene as Mitsuba has it: shapes, materials, lights, fog and cameras, loaded and cached."""
 
 from __future__ import annotations
 
@@ -22,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.cache import content_key
+from attnwarp_eval.scene.base import linear_rgb
+from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.materials import (
     GlassMaterial,
     InteriorSpec,
@@ -35,17 +28,12 @@ from attnwarp_eval.scene.materials import (
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.scene.spec import ObjectSpec, SkySpec, SunSpec
-from attnwarp_eval.scene.textures import albedo, linear_rgb
+from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth.llvm import SCALAR, variant
-from attnwarp_eval.truth.plan import Pass, Plan, beam, plan, sampler, smooth_objects
-from attnwarp_eval.truth.raycast import Geometry
+from attnwarp_eval.truth.plan import Plan, beam
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 
 Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.float32]
-
-APPEARANCE_PROTOCOL = 2
-"""Raised whenever the same scene, camera, plan and seed would give another picture."""
 
 TEXELS = 2048
 """Most texels along the longer side of a baked texture."""
@@ -61,198 +49,13 @@ middle.
 """
 
 
-def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
-    """What ``camera`` sees, in linear RGB.
-
-    Args:
-        camera: square pixels and no skew; any principal point.
-        spp: samples a pixel; the scene's own number if left out.
-        seed: the same seed gives the same bits.
-
-    Returns:
-        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel.
-        Kept on disk, see :mod:`attnwarp_eval.cache`.
-
-    Raises:
-        ValueError: a camera that Mitsuba cannot express.
-    """
-    import mitsuba
-
-    planned = plan(scene, spp)
-    pose = {name: value for name, value in camera.to_dict().items() if name != "name"}
-    key = content_key(
-        "appearance",
-        APPEARANCE_PROTOCOL,
-        mitsuba.__version__,
-        variant(),
-        scene.world_hash,
-        _texel(scene),
-        # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
-        (
-            scene.spec.cameras.model_dump(mode="json", exclude={"size"})
-            if planned.lens or planned.media
-            else None
-        ),
-        pose,
-        planned.identity(),
-        int(seed),
-    )
-    stored = read_arrays("appearance", key)
-    if stored is None:
-        stored = {"image": render_plan(scene, camera, planned, seed)}
-        write_arrays("appearance", key, stored)
-    return stored["image"]
-
-
-def render_plan(
-    scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None
-) -> Image:
-    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is
-    kept.
-
-    Args:
-        made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
-        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads
-            add them to pixels in any order, which shows in the last bits of float32.
-    """
-    _mitsuba(made_by or variant())
-    total = _render_passes(scene, camera, plan, seed)
-    for again in range(1, ATTEMPTS):
-        broken = ~np.isfinite(total).all(-1)
-        if not broken.any():
-            break
-        total[broken] = _render_passes(scene, camera, plan, seed + again * OTHER_SEEDS)[broken]
-    return total
-
-
-ATTEMPTS, OTHER_SEEDS = 4, 1_000_003
-"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the
-pixel is then rendered again with other seeds, which biases it by nothing that a rejected sample
-would not."""
-
-
-def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
-    mi = _mitsuba()
-    total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
-    for number, step in enumerate(plan.passes):
-        options: dict[str, Any] = {"type": step.integrator}
-        if step.integrator == "direct":
-            options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
-        else:
-            # Without an end a path still needs a number there; Mitsuba's is -1.
-            options |= {"max_depth": step.max_depth, "rr_depth": step.rr_depth}
-        if step.integrator == "ptracer":
-            # Lamps, seen directly, are the other pass's.
-            options |= {"hide_emitters": True}
-        world, center, fog = _world(scene, step.lights, step.lamps, plan.media, step.beam)
-        pass_seed = len(plan.passes) * int(seed) + number
-        if step.first != "any":
-            total += step.sign * _part(
-                scene, camera, plan, step, options, pass_seed, (world, center, fog)
-            )
-            continue
-        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
-        # stratify.
-        kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
-        sensor = _sensor(
-            scene,
-            camera,
-            center,
-            {"type": kind, "sample_count": step.spp},
-            world,
-            plan,
-            fog if plan.media else None,
-        )
-        picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=pass_seed)
-        total += step.sign * np.array(picture, dtype=np.float32)[..., :3]
-    return total
-
-
-def _part(
-    scene: Scene,
-    camera: Camera,
-    plan: Plan,
-    step: Pass,
-    options: dict[str, Any],
-    seed: int,
-    loaded: tuple[Any, Array, Any],
-) -> Image:
-    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the
-    others; zero elsewhere.
-
-    Each camera ray gets a pixel of its own in a picture of
-    k x k cells a pixel, so that the index of the shape it met first tells which of the two it
-    belongs to.
-    """
-    mi = _mitsuba()
-    world, center, fog = loaded
-    k = max(1, math.isqrt(step.spp))
-    fine = camera.resize(camera.width * k, camera.height * k)
-    lamps = [number for number, item in enumerate(scene.spec.objects) if item.emission]
-    smooth = np.isin(_owner_of_number(scene, world), [-1, *smooth_objects(scene), *lamps])
-    if step.first == "rough":
-        smooth = ~smooth
-    integrator = mi.load_dict({"type": "aov", "aovs": "first:shape_index", "seen": options})
-    total = np.zeros((fine.height, fine.width, 3), dtype=np.float64)
-    each = math.ceil(step.spp / k**2)
-    for number in range(each):
-        sensor = _sensor(
-            scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog
-        )
-        picture = np.array(
-            mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1)
-        )
-        keep = smooth[np.round(picture[..., 3]).astype(np.int64)]
-        total += np.where(keep[..., None], picture[..., :3], 0.0)
-    return (
-        (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
-    )
-
-
-def comparable(scene: Scene) -> str:
-    """The variant in which renderings of the source by different integrators can be held against
-    each other.
-
-    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that
-    depends on how an integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on
-    the scene alone.
-    """
-    if variant() == SCALAR:
-        return SCALAR
-    tied, _ = Geometry(scene).ties(scene.source)
-    return SCALAR if tied.any() else variant()
-
-
-def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
-    """What Mitsuba's own ray tracer hits at the pixel centres, to hold the exact geometry against.
-
-    Returns:
-        position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is
-            hit.
-        object_id: (H, W) index of the object, -1 where nothing is hit.
-    """
-    mi = _mitsuba(variant())
-    world, center, _ = _world(scene, (), False, False)
-    integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
-    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
-    # lie nowhere.
-    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-    sensor = _sensor(scene, camera, center, middles, world, Plan((), ()), None)
-    picture = np.array(
-        mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64
-    )
-    shape = np.round(picture[..., 3]).astype(np.int64)
-    position = np.where((shape > 0)[..., None], picture[..., :3] + center, np.nan)
-    return position, _owner_of_number(scene, world)[shape]
-
-
-def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
+def owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
     """Object by the number that the AOV shape_index has for a shape; -1 for 0, which is none.
 
     It is 1 + the place among the shapes in scalar_rgb, the place in a registry of the whole process
     in the others.
     """
-    mi = _mitsuba()
+    mi = library()
     shapes, owners = world.shapes(), _owners(scene)
     numbers = list(range(1, len(shapes) + 1))
     if mi.variant() != SCALAR:
@@ -270,10 +73,10 @@ def _owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
 
 def use(name: str) -> None:
     """Load or turn to a variant now, so that no timer has it."""
-    _mitsuba(name)
+    library(name)
 
 
-def _mitsuba(name: str | None = None) -> Any:
+def library(name: str | None = None) -> Any:
     """The library, with the variant ``name``; without a name as the caller's caller has set it."""
     import mitsuba
 
@@ -287,24 +90,26 @@ def _mitsuba(name: str | None = None) -> Any:
     return mi
 
 
-def _world(
+def load_world(
     scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, narrow: bool = False
 ) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and
     the fog or None.
     """
-    mi = _mitsuba()
-    texel = _texel(scene)
+    mi = library()
+    texel = texel_size(scene)
     base = (mi.variant(), scene.world_hash, texel)
-    forms, center, _ = _kept(base, lambda: _load_shapes(scene, texel))
+    forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
     shone = {
-        f"light_{k}": _beam(scene, k, center) if narrow else _light(scene.spec.lights[k], center)
+        f"light_{k}": _beam(scene, k, center)
+        if narrow
+        else light_form(scene.spec.lights[k], center)
         for k in lights
     }
     # Asked for or not: what is not there does not make another world.
     lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (
-        scene.spec.medium is not None or any(_interior(item) for item in scene.spec.objects)
+        scene.spec.medium is not None or any(interior(item) for item in scene.spec.objects)
     )
 
     def make() -> tuple[Any, Array, Any]:
@@ -312,7 +117,7 @@ def _world(
         fog = None
         around: tuple[Array, Array] | None = None
         if media and scene.spec.medium is not None:
-            fog = mi.load_dict(_homogeneous(scene.spec.medium))
+            fog = mi.load_dict(medium_form(scene.spec.medium))
             around = fog_box(scene)
         for key, (shape, owner, form) in forms.items():
             item = scene.spec.objects[owner]
@@ -322,8 +127,8 @@ def _world(
                     "type": "area",
                     "radiance": _rgb(item.emission.radiance, item.emission.color),
                 }
-            if media and _interior(item):
-                extra["interior"] = _homogeneous(item.material.interior)
+            if media and interior(item):
+                extra["interior"] = medium_form(item.material.interior)
             if (
                 fog is not None
                 and isinstance(item.material, GlassMaterial)
@@ -348,10 +153,11 @@ def _world(
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
     cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
-    return _kept((*base, lights, lamps, media, narrow, cameras), make)
+    return cached((*base, lights, lamps, media, narrow, cameras), make)
 
 
-def _interior(item: ObjectSpec) -> InteriorSpec | None:
+def interior(item: ObjectSpec) -> InteriorSpec | None:
+    """What fills a glass object, None for any other object."""
     return item.material.interior if isinstance(item.material, GlassMaterial) else None
 
 
@@ -381,7 +187,8 @@ def _within(scene: Scene, owner: int, box: tuple[Array, Array] | None) -> bool:
     return bool(((middle > box[0]) & (middle < box[1])).all())
 
 
-def _homogeneous(said: InteriorSpec) -> dict[str, Any]:
+def medium_form(said: InteriorSpec) -> dict[str, Any]:
+    """A homogeneous medium as Mitsuba reads it."""
     return {
         "type": "homogeneous",
         "sigma_t": said.sigma_t,
@@ -394,89 +201,20 @@ def _rgb(scale: float, color: str) -> dict[str, Any]:
     return {"type": "rgb", "value": (scale * np.array(linear_rgb(color))).tolist()}
 
 
-def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
-    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as
-    loaded.
-    """
-    mi = _mitsuba(variant())
-    everything = tuple(range(len(scene.spec.lights)))
-    world, center, fog = _world(scene, everything, True, True)
-    forms, _, plugins = _kept(
-        (mi.variant(), scene.world_hash, _texel(scene)), lambda: _load_shapes(scene, _texel(scene))
-    )
-    names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}
-    parsed = [
-        (where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n)
-        for where, n in plugins
-    ]
-    for k in everything:
-        parsed += _plugins(f"lights[{k}]", _light(scene.spec.lights[k], center))
-    for k, item in enumerate(scene.spec.objects):
-        inside = _interior(item)
-        if inside is not None:
-            parsed += _plugins(f"objects[{k}].interior", _homogeneous(inside))
-    if scene.spec.medium is not None:
-        parsed += _plugins("medium.interior", _homogeneous(scene.spec.medium))
-    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-    sensor = _sensor(scene, scene.source, center, middles, world, plan(scene, 1), fog)
-    parsed.append(
-        ("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective"))
-    )
-    loaded = [
-        (
-            names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]) :],
-            thing,
-        )
-        for where, thing in _walk(world)
-    ]
-    return parsed, loaded
-
-
-def _plugins(where: str, form: Any) -> list[tuple[str, str]]:
-    if not isinstance(form, dict):
-        return []
-    out = [(where, str(form["type"]))] if "type" in form else []
-    for key, value in form.items():
-        out += _plugins(f"{where}.{key}", value)
-    return out
-
-
-def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
-    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
-    it.
-    """
-    mi = _mitsuba()
-    found: list[tuple[str, Any]] = []
-
-    class Visit(mi.TraversalCallback):  # type: ignore[name-defined]
-        def put(self, name: str, value: Any, *_: Any) -> None:
-            if isinstance(value, mi.Object):
-                found.append((where + name, value))
-                found.extend(_walk(value, f"{where}{name}."))
-
-        put_object = put
-
-        def put_value(self, name: str, value: Any, *_: Any) -> None:
-            """Numbers are of no interest here."""
-
-    thing.traverse(Visit())
-    return found
-
-
 _loaded: dict[Any, Any] = {}
 
-KEPT = 12
+CACHED = 12
 """Loaded scenes and shapes that are kept: those of a plan with a caustic, a rendering of everything
 on, in two variants.
 """
 
 
-def _kept(key: Any, make: Callable[[], Any]) -> Any:
+def cached(key: Any, make: Callable[[], Any]) -> Any:
     """The value of ``make``, kept with the last few others: a scene's views come one after the
     other.
     """
     if key not in _loaded:
-        while len(_loaded) >= KEPT:
+        while len(_loaded) >= CACHED:
             _loaded.pop(next(iter(_loaded)))
         _loaded[key] = make()
     return _loaded[key]
@@ -487,14 +225,16 @@ def forget() -> None:
     _loaded.clear()
 
 
-def _load_shapes(
+def load_shapes(
     scene: Scene, texel: float
 ) -> tuple[dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]], Array, list[tuple[str, str]]]:
     """Shapes that neither shine nor hold a medium: name -> (shape, object, what it is loaded from);
     origin; plugins.
     """
-    mi = _mitsuba()
-    bounds = np.stack([shape.bounds() for shape in scene.shapes()])
+    mi = library()
+    shapes = scene.shapes()
+    warn_of_strays(scene, shapes)
+    bounds = np.stack([shape.bounds() for shape in shapes])
     center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
     out: dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]] = {}
     plugins: list[tuple[str, str]] = []
@@ -503,7 +243,7 @@ def _load_shapes(
             _shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True
         ):
             shape = mi.load_dict(form, optimize=False)
-            plugins += _plugins(name, form)
+            plugins += plugin_names(name, form)
             item = scene.spec.objects[owner]
             again: Callable[[], dict[str, Any]] = dict
             if item.emission or isinstance(item.material, GlassMaterial):
@@ -531,7 +271,7 @@ def _owners(scene: Scene) -> list[int]:
 def _shapes(
     scene: Scene, center: Array, texel: float, folder: Path
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    mi = _mitsuba()
+    mi = library()
     for index, shape in enumerate(_faces(scene)):
         item = scene.spec.objects[shape.object_id]
         texture = item.texture
@@ -642,7 +382,7 @@ def _bsdf(item: ObjectSpec, reflectance: dict[str, Any]) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": inner}
 
 
-def _texel(scene: Scene) -> float:
+def texel_size(scene: Scene) -> float:
     """Size of a baked texel in scene units, for pictures of 512 rows."""
     orbit = scene.spec.cameras
     return TEXEL_SIZE * orbit.radius * 2 * math.tan(math.radians(orbit.fov) / 2) / 512
@@ -728,8 +468,9 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
         file.write(faces.tobytes())
 
 
-def _light(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> dict[str, Any]:
-    mi = _mitsuba()
+def light_form(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -> dict[str, Any]:
+    """A light as Mitsuba reads it, relative to ``center``."""
+    mi = library()
     if isinstance(light, SunSpec):
         color = (light.irradiance * np.array(linear_rgb(light.color))).tolist()
         return {
@@ -779,10 +520,10 @@ def _beam(scene: Scene, light: int, center: Array) -> dict[str, Any]:
         cutoff=angle,
         beam=0.999 * angle,
     )
-    return _light(spot, center)
+    return light_form(spot, center)
 
 
-def _sensor(
+def load_sensor(
     scene: Scene,
     camera: Camera,
     center: Array,
@@ -791,7 +532,12 @@ def _sensor(
     plan: Plan,
     fog: Any,
 ) -> Any:
-    mi = _mitsuba()
+    """The camera as Mitsuba has it.
+
+    Raises:
+        ValueError: a camera that Mitsuba cannot express.
+    """
+    mi = library()
     fx, fy, skew = camera.K[0, 0], camera.K[1, 1], camera.K[0, 1]
     if abs(fx / fy - 1) > 1e-6 or skew != 0:
         raise ValueError(
@@ -847,3 +593,13 @@ def focus_distance(scene: Scene, camera: Camera) -> float:
     """
     depth = float((camera.world_to_camera @ np.array([*scene.center, 1.0]))[2])
     return depth if depth > 0 else scene.spec.cameras.radius
+
+
+def plugin_names(where: str, form: Any) -> list[tuple[str, str]]:
+    """(place, plugin name) of a form and of all forms in it."""
+    if not isinstance(form, dict):
+        return []
+    out = [(where, str(form["type"]))] if "type" in form else []
+    for key, value in form.items():
+        out += plugin_names(f"{where}.{key}", value)
+    return out

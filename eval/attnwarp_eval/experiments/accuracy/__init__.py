@@ -1,0 +1,111 @@
+"""What accuracy of the truth itself costs in time: error against seconds of pictures, depth and
+visibility.
+
+Every contestant is held against an answer that it does not share: pictures against the mean of many
+others at far more samples, depth and visibility against every triangle of the scene met one by one
+in float64. Seconds are taken in turn, see :func:`attnwarp_eval.cost.in_turn`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from attnwarp.errors import InputError
+from attnwarp_eval.experiments.accuracy.geometry import depth, triangles, visibility
+from attnwarp_eval.experiments.accuracy.images import pictures
+from attnwarp_eval.experiments.accuracy.panel import Panel
+from attnwarp_eval.files import without_nan
+from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.store import Store
+
+PROTOCOL = 1
+"""Raised whenever a panel would come out otherwise."""
+
+PICTURE_SCENES = ("spheres", "bear", "glass", "fog")
+GEOMETRY_SCENES = ("bear", "garden", "far")
+
+Question = Callable[..., Panel]
+
+
+def measure(
+    names: Sequence[str] = (), *, out: Path, rounds: int = 7, progress: Progress = silent
+) -> Iterator[Panel]:
+    """Every question on every scene that it makes sense for.
+
+    Each panel is a cell of the run's folder: a call that was killed goes on where it was.
+
+    Args:
+        names: scenes' names or paths; :data:`PICTURE_SCENES` and :data:`GEOMETRY_SCENES` if left
+            out. Of those without a triangle depth and visibility are closed forms, and left out.
+        out: the run's folder.
+        rounds: of every timing.
+        progress: told of each step of each panel.
+
+    Raises:
+        InputError: a scene that cannot be used; another run is writing to ``out``.
+    """
+    from attnwarp_eval.scene.file import load_scene
+    from attnwarp_eval.truth.mitsuba import forget
+
+    cells = _cells([load_scene(name) for name in names])
+    store = Store(out)
+    with store.lock():
+        for number, (question, scene) in enumerate(cells):
+
+            def tell(step: str, number: int = number) -> None:
+                progress(number, len(cells), step)
+
+            tell(f"{scene.name}: {question.__name__}")
+            yield _resumed(store, question, scene, rounds, tell)
+            forget()
+
+
+def _cells(scenes: Sequence[Scene]) -> list[tuple[Question, Scene]]:
+    from attnwarp_eval.scene.file import load_scene
+
+    lit = scenes or [load_scene(name) for name in PICTURE_SCENES]
+    meshed = scenes or [load_scene(name) for name in GEOMETRY_SCENES]
+    cells: list[tuple[Question, Scene]] = [(pictures, scene) for scene in lit]
+    for scene in meshed:
+        try:
+            triangles(scene)
+        except InputError:
+            continue
+        cells += [(depth, scene), (visibility, scene)]
+    return cells
+
+
+def _resumed(
+    store: Store, question: Question, scene: Scene, rounds: int, tell: Callable[[str], None]
+) -> Panel:
+    import mitsuba
+
+    from attnwarp_eval._open3d import open3d
+    from attnwarp_eval.truth.llvm import variant
+    from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
+
+    spec: dict[str, Any] = {
+        "probe": "accuracy",
+        "protocol": PROTOCOL,
+        "question": question.__name__,
+        "scene": scene.content_hash,
+        "name": scene.name,
+        "rounds": rounds,
+    }
+    if question is pictures:
+        spec |= {"mitsuba": mitsuba.__version__, "variant": variant()}
+        spec |= {"appearance": APPEARANCE_PROTOCOL}
+    else:
+        spec |= {"open3d": open3d().__version__}
+    record = store.resumed(
+        spec, lambda: {"panel": _plain(question(scene, rounds=rounds, tell=tell))}
+    )
+    return Panel.from_json(record["panel"])
+
+
+def _plain(panel: Panel) -> dict[str, Any]:
+    return dict(without_nan(asdict(panel)))

@@ -1,0 +1,84 @@
+"""What contestants for one question on one scene got, and what it took."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from attnwarp_eval.statistics.intervals import Ratio, time_ratio
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """What one way to the truth got, and what it took.
+
+    Attributes:
+        name: for a person.
+        error: in the panel's unit, with a 95 % interval where rounds differ (bootstrap over
+            rounds), else three times itself.
+        seconds: of each round.
+        more: further figures by name.
+    """
+
+    name: str
+    error: tuple[float, float, float]
+    seconds: tuple[float, ...]
+    more: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """The contestants of one question on one scene; the first is the baseline of the ratios.
+
+    Attributes:
+        question: "pictures", "depth" or "visibility".
+        scene: its name.
+        unit: of the error.
+        contestants: the baseline first.
+        again: seconds of the baseline's second run of each round.
+        squares: squared error of each round, by contestant ("pictures" only).
+    """
+
+    question: str
+    scene: str
+    unit: str
+    contestants: tuple[Contestant, ...]
+    again: tuple[float, ...]
+    squares: tuple[tuple[float, ...], ...] = ()
+
+    def ratio(self, index: int | None) -> Ratio:
+        """Seconds of a contestant (None: the baseline's second run) over the baseline's, paired by
+        round.
+        """
+        seconds = self.again if index is None else self.contestants[index].seconds
+        return time_ratio([seconds], [self.contestants[0].seconds])
+
+    def at_equal_error(self, index: int) -> Ratio:
+        """Time for the same noise over the baseline's: variance x seconds, paired by round."""
+        products = [
+            np.array(self.squares[k]) * np.array(self.contestants[k].seconds) for k in (index, 0)
+        ]
+        return time_ratio([products[0].tolist()], [products[1].tolist()])
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> Panel:
+        """A panel from the JSON of its fields.
+
+        Raises:
+            KeyError, TypeError: a field is missing or of another kind.
+        """
+        contestants = tuple(
+            Contestant(c["name"], tuple(c["error"]), tuple(c["seconds"]), c["more"])
+            for c in fields["contestants"]
+        )
+        return cls(
+            fields["question"],
+            fields["scene"],
+            fields["unit"],
+            contestants,
+            tuple(fields["again"]),
+            tuple(tuple(row) for row in fields["squares"]),
+        )

@@ -1,0 +1,180 @@
+"""accuracy.md, accuracy.json and their figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from attnwarp.errors import InputError
+from attnwarp_eval.experiments.accuracy.panel import Panel
+from attnwarp_eval.files import write_atomic, write_json
+from attnwarp_eval.statistics.intervals import Ratio
+
+
+def _read(path: Path) -> list[Panel]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return []
+    try:
+        return [Panel.from_json(fields) for fields in json.loads(text)["panels"]]
+    except (ValueError, KeyError, TypeError):
+        raise InputError(
+            f"{path}: it is no measurement of accuracy; name another folder with --out"
+        ) from None
+
+
+def write(panels: Sequence[Panel], out: Path) -> list[Path]:
+    """accuracy.md, accuracy.json and the figures below ``out``; their paths.
+
+    Panels of other scenes that are in ``accuracy.json`` already stay, so that scenes can be
+    measured one by one.
+
+    Raises:
+        InputError: an ``accuracy.json`` of something else.
+    """
+    from attnwarp_eval.cost import environment
+    from attnwarp_eval.document import figures
+    from attnwarp_eval.document.model import Picture, Report
+    from attnwarp_eval.document.write import markdown
+    from attnwarp_eval.statistics.intervals import Interval
+    from attnwarp_eval.truth.llvm import variant
+
+    out.mkdir(parents=True, exist_ok=True)
+    nan = float("nan")
+    merged = {
+        (panel.question, panel.scene): panel for panel in [*_read(out / "accuracy.json"), *panels]
+    }
+    panels = list(merged.values())
+
+    def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
+        base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
+        mean, low, high = panel.contestants[k].error
+        if mean == 0 and high > 0:
+            # None wrong has no place on a logarithmic axis: shown at half a point, up to what none
+            # of so many excludes.
+            mean = 0.5 / panel.contestants[k].more["points"]
+        seconds = Interval(
+            base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan
+        )
+        return seconds, Interval(mean, low, high, 1, 1, 0, nan, nan)
+
+    drawn = []
+    for question in ("pictures", "depth", "visibility"):
+        selected = [panel for panel in panels if panel.question == question]
+        if not selected:
+            continue
+        path = out / f"{question}.svg"
+        with figures.drawing(path, columns=len(selected)) as axes:
+            for ax, panel in zip(axes, selected, strict=True):
+                points = {c.name: point(panel, k) for k, c in enumerate(panel.contestants)}
+                figures.cost_front(ax, points, x="seconds", y=SHORT[question], title=panel.scene)
+        drawn.append((question, path))
+    sections = _sections(panels)
+    for section in sections:
+        section.figures += [
+            Picture(path.name, f"{section.title}: error against time")
+            for question, path in drawn if TITLES[question] == section.title
+        ]  # fmt: skip
+    about = environment()
+    lead = [
+        (
+            f"Mitsuba {about['versions']['mitsuba']} as `{variant()}`, Open3D"
+            f" {about['versions']['open3d']}, {about['machine']['cores']} cores"
+            f" ({about['machine']['arch']})."
+        ),
+        (
+            "All contestants of a scene ran in turn in one process, in an order drawn anew each"
+            " round. A ratio is the median over rounds of the ratio to the first row within a"
+            " round, with a 95 % bootstrap interval over rounds. The row `again` is the first row"
+            " against itself: inside its band nothing is called faster or slower."
+        ),
+    ]
+    files = [out / "accuracy.md", out / "accuracy.json", *(path for _, path in drawn)]
+    report = Report("Error of the truth itself, against time", lead, sections)
+    write_atomic(files[0], markdown(report).encode())
+    data = {
+        "environment": about,
+        "variant": variant(),
+        "panels": [asdict(panel) for panel in panels],
+    }
+    write_json(files[1], data, sort_keys=False)
+    return files
+
+
+SHORT = {
+    "pictures": "RMS error / mean",
+    "depth": "largest relative error",
+    "visibility": "not labelled rightly",
+}
+TITLES = {
+    "pictures": "Pictures: samples, plan and variant",
+    "depth": "Depth: float32 hits and their refinement",
+    "visibility": "Visibility: rays and depth maps",
+}
+
+
+def _sections(panels: Sequence[Panel]) -> list[Any]:
+    from attnwarp_eval.document.model import Section, Table
+    from attnwarp_eval.document.numbers import number
+
+    def ratio(value: Ratio) -> str:
+        return f"{number(value.ratio)} [{number(value.low)}, {number(value.high)}]"
+
+    sections = []
+    for question, title in TITLES.items():
+        selected = [panel for panel in panels if panel.question == question]
+        if not selected:
+            continue
+        section = Section(title)
+        extra = {
+            "pictures": ["bias of the mean", "time for the same noise, ratio"],
+            "depth": ["median", "99 %", "off by more than 0.1 %"],
+            "visibility": ["wrong", "unanswered"],
+        }[question]
+        for panel in selected:
+            rows = []
+            for k, c in enumerate(panel.contestants):
+                value, low, high = c.error
+                shown = (
+                    number(value)
+                    if low == high
+                    else f"{number(value)} [{number(low)}, {number(high)}]"
+                )
+                if question == "pictures":
+                    more = [f"{100 * c.more['bias']:+.2f} % ± {196 * c.more['bias_error']:.2f}",
+                            "1" if k == 0 else ratio(panel.at_equal_error(k))]  # fmt: skip
+                elif question == "depth":
+                    more = [
+                        f"{c.more['median']:.1e}",
+                        f"{c.more['p99']:.1e}",
+                        f"{100 * c.more['wrong']:.2f} %",
+                    ]
+                    shown = f"{value:.1e}"
+                else:
+                    more = [f"{100 * c.more[key]:.1f} %" for key in ("wrong", "unanswered")]
+                    shown = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+                times = [
+                    number(1000 * float(np.median(c.seconds))),
+                    "1" if k == 0 else ratio(panel.ratio(k)),
+                ]
+                rows.append([c.name, shown, *more, *times])
+            blank = ["–"] * (1 + len(extra))
+            rows.append(
+                [
+                    "again",
+                    *blank,
+                    number(1000 * float(np.median(panel.again))),
+                    ratio(panel.ratio(None)),
+                ]
+            )
+            section.tables.append(
+                Table(["contestant", panel.unit, *extra, "ms", "time, ratio"], rows, panel.scene)
+            )
+        sections.append(section)
+    return sections

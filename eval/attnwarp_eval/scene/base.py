@@ -1,0 +1,95 @@
+"""What every part of a scene file is made of: the base of its models, colours, vectors."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    JsonValue,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
+
+from attnwarp_eval.colors import to_linear
+
+FARTHEST = 1e9
+"""Largest coordinate or length, in scene units. Float64 resolves 1e-7 there; the squares and
+products of much larger ones overflow the float32 of what renders them."""
+
+
+def _no_truth(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError(f"got {str(value).lower()}, expected a number")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_truth)]
+"""A number, which yes and true are not. YAML reads 1e3 as text, so that text of a number counts."""
+
+Coordinate = Annotated[Number, Field(ge=-FARTHEST, le=FARTHEST)]
+
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+
+Positive = Annotated[Number, Field(gt=0, le=FARTHEST)]
+
+Length = Annotated[Number, Field(ge=0, le=FARTHEST)]
+
+
+def _hex(value: Any) -> str:
+    if value is None:
+        raise ValueError(
+            "got nothing; an unquoted # starts a YAML comment, so write the colour in quotes:"
+            " '#c08040'"
+        )
+    text = str(value)
+    if len(text) != 7 or text[0] != "#" or any(c not in "0123456789abcdefABCDEF" for c in text[1:]):
+        raise ValueError(f"got {value!r}, expected an sRGB colour in quotes such as '#c08040'")
+    return text.lower()
+
+
+def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not any(value):
+        raise ValueError("got [0, 0, 0], expected a direction")
+    return value
+
+
+Direction = Annotated[Vector, AfterValidator(_direction)]
+"""A vector of any length but zero."""
+
+Color = Annotated[str, BeforeValidator(_hex)]
+
+
+def linear_rgb(color: str) -> tuple[float, float, float]:
+    """Linear RGB of an sRGB colour written '#rrggbb'."""
+    r, g, b = to_linear(np.array([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)]))
+    return float(r), float(g), float(b)
+
+
+LATER: dict[str, JsonValue] = {"later": True}
+"""``Field(default, json_schema_extra=LATER)``: a key that the format did not have at first. While
+it keeps its default it is left out of what is hashed, so that files written before it mean, and are
+called, what they always did."""
+
+
+class Spec(BaseModel):
+    """Base of everything a scene file says: unknown keys and numbers that are not finite are
+    refused.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True
+    )
+
+    @model_serializer(mode="wrap")
+    def _leave_out_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        said: dict[str, Any] = handler(self)
+        for name, about in type(self).model_fields.items():
+            if about.json_schema_extra == LATER and getattr(self, name) == about.default:
+                said.pop(name, None)
+        return said

@@ -1,0 +1,363 @@
+"""glTF 2.0 in one binary file (.glb): the triangles of its scene, and what of it is not used."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from attnwarp_eval.scene.meshes.surface import Array, Indices, Surface, clip
+
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+READ = ("KHR_mesh_quantization",)
+"""Required extensions that change the geometry and are read."""
+
+LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "KHR_animation_")
+"""Beginnings of the names of extensions that no geometry depends on."""
+
+MOST_VERTICES = 30_000_000
+"""Each node may repeat a mesh, so that a small file can mean any number of vertices."""
+
+POINTS, LINES, TRIANGLES, STRIP, FAN = 0, (1, 2, 3), 4, 5, 6
+
+
+class _Part(BaseModel):
+    """What is not listed plays no part for the geometry."""
+
+    model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
+
+    extensions: dict[str, Any] = {}
+
+
+Index = Field(ge=0, le=2**31)
+Number = float | int
+
+
+class _Asset(_Part):
+    version: str
+
+
+class _View(_Part):
+    buffer: int = Index
+    byteOffset: int = Field(0, ge=0)
+    byteLength: int = Field(ge=1)
+    byteStride: int | None = Field(None, ge=1, le=252)
+
+
+class _Accessor(_Part):
+    bufferView: int | None = Field(None, ge=0)
+    byteOffset: int = Field(0, ge=0)
+    componentType: int
+    normalized: bool = False
+    count: int = Field(ge=1)
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    sparse: dict[str, Any] | None = None
+
+
+class _Primitive(_Part):
+    attributes: dict[str, int]
+    indices: int | None = Field(None, ge=0)
+    material: int | None = None
+    mode: int = Field(4, ge=0, le=6)
+    targets: list[Any] = []
+
+
+class _Mesh(_Part):
+    primitives: list[_Primitive]
+
+
+class _Node(_Part):
+    children: list[int] = []
+    mesh: int | None = Field(None, ge=0)
+    skin: int | None = None
+    matrix: list[Number] | None = Field(None, min_length=16, max_length=16)
+    translation: list[Number] = Field([0, 0, 0], min_length=3, max_length=3)
+    rotation: list[Number] = Field([0, 0, 0, 1], min_length=4, max_length=4)
+    scale: list[Number] = Field([1, 1, 1], min_length=3, max_length=3)
+
+
+class _Scene(_Part):
+    nodes: list[int] = []
+
+
+class _Buffer(_Part):
+    byteLength: int = Field(ge=1)
+    uri: str | None = None
+
+
+class _Document(_Part):
+    asset: _Asset
+    extensionsUsed: list[str] = []
+    extensionsRequired: list[str] = []
+    scene: int = Field(0, ge=0)
+    scenes: list[_Scene] = []
+    nodes: list[_Node] = []
+    meshes: list[_Mesh] = []
+    accessors: list[_Accessor] = []
+    bufferViews: list[_View] = []
+    buffers: list[_Buffer] = []
+    textures: list[Any] = []
+    materials: list[Any] = []
+    animations: list[Any] = []
+
+
+def read_glb(data: bytes) -> Surface:
+    """The triangles of a .glb file's scene, with the transforms of its nodes (glTF 2.0, chapters
+    3 and 4).
+
+    Raises:
+        ValueError: lengths or indices that cannot be, data outside the file, or a required
+            extension that is not read, which is named.
+    """
+    head, binary = _chunks(data)
+    try:
+        document = _Document.model_validate(json.loads(head))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(map(str, first["loc"])) or "the document"
+        raise ValueError(f"glTF: {place}: {first['msg']}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"glTF: damaged JSON: {' '.join(str(error).split())}") from error
+    return _Reader(document, binary).surface()
+
+
+def _chunks(data: bytes) -> tuple[bytes, bytes]:
+    if len(data) < 20 or data[:4] != b"glTF":
+        raise ValueError("begins with no glTF header")
+    version, length = struct.unpack("<II", data[4:12])
+    if version != 2:
+        raise ValueError(f"glTF of version {version}, expected 2")
+    if length != len(data):
+        raise ValueError(f"announces {length} bytes, but has {len(data)}")
+    chunks, start = [], 12
+    while start < len(data):
+        if start + 8 > len(data):
+            raise ValueError("ends within a chunk's header")
+        size, kind = struct.unpack("<I4s", data[start : start + 8])
+        if start + 8 + size > len(data):
+            raise ValueError(f"a chunk announces {size} bytes, but the file ends before")
+        chunks.append((kind, data[start + 8 : start + 8 + size]))
+        start += 8 + size
+    if chunks[0][0] != b"JSON":
+        raise ValueError("its first chunk is no JSON")
+    return chunks[0][1], next((chunk for kind, chunk in chunks[1:] if kind == b"BIN\0"), b"")
+
+
+class _Reader:
+    """One document with its binary chunk."""
+
+    def __init__(self, document: _Document, binary: bytes) -> None:
+        self.document = document
+        self.binary = binary
+        self.ignored: Counter[str] = Counter()
+
+    def surface(self) -> Surface:
+        self._check_extensions()
+        vertices, faces, tints = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], []
+        count, seen = 0, {"materials": False, "skins": False, "morph targets": False}
+        for node, pose in self._nodes():
+            if node.mesh is None:
+                continue
+            seen["skins"] |= node.skin is not None
+            for primitive in self._item("meshes", node.mesh).primitives:
+                seen["materials"] |= primitive.material is not None
+                seen["morph targets"] |= bool(primitive.targets)
+                if (part := self._primitive(primitive, pose)) is None:
+                    continue
+                points, triangles, tint = part
+                vertices.append(points)
+                faces.append(triangles + count)
+                tints.append(tint)
+                count += len(points)
+                if count > MOST_VERTICES:
+                    raise ValueError(f"glTF: its nodes make more than {MOST_VERTICES:,} vertices")
+        words = [f"{number} primitives of {kind}" for kind, number in self.ignored.items()]
+        for name, number in (
+            ("textures", len(self.document.textures)),
+            ("animations", len(self.document.animations)),
+        ):
+            if number:
+                words.append(f"{number} {name}")
+        words += [name for name, present in seen.items() if present]
+        tint = None
+        if any(t is not None for t in tints):
+            tint = np.concatenate(
+                [
+                    np.ones_like(p) if t is None else t
+                    for p, t in zip(vertices[1:], tints, strict=True)
+                ]
+            )
+        corners = np.concatenate(faces).ravel()
+        return Surface(
+            np.concatenate(vertices),
+            corners,
+            np.full(len(corners) // 3, 3, np.int64),
+            tint,
+            tuple(words),
+        )
+
+    def _check_extensions(self) -> None:
+        required = set(self.document.extensionsRequired)
+        # Copies of a mesh are geometry, whether or not a reader has to know them.
+        required |= {"EXT_mesh_gpu_instancing"} & set(self.document.extensionsUsed)
+        for name in sorted(required):
+            if name not in READ and not name.startswith(LOOKS):
+                raise ValueError(
+                    f"needs the glTF extension {clip(name)}, which is not read; export it without"
+                )
+
+    def _item(self, kind: str, index: int) -> Any:
+        items = getattr(self.document, kind)
+        if not 0 <= index < len(items):
+            raise ValueError(f"glTF: names item {index} of {kind}, but there are {len(items)}")
+        return items[index]
+
+    def _nodes(self) -> Iterator[tuple[_Node, Array]]:
+        """The nodes of the scene, each with its (4, 4) pose in the world."""
+        document = self.document
+        if document.scenes:
+            roots = self._item("scenes", document.scene).nodes
+        else:
+            children = {child for node in document.nodes for child in node.children}
+            roots = [k for k in range(len(document.nodes)) if k not in children]
+        waiting = [(k, np.eye(4)) for k in reversed(roots)]
+        visited: set[int] = set()
+        while waiting:
+            index, above = waiting.pop()
+            node = self._item("nodes", index)
+            if index in visited:
+                raise ValueError(f"glTF: node {index} is reached twice, expected a tree")
+            visited.add(index)
+            pose = above @ _pose(node)
+            if not np.isfinite(pose).all():
+                raise ValueError(f"glTF: the transform of node {index} is not finite")
+            yield node, pose
+            waiting += [(child, pose) for child in reversed(node.children)]
+
+    def _primitive(
+        self, primitive: _Primitive, pose: Array
+    ) -> tuple[Array, Indices, Array | None] | None:
+        if primitive.mode == POINTS or primitive.mode in LINES:
+            self.ignored["points" if primitive.mode == POINTS else "lines"] += 1
+            return None
+        if "POSITION" not in primitive.attributes:
+            self.ignored["no position"] += 1
+            return None
+        points = self._values(primitive.attributes["POSITION"], "VEC3")
+        if primitive.indices is None:
+            order = np.arange(len(points), dtype=np.int64)
+        else:
+            order = self._indices(primitive.indices, len(points))
+        triangles = _triangles(order, primitive.mode)
+        tint = None
+        if "COLOR_0" in primitive.attributes:
+            tint = self._values(primitive.attributes["COLOR_0"], "VEC3", "VEC4")[:, :3]
+            if len(tint) != len(points) or not ((tint >= 0) & (tint <= 1)).all():
+                raise ValueError("glTF: COLOR_0 is not a colour from 0 to 1 for each vertex")
+        if np.linalg.det(pose[:3, :3]) < 0:
+            triangles = triangles[:, ::-1]  # a mirror turns triangles over
+        return points @ pose[:3, :3].T + pose[:3, 3], triangles, tint
+
+    def _indices(self, index: int, vertices: int) -> Indices:
+        order = self._raw(index, "SCALAR")
+        if order.dtype.kind != "u":
+            raise ValueError(f"glTF: accessor {index} holds indices, but no unsigned integers")
+        if len(order) and order.max() >= vertices:
+            raise ValueError(f"a face names vertex {int(order.max())}, but its part has {vertices}")
+        return order[:, 0].astype(np.int64)
+
+    def _values(self, index: int, *kinds: str) -> Array:
+        raw = self._raw(index, *kinds)
+        values = raw.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError(f"glTF: accessor {index} holds numbers that are not finite")
+        if self._item("accessors", index).normalized and raw.dtype.kind in "iu":
+            # Section 3.11: the least signed number means -1 as its neighbour does.
+            values = np.maximum(values / np.iinfo(raw.dtype).max, -1.0)
+        return values
+
+    def _raw(self, index: int, *kinds: str) -> npt.NDArray[Any]:
+        accessor = self._item("accessors", index)
+        if accessor.type not in kinds or accessor.componentType not in COMPONENTS:
+            raise ValueError(
+                f"glTF: accessor {index} is {accessor.type} of type {accessor.componentType},"
+                f" expected {' or '.join(kinds)}"
+            )
+        if accessor.sparse is not None:
+            raise ValueError(f"glTF: accessor {index} is sparse, which is not read")
+        kind, width = np.dtype(COMPONENTS[accessor.componentType]), WIDTHS[accessor.type]
+        if accessor.bufferView is None:
+            raise ValueError(
+                f"glTF: accessor {index} has no data"
+                " (compressed by an extension that is not read?); export it without"
+            )
+        view = self._item("bufferViews", accessor.bufferView)
+        buffer = self._item("buffers", view.buffer)
+        if view.buffer or buffer.uri is not None:
+            raise ValueError("glTF: keeps data outside its binary chunk; export it as one .glb")
+        end = view.byteOffset + view.byteLength
+        size = kind.itemsize * width
+        stride = view.byteStride or size
+        last = accessor.byteOffset + stride * (accessor.count - 1) + size
+        if stride < size or last > view.byteLength or end > len(self.binary):
+            raise ValueError(f"glTF: accessor {index} reaches beyond its data")
+        return np.ndarray(
+            (accessor.count, width),
+            kind,
+            self.binary,
+            view.byteOffset + accessor.byteOffset,
+            (stride, kind.itemsize),
+        )
+
+
+def _pose(node: _Node) -> Array:
+    if node.matrix is not None:
+        return np.array([_float(x) for x in node.matrix]).reshape(4, 4).T
+    x, y, z, w = (_float(value) for value in node.rotation)
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not 0.99 < norm < 1.01:
+        raise ValueError(f"glTF: a node's rotation has length {norm:.3g}, expected 1")
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation * np.array([_float(value) for value in node.scale])
+    pose[:3, 3] = [_float(value) for value in node.translation]
+    return pose
+
+
+def _float(value: Number) -> float:
+    # JSON has whole numbers of any length and Python reads NaN; a scene has neither.
+    if isinstance(value, int) and abs(value) > 10**18:
+        raise ValueError("glTF: a node's transform holds a whole number of more than 18 digits")
+    if not math.isfinite(value) or abs(value) > 1e30:
+        raise ValueError(f"glTF: a node's transform holds {value:g}")
+    return float(value)
+
+
+def _triangles(order: Indices, mode: int) -> Indices:
+    if mode == TRIANGLES:
+        if len(order) % 3:
+            raise ValueError(f"glTF: {len(order)} corners do not make whole triangles")
+        return order.reshape(-1, 3)
+    if len(order) < 3:
+        raise ValueError(f"glTF: {len(order)} corners make no strip or fan")
+    if mode == STRIP:
+        out = np.stack([order[:-2], order[1:-1], order[2:]], axis=-1)
+        out[1::2] = out[1::2][:, [1, 0, 2]]  # every second triangle turns the other way
+        return out
+    return np.stack([order[1:-1], order[2:], np.full(len(order) - 2, order[0])], axis=-1)

@@ -1,0 +1,147 @@
+"""Wavefront OBJ: vertices with or without colours, and polygons."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+
+import numpy as np
+
+from attnwarp_eval.scene.meshes.surface import Surface, clip, decimal, polygons, unit_colors, whole
+
+UNUSED = frozenset(
+    [
+        "vn",
+        "vt",
+        "vp",
+        "g",
+        "o",
+        "s",
+        "mg",
+        "usemtl",
+        "mtllib",
+        "maplib",
+        "usemap",
+        "lod",
+        "bevel",
+        "c_interp",
+        "d_interp",
+        "shadow_obj",
+        "trace_obj",
+        "ctech",
+        "stech",
+        "deg",
+        "cstype",
+        "bmat",
+        "step",
+        "parm",
+        "trim",
+        "hole",
+        "scrv",
+        "sp",
+        "end",
+        "con",
+        "call",
+        "csh",
+    ]
+)
+"""Keywords that move no polygon."""
+
+NOT_SURFACES = {"l": "lines", "p": "points", "curv": "curves", "curv2": "curves",
+                "surf": "free-form surfaces"}  # fmt: skip
+
+STATED = re.compile(r"#\s*(?:number of )?(vertices|faces|triangles)\s*:\s*(\d{1,18})\s*", re.I)
+"""The comment in which MeshLab and Open3D state how much a file holds."""
+
+
+def read_obj(data: bytes) -> Surface:
+    """The polygons of an OBJ file (Wavefront's Advanced Visualizer manual, appendix B).
+
+    Raises:
+        ValueError: a line that cannot be read, a vertex that is not there, or fewer vertices or
+            faces than the file's own comment states.
+    """
+    text = data.decode("latin-1")  # names and comments come in any encoding
+    vertices: list[list[float]] = []
+    colors: list[list[float]] = []
+    faces: list[list[int]] = []
+    ignored: Counter[str] = Counter()
+    stated: dict[str, list[int]] = {}
+    materials = False
+    number, pending = 0, ""
+    for number, raw in enumerate(text.splitlines(), 1):
+        line = pending + raw
+        if line.endswith("\\"):
+            pending = line[:-1] + " "
+            continue
+        pending = ""
+        if match := STATED.fullmatch(line.strip()):
+            stated.setdefault(match[1].lower(), []).append(int(match[2]))
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        key, rest = words[0], words[1:]
+        if key == "v":
+            if len(rest) not in (3, 4, 6, 7, 8):
+                raise ValueError(f"line {number}: a vertex has {len(rest)} numbers, expected 3")
+            values = [decimal(word, number) for word in rest]
+            vertices.append(values[:3])
+            if len(values) >= 6:
+                colors.append(values[3:6])
+        elif key in ("f", "fo"):
+            faces.append(_face(rest, len(vertices), number))
+        elif key in NOT_SURFACES:
+            ignored[NOT_SURFACES[key]] += 1
+        elif key in UNUSED:
+            materials |= key == "usemtl"
+        else:
+            raise ValueError(f"line {number}: got the keyword {clip(key)}, which OBJ does not have")
+    if pending:
+        raise ValueError(f"line {number}: ends in a continuation that does not come")
+    _check_stated(stated, len(vertices), len(faces))
+    words_ignored = [f"{count} {name}" for name, count in ignored.items()]
+    if materials:
+        words_ignored.append("materials and their textures")
+    tint = None
+    if colors and len(colors) == len(vertices):
+        tint = unit_colors(np.array(colors))
+    elif colors:
+        words_ignored.append(f"colours of {len(colors)} of {len(vertices)} vertices")
+    corners, sizes = polygons(faces)
+    cut_off = None if text.endswith(("\n", "\r")) else "its last line has no end"
+    return Surface(
+        np.array(vertices).reshape(-1, 3), corners, sizes, tint, tuple(words_ignored), cut_off
+    )
+
+
+def _face(words: list[str], vertices: int, line: int) -> list[int]:
+    if len(words) < 3:
+        raise ValueError(f"line {line}: a face has {len(words)} corners, expected at least 3")
+    face = []
+    for word in words:
+        parts = word.split("/")
+        if len(parts) > 3:
+            raise ValueError(f"line {line}: got {clip(word)}, expected v, v/vt, v//vn or v/vt/vn")
+        for part in parts[1:]:
+            if part:
+                whole(part, line)
+        index = whole(parts[0], line)
+        # Counted from 1; a negative one counts back from the vertices so far.
+        index = index - 1 if index > 0 else vertices + index if index < 0 else -1
+        if index < 0:
+            raise ValueError(
+                f"line {line}: a face names vertex {clip(parts[0])}, but there are {vertices}"
+            )
+        face.append(index)
+    return face
+
+
+def _check_stated(stated: dict[str, list[int]], vertices: int, faces: int) -> None:
+    for name, counts in stated.items():
+        count = vertices if name == "vertices" else faces
+        # Several such comments are one for each part of the file.
+        if len(counts) == 1 and counts[0] != count:
+            raise ValueError(
+                f"its own comment states {counts[0]} {name}, but it holds {count}; the file is"
+                " damaged, or the comment is to be corrected"
+            )

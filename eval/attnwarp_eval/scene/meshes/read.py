@@ -1,0 +1,146 @@
+"""The door for mesh files: the format by its suffix, checks that all formats share, and counts."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from attnwarp_eval.scene.base import FARTHEST
+from attnwarp_eval.scene.meshes.glb import read_glb
+from attnwarp_eval.scene.meshes.obj import read_obj
+from attnwarp_eval.scene.meshes.off import read_off
+from attnwarp_eval.scene.meshes.ply import read_ply
+from attnwarp_eval.scene.meshes.polygons import triangulate
+from attnwarp_eval.scene.meshes.stl import read_stl
+from attnwarp_eval.scene.shapes import Mesh, MeshNotice
+
+READER_PROTOCOL = 2
+"""Raised whenever the same file would give other triangles or colours; part of the hash of scenes
+with mesh files."""
+
+# No .gltf: it keeps its vertices in another file, which a hash of its own bytes would not see.
+READERS = {
+    ".ply": read_ply,
+    ".obj": read_obj,
+    ".glb": read_glb,
+    ".stl": read_stl,
+    ".off": read_off,
+}
+MESH_SUFFIXES = tuple(READERS)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """A mesh with what became of its file.
+
+    Attributes:
+        mesh: the triangles.
+        polygons: how many the file holds.
+        crossed: polygons left out because they cross themselves.
+        flat: triangles left out because they have no area.
+        unused: vertices that no polygon names.
+        ignored: what else the file holds and nobody uses, in words.
+        cut_off: why polygons may be missing at the file's end, or None.
+    """
+
+    mesh: Mesh
+    polygons: int
+    crossed: int
+    flat: int
+    unused: int
+    ignored: tuple[str, ...]
+    cut_off: str | None
+
+    def __str__(self) -> str:
+        left_out = [
+            f"{count} {what}"
+            for count, what in (
+                (self.crossed, "polygons that cross themselves"),
+                (self.flat, "triangles without area"),
+                (self.unused, "vertices of no polygon"),
+            )
+            if count
+        ]
+        return (
+            f"{self.polygons} polygons in, {len(self.mesh.faces)} triangles out"
+            + (f"; left out: {', '.join(left_out)}" if left_out else "")
+            + (f"; not used: {', '.join(self.ignored)}" if self.ignored else "")
+            + (f"; {self.cut_off}, so that its end may be missing" if self.cut_off else "")
+        )
+
+
+def read_mesh(path: Path) -> Mesh:
+    """A triangle mesh from a file (.ply, .obj, .glb, .stl, .off), all its parts joined.
+
+    Vertex colours, where the file has them, become the tint (taken as sRGB, but linear in .glb, as
+    that format defines). What is left out is said by a :class:`~attnwarp_eval.scene.shapes
+    .MeshNotice`, with its number.
+
+    Raises:
+        ValueError: the format is not known, or the file is damaged or holds no triangles.
+    """
+    return read_mesh_file(path).mesh
+
+
+def read_mesh_file(path: Path) -> MeshFile:
+    """:func:`read_mesh` with the counts of what came in and out."""
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ValueError(
+            f"{path}: mesh format {path.suffix!r} is not read; use one of"
+            f" {', '.join(MESH_SUFFIXES)}"
+        )
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    try:
+        surface = reader(data)
+        if not len(surface.sizes):
+            raise ValueError("holds no triangles (a point cloud?); export it as a mesh")
+        outside = (surface.corners < 0) | (surface.corners >= len(surface.vertices))
+        if outside.any():
+            raise ValueError(
+                f"a face names vertex {int(surface.corners[outside][0])}, but there are"
+                f" {len(surface.vertices)}"
+            )
+        named = np.zeros(len(surface.vertices), dtype=bool)
+        named[surface.corners] = True
+        bad = np.flatnonzero(named & ~np.isfinite(surface.vertices).all(axis=1))
+        if bad.size:
+            raise ValueError(f"vertex {int(bad[0])} is not finite")
+        reach = np.abs(surface.vertices[named]).max(axis=1)
+        if reach.max() > FARTHEST:
+            raise ValueError(
+                f"vertex {int(np.flatnonzero(named)[reach.argmax()])} lies {reach.max():.3g} from"
+                f" the origin, expected at most {FARTHEST:g}"
+            )
+        unused = int((~named).sum())
+        if surface.cut_off and unused:
+            raise ValueError(
+                f"{surface.cut_off}, and {unused} of {len(named)} vertices belong to no face, so"
+                " that its end seems to be missing"
+            )
+        faces, crossed = triangulate(surface.vertices, surface.corners, surface.sizes)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}; repair or export the file again") from error
+    if not len(faces):
+        raise ValueError(f"{path}: all {len(crossed)} polygons cross themselves; repair the file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MeshNotice)  # said below, with all else
+        mesh = Mesh(surface.vertices, faces, None, surface.tint).cleaned(str(path))
+    result = MeshFile(
+        mesh,
+        len(surface.sizes),
+        len(crossed),
+        len(faces) - len(mesh.faces),
+        unused,
+        surface.ignored,
+        surface.cut_off,
+    )
+    if result.crossed or result.flat or result.unused or result.ignored or result.cut_off:
+        warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
+    return result

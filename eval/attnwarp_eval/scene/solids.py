@@ -1,0 +1,441 @@
+"""Signed-distance bodies: their parts, the distance, and the mesh that a body becomes.
+
+A body's mesh, not its distance function, is the truth that everything is measured against.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.scene.shapes import Mesh, MeshNotice
+from attnwarp_eval.scene.textures import fractal_noise
+
+Array = npt.NDArray[np.float64]
+
+MESHING_PROTOCOL = 2
+"""Raised whenever the same description of a body would give other vertices; part of every cache
+key.
+"""
+
+BLOCK = 8
+"""Lattice points along the side of the blocks that are sampled, or left out, together."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What every part of a body has.
+
+    Attributes:
+        color: linear RGB.
+        blend: True to join it to the parts before it in the body's own width, False for a sharp
+            joint, or a width.
+        carve: it is taken away from the blended parts before it.
+    """
+
+    color: tuple[float, float, float] = field(default=(1.0, 1.0, 1.0), kw_only=True)
+    blend: bool | float = field(default=True, kw_only=True)
+    carve: bool = field(default=False, kw_only=True)
+
+    def row(self) -> list[float]:
+        """What the kernels read: kind, mode (0 sharp, 1 blended, 2 carved), width (negative for the
+        body's), shape.
+        """
+        mode = 2.0 if self.carve else float(bool(self.blend))
+        width = -1.0 if isinstance(self.blend, bool) else float(self.blend)
+        shape = [*self._shape(), *([0.0] * 13)]
+        return [self._kind(), mode, width, *shape[:13]]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        raise TypeError(f"{type(self).__name__} says no reach")
+
+    def _kind(self) -> float:
+        raise TypeError(f"{type(self).__name__} says no kind")
+
+    def _shape(self) -> list[float]:
+        raise TypeError(f"{type(self).__name__} says no shape")
+
+
+def _turn(yaw: float, pitch: float, roll: float) -> list[float]:
+    a = np.radians([pitch, yaw, roll])
+    return [float(f(x)) for x in a for f in (np.cos, np.sin)]
+
+
+@dataclass(frozen=True)
+class Ellipsoid(_Part):
+    """An ellipsoid with its ``radii`` along its own x, y, z: rolled about x, pitched about y, then
+    turned about z.
+    """
+
+    center: tuple[float, float, float]
+    radii: tuple[float, float, float]
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 0.0
+
+    def _shape(self) -> list[float]:
+        return [*self.center, *self.radii, *_turn(self.yaw, self.pitch, self.roll)]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), max(self.radii)
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Capsule(_Part):
+    """A rod from ``start`` to ``end`` whose radius goes from ``radii[0]`` to ``radii[1]``."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radii: tuple[float, float]
+
+    def _kind(self) -> float:
+        return 1.0
+
+    def _shape(self) -> list[float]:
+        return [*self.start, *self.end, *self.radii]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        ends, r = np.array([self.start, self.end]), max(self.radii)
+        return np.stack([ends.min(0) - r, ends.max(0) + r])
+
+
+@dataclass(frozen=True)
+class Torus(_Part):
+    """A ring of radius ``radii[0]``, ``radii[1]`` thick, about its own z; turned as an
+    :class:`Ellipsoid` is.
+    """
+
+    center: tuple[float, float, float]
+    radii: tuple[float, float]
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 2.0
+
+    def _shape(self) -> list[float]:
+        return [*self.center, *self.radii, 0.0, *_turn(self.yaw, self.pitch, self.roll)]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), sum(self.radii)
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Block(_Part):
+    """A box of ``size`` along its own x, y, z with edges rounded by ``round``; turned as an
+    :class:`Ellipsoid` is.
+    """
+
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    round: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 3.0
+
+    def _shape(self) -> list[float]:
+        half = (x / 2 - self.round for x in self.size)
+        return [*self.center, *half, *_turn(self.yaw, self.pitch, self.roll), self.round]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), float(np.linalg.norm(self.size)) / 2
+        return np.stack([c - r, c + r])
+
+
+@dataclass(frozen=True)
+class Disc(_Part):
+    """An upright cylinder of ``radius`` and ``height``, edges rounded by ``round``; turned as an
+    Ellipsoid is.
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+    height: float
+    round: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll: float = 0.0
+
+    def _kind(self) -> float:
+        return 4.0
+
+    def _shape(self) -> list[float]:
+        shape = [self.radius - self.round, self.height / 2 - self.round, 0.0]
+        return [*self.center, *shape, *_turn(self.yaw, self.pitch, self.roll), self.round]
+
+    def reach(self) -> Array:
+        """(2, 3) box that holds the part."""
+        c, r = np.asarray(self.center), math.hypot(self.radius, self.height / 2)
+        return np.stack([c - r, c + r])
+
+
+Part = Ellipsoid | Capsule | Torus | Block | Disc
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Noise that moves a body's surface out and in by up to ``depth``, with features of
+    ``size``."""
+
+    depth: float
+    size: float
+    octaves: int = 3
+    seed: int = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _part_distance(x: float, y: float, z: float, part: Array) -> float:
+    x, y, z = x - part[3], y - part[4], z - part[5]
+    if part[0] == 1.0:
+        # Capsule: distance from the segment, less the radius there.
+        bx, by, bz = part[6] - part[3], part[7] - part[4], part[8] - part[5]
+        length = bx * bx + by * by + bz * bz
+        along = min(max((x * bx + y * by + z * bz) / length, 0.0), 1.0) if length > 0 else 0.0
+        gap = math.sqrt((x - along * bx) ** 2 + (y - along * by) ** 2 + (z - along * bz) ** 2)
+        return gap - (part[9] + along * (part[10] - part[9]))
+    # Into the part's own axes: back by the yaw, the pitch and the roll.
+    x, y = part[11] * x + part[12] * y, part[11] * y - part[12] * x
+    x, z = part[9] * x - part[10] * z, part[10] * x + part[9] * z
+    y, z = part[13] * y + part[14] * z, part[13] * z - part[14] * y
+    if part[0] == 0.0:
+        # Ellipsoid: |q|(|q| - 1) / |q / r| with q = p / r, a bound of the distance (Quilez,
+        # "ellipsoid - distance").
+        qx, qy, qz = x / part[6], y / part[7], z / part[8]
+        k0 = math.sqrt(qx * qx + qy * qy + qz * qz)
+        k1 = math.sqrt((qx / part[6]) ** 2 + (qy / part[7]) ** 2 + (qz / part[8]) ** 2)
+        return k0 * (k0 - 1) / k1 if k1 > 0 else -min(part[6], part[7], part[8])
+    if part[0] == 2.0:
+        return math.sqrt((math.sqrt(x * x + y * y) - part[6]) ** 2 + z * z) - part[7]
+    if part[0] == 3.0:
+        dx, dy, dz = abs(x) - part[6], abs(y) - part[7], abs(z) - part[8]
+        out = math.sqrt(max(dx, 0.0) ** 2 + max(dy, 0.0) ** 2 + max(dz, 0.0) ** 2)
+        return out + min(max(dx, dy, dz), 0.0) - part[15]
+    dr, dz = math.sqrt(x * x + y * y) - part[6], abs(z) - part[7]
+    return math.sqrt(max(dr, 0.0) ** 2 + max(dz, 0.0) ** 2) + min(max(dr, dz), 0.0) - part[15]
+
+
+@numba.njit(cache=True, nogil=True)
+def _body_distance(points: Array, parts: Array, blend: float) -> Array:
+    out = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        soft, hard = np.inf, np.inf
+        for k in range(parts.shape[0]):
+            d = _part_distance(points[i, 0], points[i, 1], points[i, 2], parts[k])
+            width = blend if parts[k, 2] < 0 else parts[k, 2]
+            if parts[k, 1] == 0.0:
+                hard = min(hard, d)
+            elif parts[k, 1] == 2.0:
+                # What is carved is the smooth maximum with the part turned inside out.
+                if width > 0 and soft < np.inf:
+                    h = min(max(0.5 + 0.5 * (-soft - d) / width, 0.0), 1.0)
+                    soft = -(-soft + h * (d + soft) - width * h * (1 - h))
+                else:
+                    soft = max(soft, -d)
+            elif width > 0 and soft < np.inf:
+                h = min(max(0.5 + 0.5 * (soft - d) / width, 0.0), 1.0)
+                soft = soft + h * (d - soft) - width * h * (1 - h)
+            else:
+                soft = min(soft, d)
+        out[i] = min(soft, hard)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _part_distances(points: Array, parts: Array) -> Array:
+    out = np.empty((parts.shape[0], points.shape[0]))
+    for k in range(parts.shape[0]):
+        for i in range(points.shape[0]):
+            out[k, i] = _part_distance(points[i, 0], points[i, 1], points[i, 2], parts[k])
+    return out
+
+
+def _table(parts: Sequence[Part]) -> Array:
+    if not parts:
+        raise ValueError("parts: got an empty list, expected at least one part")
+    return np.array([part.row() for part in parts], dtype=np.float64)
+
+
+def body_distance(
+    parts: Sequence[Part], blend: float, points: npt.ArrayLike, relief: Relief | None = None
+) -> Array:
+    """Signed distance bound of a body, negative inside.
+
+    Parts with ``blend`` are joined by Quilez' polynomial smooth minimum of width ``blend`` or their
+    own; the others (eyes, a nose) are joined sharply. A part that carves is taken away from the
+    blended ones before it.
+
+    Args:
+        parts: at least one.
+        blend: width of the joints in scene units, 0 for sharp ones.
+        points: (N, 3).
+        relief: noise added to the distance.
+
+    Returns:
+        (N,) float64.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    distance = _body_distance(points, _table(parts), float(blend))
+    if relief is not None:
+        near = np.flatnonzero(np.abs(distance) < 4 * relief.depth)
+        noise = fractal_noise(points[near] / relief.size, relief.octaves, relief.seed)
+        distance[near] += relief.depth * (1 - 2 * noise)
+    return distance
+
+
+def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
+    distances = _part_distances(points, _table(parts))
+    # A sharp part owns its whole surface; blended parts share their colours across the joint.
+    solid = [not part.carve for part in parts]
+    nearest = distances[solid].min(0)
+    weights = np.exp(-np.clip(distances - nearest, 0, None) / max(width, 1e-12))
+    for k, part in enumerate(parts):
+        if part.carve:
+            weights[k] = 0
+        # A cut without a colour of its own shows that of what was cut.
+        if not part.blend or (part.carve and part.color != (1.0, 1.0, 1.0)):
+            mine = (np.abs(distances[k]) if part.carve else distances[k]) < 1e-3 * width + 1e-9
+            weights[:, mine] = 0
+            weights[k, mine] = 1
+    colors = np.array([part.color for part in parts])
+    return (weights.T @ colors) / weights.sum(0)[:, None]
+
+
+def mesh_body(
+    parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None = None
+) -> Mesh:
+    """The body's surface as triangles: marching cubes, then Newton steps onto the zero of the
+    distance.
+
+    Args:
+        parts, blend, relief: see :func:`body_distance`.
+        resolution: cells along the longest side of the bounding box.
+
+    Returns:
+        A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by
+        content.
+    """
+    # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours
+    # are no part of
+    # it: a body painted otherwise is the same mesh.
+    bare = [replace(part, color=(1.0, 1.0, 1.0)) for part in parts]
+    key = content_key(
+        "body", MESHING_PROTOCOL, [repr(part) for part in bare], blend, resolution, repr(relief)
+    )
+    stored = read_arrays("meshes", key)
+    if stored is None:
+        stored = _march(parts, blend, resolution, relief)
+        write_arrays("meshes", key, stored)
+    step = _lattice_of(parts, resolution)[2]
+    tint = _part_colors(parts, max(blend, step) / 3, stored["vertices"])
+    return Mesh(stored["vertices"], stored["faces"], stored["normals"], tint)
+
+
+def _lattice_of(parts: Sequence[Part], resolution: int) -> tuple[Array, Array, float]:
+    reach = np.stack([part.reach() for part in parts if not part.carve])
+    low, high = reach[:, 0].min(0), reach[:, 1].max(0)
+    return low, high, float((high - low).max() / resolution)
+
+
+def _march(
+    parts: Sequence[Part], blend: float, resolution: int, relief: Relief | None
+) -> dict[str, npt.NDArray]:
+    from skimage.measure import marching_cubes
+
+    low, high, step = _lattice_of(parts, resolution)
+    depth = relief.depth if relief else 0.0
+    low, high = low - 2 * step - blend / 4 - depth, high + 2 * step + blend / 4 + depth
+
+    def distance(points: Array) -> Array:
+        return body_distance(parts, blend, points, relief)
+
+    counts = np.ceil((high - low) / step).astype(int) + 1
+    axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
+    volume = _sample(axes, distance, depth)
+    if volume.min() >= 0:
+        raise ValueError(
+            f"body: no part is thick enough to be seen at resolution {resolution}; raise it"
+        )
+    vertices, faces, _, _ = marching_cubes(
+        volume, 0.0, spacing=(step,) * 3, gradient_direction="ascent"
+    )
+    vertices = vertices.astype(np.float64) + low
+
+    def gradient(points: Array) -> Array:
+        e = 1e-4 * step
+        shifts = np.eye(3) * e
+        return np.stack(
+            [(distance(points + s) - distance(points - s)) / (2 * e) for s in shifts], axis=-1
+        )
+
+    for _ in range(2):
+        g = gradient(vertices)
+        move = distance(vertices) / np.maximum((g**2).sum(-1), 1e-12)
+        # Half a cell at most, so that creases, where the gradient jumps, cannot fold the mesh.
+        vertices = vertices - g * np.clip(move, -0.5 * step, 0.5 * step)[:, None]
+    normals = gradient(vertices)
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    mesh = Mesh(vertices, faces[:, ::-1].astype(np.int64))
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    outward = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[mesh.faces[:, 0]])
+    if np.median(outward) < 0:
+        mesh = replace(mesh, faces=mesh.faces[:, ::-1].copy())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MeshNotice)  # marching cubes makes slivers by design
+        mesh = mesh.cleaned("body")
+    return {
+        "vertices": mesh.vertices,
+        "faces": np.ascontiguousarray(mesh.faces),
+        "normals": normals,
+    }
+
+
+def _sample(axes: list[Array], distance: Callable[[Array], Array], depth: float) -> Array:
+    """The distance at every point of a lattice near its zero; farther off, the right sign.
+
+    Blocks of the lattice whose middle is farther from the surface than they reach, with half as
+    much to spare since the distance is only a bound, take the middle's value: no triangle comes
+    from them.
+    """
+    step = float(axes[0][1] - axes[0][0])
+    volume = np.empty([len(axis) for axis in axes])
+    starts = [np.arange(0, len(axis), BLOCK) for axis in axes]
+    middles = np.meshgrid(
+        *(axis[0] + step * (s + (BLOCK - 1) / 2) for axis, s in zip(axes, starts, strict=True)),
+        indexing="ij",
+    )
+    coarse = distance(np.stack(middles, -1).reshape(-1, 3)).reshape(middles[0].shape)
+    reach = 1.5 * step * BLOCK * math.sqrt(3) / 2 + depth
+    for i, x0 in enumerate(starts[0]):
+        xs = slice(x0, x0 + BLOCK)
+        for j, y0 in enumerate(starts[1]):
+            ys = slice(y0, y0 + BLOCK)
+            row = np.repeat(coarse[i, j], BLOCK)[: len(axes[2])]
+            volume[xs, ys] = row
+            near = np.flatnonzero(np.repeat(np.abs(coarse[i, j]) <= reach, BLOCK)[: len(axes[2])])
+            if near.size:
+                points = np.stack(
+                    np.meshgrid(axes[0][xs], axes[1][ys], axes[2][near], indexing="ij"), -1
+                )
+                volume[xs, ys, near] = distance(points.reshape(-1, 3)).reshape(points.shape[:-1])
+    return volume

@@ -1,0 +1,224 @@
+"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.plan` plans them.
+
+Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else
+``scalar_rgb``, which works
+everywhere: see :mod:`attnwarp_eval.truth.llvm`.
+
+Mitsuba computes in float32, so the scene is moved to the middle of its bounding box in float64
+first. Its cameras look along +z with +x to the left and +y up: OpenCV axes are turned by diag(-1,
+-1, 1).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth.llvm import SCALAR, variant
+from attnwarp_eval.truth.mitsuba.build import (
+    library,
+    load_sensor,
+    load_world,
+    owner_of_number,
+    texel_size,
+)
+from attnwarp_eval.truth.plan import Pass, Plan, plan, sampler, smooth_objects
+from attnwarp_eval.truth.raycast import Geometry
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+
+APPEARANCE_PROTOCOL = 2
+"""Raised whenever the same scene, camera, plan and seed would give another picture."""
+
+
+def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
+    """What ``camera`` sees, in linear RGB.
+
+    Args:
+        camera: square pixels and no skew; any principal point.
+        spp: samples a pixel; the scene's own number if left out.
+        seed: the same seed gives the same bits.
+
+    Returns:
+        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel.
+        Kept on disk, see :mod:`attnwarp_eval.cache`.
+
+    Raises:
+        ValueError: a camera that Mitsuba cannot express.
+    """
+    import mitsuba
+
+    planned = plan(scene, spp)
+    pose = {name: value for name, value in camera.to_dict().items() if name != "name"}
+    key = content_key(
+        "appearance",
+        APPEARANCE_PROTOCOL,
+        mitsuba.__version__,
+        variant(),
+        scene.world_hash,
+        texel_size(scene),
+        # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
+        (
+            scene.spec.cameras.model_dump(mode="json", exclude={"size"})
+            if planned.lens or planned.media
+            else None
+        ),
+        pose,
+        planned.identity(),
+        int(seed),
+    )
+    stored = read_arrays("appearance", key)
+    if stored is None:
+        stored = {"image": render_plan(scene, camera, planned, seed)}
+        write_arrays("appearance", key, stored)
+    return stored["image"]
+
+
+def render_plan(
+    scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None
+) -> Image:
+    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is
+    kept.
+
+    Args:
+        made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
+        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads
+            add them to pixels in any order, which shows in the last bits of float32.
+    """
+    library(made_by or variant())
+    total = _render_passes(scene, camera, plan, seed)
+    for again in range(1, ATTEMPTS):
+        broken = ~np.isfinite(total).all(-1)
+        if not broken.any():
+            break
+        total[broken] = _render_passes(scene, camera, plan, seed + again * OTHER_SEEDS)[broken]
+    return total
+
+
+ATTEMPTS, OTHER_SEEDS = 4, 1_000_003
+"""A sample that float32 could not compute (such as a ray along a surface) makes its pixel NaN; the
+pixel is then rendered again with other seeds, which biases it by nothing that a rejected sample
+would not."""
+
+
+def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image:
+    mi = library()
+    total = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
+    for number, step in enumerate(plan.passes):
+        options: dict[str, Any] = {"type": step.integrator}
+        if step.integrator == "direct":
+            options |= {"emitter_samples": step.emitter_samples, "bsdf_samples": step.bsdf_samples}
+        else:
+            # Without an end a path still needs a number there; Mitsuba's is -1.
+            options |= {"max_depth": step.max_depth, "rr_depth": step.rr_depth}
+        if step.integrator == "ptracer":
+            # Lamps, seen directly, are the other pass's.
+            options |= {"hide_emitters": True}
+        world, center, fog = load_world(scene, step.lights, step.lamps, plan.media, step.beam)
+        pass_seed = len(plan.passes) * int(seed) + number
+        if step.first != "any":
+            total += step.sign * _part(
+                scene, camera, plan, step, options, pass_seed, (world, center, fog)
+            )
+            continue
+        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
+        # stratify.
+        kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
+        sensor = load_sensor(
+            scene,
+            camera,
+            center,
+            {"type": kind, "sample_count": step.spp},
+            world,
+            plan,
+            fog if plan.media else None,
+        )
+        picture = mi.render(world, sensor=sensor, integrator=mi.load_dict(options), seed=pass_seed)
+        total += step.sign * np.array(picture, dtype=np.float32)[..., :3]
+    return total
+
+
+def _part(
+    scene: Scene,
+    camera: Camera,
+    plan: Plan,
+    step: Pass,
+    options: dict[str, Any],
+    seed: int,
+    loaded: tuple[Any, Array, Any],
+) -> Image:
+    """What the camera rays see that meet something smooth, a lamp or nothing first, or else all the
+    others; zero elsewhere.
+
+    Each camera ray gets a pixel of its own in a picture of
+    k x k cells a pixel, so that the index of the shape it met first tells which of the two it
+    belongs to.
+    """
+    mi = library()
+    world, center, fog = loaded
+    k = max(1, math.isqrt(step.spp))
+    fine = camera.resize(camera.width * k, camera.height * k)
+    lamps = [number for number, item in enumerate(scene.spec.objects) if item.emission]
+    smooth = np.isin(owner_of_number(scene, world), [-1, *smooth_objects(scene), *lamps])
+    if step.first == "rough":
+        smooth = ~smooth
+    integrator = mi.load_dict({"type": "aov", "aovs": "first:shape_index", "seen": options})
+    total = np.zeros((fine.height, fine.width, 3), dtype=np.float64)
+    each = math.ceil(step.spp / k**2)
+    for number in range(each):
+        sensor = load_sensor(
+            scene, fine, center, {"type": "independent", "sample_count": 1}, world, plan, fog
+        )
+        picture = np.array(
+            mi.render(world, sensor=sensor, integrator=integrator, seed=seed * 64 + number, spp=1)
+        )
+        keep = smooth[np.round(picture[..., 3]).astype(np.int64)]
+        total += np.where(keep[..., None], picture[..., :3], 0.0)
+    return (
+        (total / each).reshape(camera.height, k, camera.width, k, 3).mean((1, 3)).astype(np.float32)
+    )
+
+
+def comparable(scene: Scene) -> str:
+    """The variant in which renderings of the source by different integrators can be held against
+    each other.
+
+    Where surfaces coincide it is up to the ray tracer which one is seen. With ``llvm_ad_rgb`` that
+    depends on how an integrator shoots its rays, in packets or one by one; with ``scalar_rgb`` on
+    the scene alone.
+    """
+    if variant() == SCALAR:
+        return SCALAR
+    tied, _ = Geometry(scene).ties(scene.source)
+    return SCALAR if tied.any() else variant()
+
+
+def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray[np.int64]]:
+    """What Mitsuba's own ray tracer hits at the pixel centres, to hold the exact geometry against.
+
+    Returns:
+        position: (H, W, 3) world, float32 precision about the scene's middle; NaN where nothing is
+            hit.
+        object_id: (H, W) index of the object, -1 where nothing is hit.
+    """
+    mi = library(variant())
+    world, center, _ = load_world(scene, (), False, False)
+    integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
+    # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
+    # lie nowhere.
+    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
+    sensor = load_sensor(scene, camera, center, middles, world, Plan((), ()), None)
+    picture = np.array(
+        mi.render(world, sensor=sensor, integrator=integrator, spp=1), dtype=np.float64
+    )
+    shape = np.round(picture[..., 3]).astype(np.int64)
+    position = np.where((shape > 0)[..., None], picture[..., :3] + center, np.nan)
+    return position, owner_of_number(scene, world)[shape]

@@ -1,0 +1,82 @@
+"""The graph of a scene as Mitsuba parsed and loaded it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth.llvm import variant
+from attnwarp_eval.truth.mitsuba.build import (
+    cached,
+    interior,
+    library,
+    light_form,
+    load_sensor,
+    load_shapes,
+    load_world,
+    medium_form,
+    plugin_names,
+    texel_size,
+)
+from attnwarp_eval.truth.plan import plan
+
+
+def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
+    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as
+    loaded.
+    """
+    mi = library(variant())
+    everything = tuple(range(len(scene.spec.lights)))
+    world, center, fog = load_world(scene, everything, True, True)
+    forms, _, plugins = cached(
+        (mi.variant(), scene.world_hash, texel_size(scene)),
+        lambda: load_shapes(scene, texel_size(scene)),
+    )
+    names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}
+    parsed = [
+        (where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n)
+        for where, n in plugins
+    ]
+    for k in everything:
+        parsed += plugin_names(f"lights[{k}]", light_form(scene.spec.lights[k], center))
+    for k, item in enumerate(scene.spec.objects):
+        inside = interior(item)
+        if inside is not None:
+            parsed += plugin_names(f"objects[{k}].interior", medium_form(inside))
+    if scene.spec.medium is not None:
+        parsed += plugin_names("medium.interior", medium_form(scene.spec.medium))
+    middles = {"type": "stratified", "sample_count": 1, "jitter": False}
+    sensor = load_sensor(scene, scene.source, center, middles, world, plan(scene, 1), fog)
+    parsed.append(
+        ("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective"))
+    )
+    loaded = [
+        (
+            names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]) :],
+            thing,
+        )
+        for where, thing in _walk(world)
+    ]
+    return parsed, loaded
+
+
+def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
+    """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
+    it.
+    """
+    mi = library()
+    found: list[tuple[str, Any]] = []
+
+    class Visit(mi.TraversalCallback):  # type: ignore[name-defined]
+        def put(self, name: str, value: Any, *_: Any) -> None:
+            if isinstance(value, mi.Object):
+                found.append((where + name, value))
+                found.extend(_walk(value, f"{where}{name}."))
+
+        put_object = put
+
+        def put_value(self, name: str, value: Any, *_: Any) -> None:
+            """Numbers are of no interest here."""
+
+    thing.traverse(Visit())
+    return found

@@ -1,0 +1,132 @@
+"""YAML from people: what cannot be meant is refused in one line, with its place, at once."""
+
+import pytest
+from mutate import mutate_bytes, mutate_text, survey
+
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import SceneError
+from attnwarp_eval.scene.yaml import DEEPEST, MOST_VALUES, YamlError, read_yaml
+
+BOMB = "a: &a [1, 2, 3, 4, 5, 6, 7, 8, 9]\n" + "".join(
+    f"{name}: &{name} [{', '.join(['*' + above] * 9)}]\n"
+    for above, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+SCENE = """\
+name: small
+title: A ball on a floor
+objects:
+  - name: floor
+    shape: {type: rectangle, center: [0, 0, 0], size: [8, 8]}
+    texture: {type: checker, colors: ['#ffffff', '#404040'], size: 0.5}
+  - name: ball
+    shape: {type: sphere, center: [0, 0, 0.5], radius: 0.5}
+    texture: {type: noise, colors: ['#1f2a52', '#5c7fc4'], size: 0.3}
+  - name: post
+    shape: {type: box, center: [1, 1, 0.5], size: [0.2, 0.2, 1], yaw: 20, repeat: {count: 3, step: [0, 1, 0]}}
+    texture: {type: plain, color: '#c04020'}
+lights:
+  - {type: sun, elevation: 48, azimuth: -55, irradiance: 2.6, color: '#fff1dc'}
+  - {type: sky, horizon: '#cfdcea', zenith: '#6f9fd8', radiance: 0.7}
+appearance: {bounces: 1, spp: 8}
+cameras:
+  look_at: [0, 0, 0.5]
+  radius: 3
+  fov: 45
+  size: [64, 64]
+  source: {yaw: 0, height: 1.5}
+  targets:
+    - {yaw: 30, height: 1}
+edits:
+  - name: blue
+    instruction: Make it blue
+    source: a ball
+    target: a blue ball
+    changes: [{object: ball, recolor: {'#5c7fc4': '#2040c0'}}]
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("a: 1\n[b, c]: 2\n", 2, "a key is a list or a mapping"),
+        ("a: 1\n? {b: c}\n: 2\n", 2, "a key is a list or a mapping"),
+        ("a: 1\nb: {c: 1, c: 2}\n", 2, "the key 'c' stands here and on line 2"),
+        ("a:\n  - 2024-99-99\n", 2, "'2024-99-99' is no timestamp"),
+        ("a: 1\nb: !!int 'x'\n", 2, "'x' is no int"),
+        ("a: !!float 'x'\n", 1, "'x' is no float"),
+        ("a: !!bool 'x'\n", 1, "'x' is no bool"),
+        ("a: !!timestamp 'x'\n", 1, "'x' is no timestamp"),
+        ("a: !!python/object:os.system x\n", 1, "could not determine a constructor"),
+        (f"a: 1\nb: {'7' * 5000}\n", 2, "'7777777.* is no int"),
+        ("a: " + "[" * 5000 + "]" * 5000, 1, f"nested deeper than {DEEPEST} levels"),
+        ("a: " + "{b: " * 5000 + "1" + "}" * 5000, 1, f"nested deeper than {DEEPEST} levels"),
+        ("a: &x [1, *x]\n", 1, r"\*x stands for what it is part of"),
+        ("a: &x\n  b: {c: *x}\n", 2, r"\*x stands for what it is part of"),
+        (BOMB, 6, f"means more than {MOST_VALUES:,} values"),
+        ("a: *x\n", 1, "found undefined alias 'x'"),
+        ('a: "\\UFFFFFFFF"\n', None, "not valid YAML"),
+        ("a: \x07\n", None, "not valid YAML: .*special characters"),
+        ("a: [1\nb: 2\n", 2, "check indentation and quotes"),
+        ("", None, "the file is empty"),
+        ("#" * (2**20 + 1), None, "has 1,048,577 characters"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_its_line(text, line, message):
+    with pytest.raises(YamlError, match=message) as caught:
+        read_yaml(text)
+    assert caught.value.line == line and "\n" not in str(caught.value)
+
+
+def test_aliases_that_repeat_little_mean_what_they_repeat():
+    _, data = read_yaml("a: &a [1, 2]\nb: [*a, *a]\nc: {<<: {d: 4}, e: *a}\n")
+    assert data == {"a": [1, 2], "b": [[1, 2], [1, 2]], "c": {"d": 4, "e": [1, 2]}}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("radius: 3", "radius: yes", r"small.yaml:19: cameras.radius: got true, expected a number"),
+        ("radius: 3", "radius: 1e30", r"small.yaml:19: cameras.radius: got '1e30', but input"),
+        ("radius: 3", "radius: !!int x", "small.yaml:19: 'x' is no int"),
+        ("radius: 3", f"radius: [{'1, ' * 5000}1]", r"radius: got \[1, 1, 1, 1, 1, 1, \.\.\.\]"),
+    ],
+)
+def test_a_scene_names_what_cannot_be_meant_on_one_short_line(tmp_path, old, new, message):
+    path = tmp_path / "small.yaml"
+    path.write_text(SCENE.replace(old, new, 1))
+    with pytest.raises(SceneError, match=message) as caught:
+        load_scene(path)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
+
+
+def loaded(case):
+    path, data = case
+    path.write_bytes(data)
+    scene = load_scene(path)
+    assert scene.cameras and scene.content_hash and scene.shapes()
+
+
+def survey_scenes(folder, count):
+    path = folder / "small.yaml"
+    cases = [
+        (f"text {seed}", (path, mutate_text(SCENE, seed).encode("utf-8", "surrogatepass")))
+        for seed in range(count)
+    ]
+    cases += [
+        (f"bytes {seed}", (path, mutate_bytes(SCENE.encode(), seed))) for seed in range(count // 4)
+    ]
+    outcomes = survey(cases, loaded, refusals=(SceneError,))
+    assert not [outcome for outcome in outcomes if outcome.failed]
+    return [outcome.kind for outcome in outcomes]
+
+
+def test_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
+    loaded((tmp_path / "small.yaml", SCENE.encode()))
+    kinds = survey_scenes(tmp_path, 32)
+    assert len(kinds) == 40 and kinds.count("refused") > 15
+
+
+@pytest.mark.slow
+def test_many_damaged_scenes_are_refused_in_one_line_or_are_scenes(tmp_path):
+    assert len(survey_scenes(tmp_path, 320)) == 400

@@ -1,0 +1,115 @@
+"""Oracles: the file system, the standard library's JSON reader, Pillow."""
+
+import io
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from attnwarp.io.file import ABANDONED_SECONDS, remove_abandoned, write_atomically
+from attnwarp.io.picture import encode_picture
+from attnwarp_eval import files
+
+WRITER = """
+import sys, time
+from attnwarp.io.file import write_atomically
+def write(stream):
+    stream.write(b"half")
+    stream.flush()
+    print("writing", flush=True)
+    time.sleep(60)
+write_atomically(sys.argv[1], write)
+"""
+
+
+def test_numbers_that_json_lacks_become_null_and_all_others_stay():
+    value = {"a": [1, 2.5, math.nan], "b": (math.inf, -math.inf), "c": np.float32(0.5), "d": None}
+    plain = files.without_nan(value)
+    assert plain == {"a": [1, 2.5, None], "b": [None, None], "c": 0.5, "d": None}
+    assert json.loads(files.canonical_json(plain)) == plain
+    assert files.without_nan({"n": np.int64(3), "t": True}) == {"n": 3, "t": True}
+    assert type(files.without_nan(np.int64(3))) is int
+
+
+def test_json_is_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "a.json"
+    files.write_json(path, {"b": 1, "a": [1.5]})
+    assert json.loads(path.read_text()) == {"a": [1.5], "b": 1}
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        files.write_json(path, math.nan)
+    assert json.loads(path.read_text()) == {"a": [1.5], "b": 1}
+    assert [p.name for p in path.parent.iterdir()] == ["a.json"]
+
+
+def test_pictures_read_back_as_pillow_reads_them(tmp_path):
+    image = np.random.default_rng(0).random((7, 9, 3))
+    image[0, 0], image[0, 1] = (-1, 0.5, 2), (0, 1, 0.25)
+    expected = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    path = files.write_picture(tmp_path / "deep" / "a.png", image)
+    assert np.array_equal(np.asarray(Image.open(path)), expected)
+    assert encode_picture(expected) == path.read_bytes()
+    smooth = np.full((16, 16, 3), (0.2, 0.5, 0.7))
+    for chroma, layers in (("444", (1, 1)), ("420", (2, 2))):
+        data = encode_picture(smooth, ".jpg", quality=88, chroma=chroma)
+        read = Image.open(io.BytesIO(data))
+        assert read.layer[0][1:3] == layers  # Pillow: (component, horizontal, vertical, table)
+        assert np.abs(np.asarray(read) / 255 - smooth).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("shape", "suffix", "words"),
+    [((4, 4), ".png", r"image: got shape \(4, 4\)"), ((4, 4, 3), ".gif", "suffix: got '.gif'")],
+)
+def test_pictures_of_another_shape_or_kind_are_refused(shape, suffix, words):
+    with pytest.raises(ValueError, match=words):
+        encode_picture(np.zeros(shape), suffix)
+
+
+def test_what_a_killed_writer_leaves_is_removed_and_a_living_ones_stays(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+    command = [sys.executable, "-c", WRITER, str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
+        try:
+            assert writer.stdout.readline() == "writing\n"
+            (half,) = tmp_path.glob(".*.tmp")
+            assert half.read_bytes() == b"half" and path.read_bytes() == b"old"
+            assert remove_abandoned(tmp_path) == 0 and half.exists()
+        finally:
+            writer.send_signal(signal.SIGKILL)
+            writer.wait()
+    assert remove_abandoned(tmp_path) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]
+
+
+def test_files_of_other_machines_go_after_a_day_and_those_of_other_programs_never(tmp_path):
+    token = "0" * 32
+    names = [f".a.00000000-1-{token}.tmp", f".b.00000000-1-{token}.tmp", ".vim.tmp", "c.tmp"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"x")
+    then = time.time() - ABANDONED_SECONDS - 60
+    for name in names[1:]:
+        os.utime(tmp_path / name, (then, then))
+    assert remove_abandoned(tmp_path) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([names[0], *names[2:]])
+
+
+def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path):
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"old")
+
+    def fails(stream):
+        stream.write(b"new")
+        raise OSError("no")
+
+    for durable in (True, False):
+        with pytest.raises(OSError, match="no"):
+            write_atomically(path, fails, durable=durable)
+    assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
