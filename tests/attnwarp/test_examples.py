@@ -17,6 +17,7 @@ MODULES = [
     "attnwarp.fit.start",
     "attnwarp.fit.views",
     "attnwarp.io.dataset",
+    "attnwarp.io.file",
     "attnwarp.io.folder",
     "attnwarp.io.images",
     "attnwarp.io.lens",
