@@ -291,7 +291,7 @@ class _Reader:
 
 def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
     reader = _Reader(path)
-    intrinsics = {}
+    intrinsics: dict[int, _Intrinsics] = {}
     for i in reader.entries("camera"):
         camera, model, width, height = reader.take("IiQQ")
         if model not in MODELS:
@@ -356,7 +356,7 @@ def _damaged(path: Path, number: int, line: str, expected: str) -> FileFormatErr
 
 
 def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
-    intrinsics = {}
+    intrinsics: dict[int, _Intrinsics] = {}
     for number, line in _text_lines(path):
         if not line:
             continue
