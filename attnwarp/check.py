@@ -1,6 +1,4 @@
-"""Checks at the public doors: return the value unchanged, or say which argument, what came, what
-was expected.
-"""
+"""Checks at the public doors, whose errors say which argument, what came and what was expected."""
 
 from __future__ import annotations
 
@@ -21,6 +19,13 @@ def shape(
     """Raise ValueError unless ``value`` has the ``expected`` shape.
 
     An int must match; None or a string (a name for the reader, such as "N") matches any length.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import check
+        >>> check.shape(np.zeros((5, 2)), ("N", 3), "points")
+        Traceback (most recent call last):
+        ValueError: points: got shape (5, 2), expected (N, 3)
     """
     actual = tuple(value.shape)
     fits = len(actual) == len(expected) and all(
@@ -37,9 +42,9 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
     array = value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
     bad = ~np.isfinite(array)
     if bad.any():
-        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(
-            f"{name}: {array[where]} at index {where}; {int(bad.sum())} of {array.size} values are"
+            f"{name}: {array[index]} at index {index}; {int(bad.sum())} of {array.size} values are"
             " not finite"
         )
 

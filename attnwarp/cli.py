@@ -200,9 +200,7 @@ def fit(
     data: Annotated[
         Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
     ],
-    out: Annotated[
-        Path, typer.Option(help="Folder for the result; a fit found in it is gone on with.")
-    ],
+    out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
     kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids.")] = Kind.two,
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Steps, one view each (default 7000).")
@@ -222,19 +220,19 @@ def fit(
     hold_out: Annotated[
         int, typer.Option(min=0, help="Hold out one view of so many; 0: none.")
     ] = 8,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     change: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; see docs/fitting.md."),
     ] = None,
     checkpoint_seconds: Annotated[
-        float, typer.Option(min=0, help="Write what there is so often.")
+        float, typer.Option(min=0, help="Seconds between two checkpoints.")
     ] = 30.0,
     threads: Annotated[
         int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
     ] = None,
     restart: Annotated[
-        bool, typer.Option("--restart", help="Begin again, whatever is in the folder.")
+        bool, typer.Option("--restart", help="Begin again without the checkpoint.")
     ] = False,
     third_scale: Annotated[
         float | None,
@@ -255,17 +253,15 @@ def fit(
         _check_out(out)
         _check_third_scale(third_scale, kind)
         _use_threads(threads)
-        dataset = _read_views(
-            data,
-            format=format,
-            images=images,
-            missing_images=missing_images,
-            resize_cameras=resize_cameras,
-            ignore_keys=ignore_key or [],
-        )
         result = _fit(
-            dataset,
             data,
+            {
+                "format": format,
+                "images": images,
+                "missing_images": missing_images,
+                "resize_cameras": resize_cameras,
+                "ignore_keys": ignore_key or [],
+            },
             out,
             kind,
             iterations,
@@ -301,8 +297,8 @@ def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
 
 
 def _fit(
-    dataset: Dataset,
     data: Path,
+    reading: dict[str, Any],
     out: Path,
     kind: Kind,
     iterations: int | None,
@@ -332,6 +328,7 @@ def _fit(
     from attnwarp.fit.progress import progress_display
 
     settings = fitting.FitSettings.from_dict(changes)
+    dataset = _read_views(data, **reading)
     train, test = fitting.hold_out(dataset, every)
     views = fitting.load_views(train, max_size=max_size)
     held_out = fitting.load_views(test, max_size=max_size) if test is not None else None

@@ -31,13 +31,25 @@ SSIM_C2 = 0.03**2
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of two (H, W, C) pictures."""
+    """Mean absolute difference of two (H, W, C) pictures.
+
+    Example:
+        >>> import torch
+        >>> l1(torch.zeros(2, 2, 3), torch.full((2, 2, 3), 0.25))
+        tensor(0.2500)
+    """
     _same(image, target)
     return (image - target).abs().mean()
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two pictures in [0, 1]; infinite when they are equal."""
+    """Peak signal-to-noise ratio in dB of two pictures in [0, 1]; infinite when they are equal.
+
+    Example:
+        >>> import torch
+        >>> psnr(torch.zeros(1, 1, 3), torch.full((1, 1, 3), 0.5)) - 20 * math.log10(2)
+        0.0
+    """
     _same(image, target)
     error = float((image.detach().double() - target.detach().double()).square().mean())
     return psnr_of_mse(error)
@@ -65,6 +77,12 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: different shapes, or a picture smaller than the window, for which it is
             undefined.
+
+    Example:
+        >>> import torch
+        >>> picture = torch.rand(16, 16, 3)
+        >>> bool(ssim(picture, picture) > 0.999999)
+        True
     """
     return ssim_map(image, target).mean()
 

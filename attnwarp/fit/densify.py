@@ -1,5 +1,4 @@
-"""Where splats are added and removed: the published strategy of 3DGS (adaptive density control),
-for both kinds.
+"""Adaptive density control (3DGS), for both kinds: where splats are added and removed.
 
 Splats whose position on screen the loss wants to change strongly are too few or too large there:
 small ones are cloned, large ones split in two. Splats that are nearly transparent or far too large
@@ -76,12 +75,12 @@ class Density:
         means = model.tensors["means"]
         if means.grad is None:
             return
-        shown = weight > 0
+        visible = weight > 0
         length = screen_gradient(
             means.grad, means.detach(), camera, gaussians.origin, self.settings.near * self.extent
         )
-        self.total += torch.where(shown, length, 0.0)
-        self.seen += shown
+        self.total += torch.where(visible, length, 0.0)
+        self.seen += visible
 
     def active(self, iteration: int) -> bool:
         """Whether splats may still be added after so many iterations."""

@@ -1,6 +1,4 @@
-"""The fit itself: one view an iteration, until the iterations, the time or the patience are used
-up.
-"""
+"""The optimisation loop: one view an iteration, until iterations, time or patience end."""
 
 from __future__ import annotations
 
@@ -125,8 +123,8 @@ def fit(
     """Fit splats to posed pictures.
 
     With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every
-    ``checkpoint_seconds`` and at the end, each atomically; a fit found there is taken up where it
-    was, and then gives the same bits as one that was never interrupted (on the same machine, with
+    ``checkpoint_seconds`` and at the end, each atomically. A fit whose checkpoint is there is
+    resumed, and gives the same bits as one that was never interrupted (on the same machine, with
     the same number of torch threads).
 
     Args:
@@ -191,13 +189,12 @@ def fit(
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
     if folder is not None:
         Path(folder).mkdir(parents=True, exist_ok=True)
-        run.take_up(Path(folder))
+        run.resume(Path(folder))
     return run.go(max_seconds, checkpoint_seconds, watch, stop)
 
 
 class _Run:
-    """A fit in progress: everything that the next iteration depends on, and how to write it
-    down."""
+    """A fit in progress: everything that the next iteration depends on."""
 
     def __init__(
         self,
@@ -233,7 +230,7 @@ class _Run:
             "origin": [float(v) for v in self.model.origin],
         }
 
-    def take_up(self, folder: Path) -> None:
+    def resume(self, folder: Path) -> None:
         self.folder = folder
         path = folder / CHECKPOINT
         if not path.exists():

@@ -18,9 +18,7 @@ Tensor = torch.Tensor
 NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
 SMALLEST, LARGEST = 1e-7, 1e3
-"""Scales stay within these shares of the extent: beyond, they would leave float32 and show nothing.
-
-"""
+"""Scales stay within these shares of the extent: beyond, they would leave float32."""
 
 EPSILON = 1e-15
 """Adam's (3DGS): gradients of a mean over pixels are tiny, and must not be taken for noise."""

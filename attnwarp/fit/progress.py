@@ -1,4 +1,4 @@
-"""How a fit stands, for people: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of a fit for people: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ def progress_display(
     )
     from rich.table import Column
 
-    where = console or Terminal(stderr=True)
-    if not where.is_terminal:
-        yield _lines(where, title)
+    target = console or Terminal(stderr=True)
+    if not target.is_terminal:
+        yield _lines(target, title)
         return
     # On a narrow terminal the figures go over two lines rather than the counts losing their digits.
     columns = (
@@ -59,7 +59,7 @@ def progress_display(
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[figures]}", markup=False, table_column=Column(no_wrap=False)),
     )
-    with Progress(*columns, console=where) as bar:
+    with Progress(*columns, console=target) as bar:
         task = bar.add_task(title, total=None, figures="")
 
         def update(step: Step) -> None:

@@ -1,6 +1,4 @@
-"""Everything that decides what a fit computes. The published numbers, and where they had to be
-changed, why.
-"""
+"""Settings of a fit: the published numbers, and reasons where others are used."""
 
 from __future__ import annotations
 
@@ -73,6 +71,14 @@ class FitSettings:
 
     Raises:
         ValueError: a number out of range or an unknown choice; the message names the field.
+
+    Example:
+        >>> from attnwarp.fit import FitSettings
+        >>> FitSettings(kind="3d").opacity_floor
+        0.005
+        >>> FitSettings(ssim=2)
+        Traceback (most recent call last):
+        ValueError: ssim: got 2, expected a number in [0, 1]
     """
 
     kind: Kind = "2d"

@@ -58,6 +58,12 @@ def from_points(
     Raises:
         ValueError: no points, a wrong shape or dtype, a coordinate that is not finite, a degree out
             of range.
+
+    Example:
+        >>> from attnwarp.fit import from_points
+        >>> start = from_points([[0, 0, 0], [1, 0, 0], [0, 1, 0]], kind="3d", sh_degree=0)
+        >>> start.world_means().tolist()
+        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
     from scipy.spatial import cKDTree
 

@@ -18,9 +18,7 @@ from attnwarp.camera import Camera
 from attnwarp.io import Dataset, FileFormatError, read_image
 
 HELD_OUT_EVERY = 8
-"""Where a data set names no split, one image of so many is held out (the field's habit since LLFF).
-
-"""
+"""One image of so many is held out where a data set names no split (LLFF's habit)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +34,14 @@ class Views:
     Raises:
         ValueError: lists of different lengths, a picture of another size than its camera's, a wrong
             dtype, values out of range; the message names the picture.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import Views
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=4, height=3, fov_y=40)
+        >>> len(Views([camera], [np.zeros((3, 4, 3), np.uint8)]))
+        1
     """
 
     cameras: Sequence[Camera]
@@ -96,8 +102,8 @@ class Views:
         ones."""
         total = hashlib.sha256()
         for camera, image in zip(self.cameras, self.images, strict=True):
-            said = {**camera.to_dict(), "name": "", "dtype": str(image.dtype), "shape": image.shape}
-            total.update(json.dumps(said, sort_keys=True).encode())
+            spec = {**camera.to_dict(), "name": "", "dtype": str(image.dtype), "shape": image.shape}
+            total.update(json.dumps(spec, sort_keys=True).encode())
             total.update(np.ascontiguousarray(image).tobytes())
         return total.hexdigest()
 
@@ -171,6 +177,18 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
 
     Raises:
         ValueError: the data set's splits leave nothing to fit on.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import hold_out
+        >>> from attnwarp.io import Dataset
+        >>> cameras = [
+        ...     Camera.look_at((3, i, 0), (0, 0, 0), width=4, height=3, fov_y=40, name=f"{i:02}")
+        ...     for i in range(9)
+        ... ]
+        >>> train, test = hold_out(Dataset(cameras, [None] * 9))
+        >>> len(train), [camera.name for camera in test.cameras]
+        (7, ['00', '08'])
     """
     if every < 0 or every == 1:
         raise ValueError(f"every: got {every}, expected 0 or at least 2")
@@ -186,5 +204,5 @@ def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Da
     out = set(order[::every]) if every else set()
     if not out or len(out) == len(dataset):
         return dataset, None
-    kept = [i for i in range(len(dataset)) if i not in out]
-    return dataset.select(kept), dataset.select(sorted(out))
+    train = [i for i in range(len(dataset)) if i not in out]
+    return dataset.select(train), dataset.select(sorted(out))

@@ -7,6 +7,7 @@ as it is.
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 from collections.abc import Iterator, Sequence
@@ -118,6 +119,9 @@ def read_colmap(
     poses = sorted((_binary_images if binary else _text_images)(source), key=lambda pose: pose.name)
     if not poses:
         raise FileFormatError(source, "holds no registered image; the reconstruction failed")
+    for one, two in itertools.pairwise(poses):
+        if one.name == two.name:
+            raise FileFormatError(source, f"image {one.name!r} stands twice; remove one")
     cameras: list[Camera] = []
     lenses: list[Lens | None] = []
     for pose in poses:
@@ -287,7 +291,7 @@ class _Reader:
 
 def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
     reader = _Reader(path)
-    intrinsics = {}
+    intrinsics: dict[int, _Intrinsics] = {}
     for i in reader.entries("camera"):
         camera, model, width, height = reader.take("IiQQ")
         if model not in MODELS:
@@ -299,8 +303,14 @@ def _binary_cameras(path: Path) -> dict[int, _Intrinsics]:
                 row=i,
             )
         name, count = MODELS[model]
+        _once(path, intrinsics, camera)
         intrinsics[camera] = _Intrinsics(name, width, height, reader.take(f"{count}d"))
     return intrinsics
+
+
+def _once(path: Path, intrinsics: dict[int, _Intrinsics], camera: int) -> None:
+    if camera in intrinsics:
+        raise FileFormatError(path, f"camera {camera} stands twice; remove one")
 
 
 def _binary_images(path: Path) -> list[_Pose]:
@@ -346,21 +356,22 @@ def _damaged(path: Path, number: int, line: str, expected: str) -> FileFormatErr
 
 
 def _text_cameras(path: Path) -> dict[int, _Intrinsics]:
-    intrinsics = {}
+    intrinsics: dict[int, _Intrinsics] = {}
     for number, line in _text_lines(path):
         if not line:
             continue
         fields = line.split()
         try:
-            camera, model, width, height, *params = fields
-            intrinsics[int(camera)] = _Intrinsics(
-                model, int(width), int(height), tuple(float(v) for v in params)
-            )
+            name, model, width, height, *params = fields
+            camera = int(name)
+            lens = _Intrinsics(model, int(width), int(height), tuple(float(v) for v in params))
         except ValueError as error:
             raise _damaged(path, number, line, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from error
         count = next((count for name, count in MODELS.values() if name == model), len(params))
         if len(params) != count:
             raise _damaged(path, number, line, f"{count} parameters for {model}")
+        _once(path, intrinsics, camera)
+        intrinsics[camera] = lens
     return intrinsics
 
 

@@ -49,6 +49,16 @@ class Dataset:
 
     Raises:
         ValueError: lists of different lengths, a wrong shape or dtype.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Dataset
+        >>> cameras = [
+        ...     Camera.look_at((3, i, 0), (0, 0, 0), width=4, height=3, fov_y=40) for i in range(3)
+        ... ]
+        >>> data = Dataset(cameras, [None] * 3, splits=["train", "train", "test"])
+        >>> len(data.split("train"))
+        2
     """
 
     cameras: list[Camera]

@@ -1,6 +1,4 @@
-"""What every reader and writer here shares: the error a bad file gets, and a write that cannot
-leave half a file.
-"""
+"""What readers and writers share: the error for a bad file, and a write that is whole or not."""
 
 from __future__ import annotations
 
@@ -12,6 +10,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -76,7 +75,8 @@ def write_atomically(
     """Call ``write`` on a temporary file beside ``path`` and rename it to ``path``.
 
     A reader, or a run that is killed, sees the old file or the new one and never a part. When
-    ``write`` raises, the old file stays and the temporary one is removed.
+    ``write`` raises, the old file stays and the temporary one is removed; that of a process that
+    was killed is removed by the next one that writes to the folder.
 
     Args:
         path: of the file; its folder must exist.
@@ -88,17 +88,17 @@ def write_atomically(
         FileNotFoundError: the folder does not exist.
         OSError: the disk is full, or the folder cannot be written to.
 
-    >>> import tempfile
-    >>> folder = tempfile.TemporaryDirectory()
-    >>> path = Path(folder.name) / "answer.txt"
-    >>> write_atomically(path, lambda stream: stream.write(b"42"))
-    >>> path.read_text()
-    '42'
-    >>> folder.cleanup()
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp.io.file import write_atomically
+        >>> write_atomically("a.txt", lambda stream: stream.write(b"whole"))
+        >>> Path("a.txt").read_text()
+        'whole'
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+    _sweep(path.parent.resolve(), os.getpid())
     # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner
     # alone.
     temporary = path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex}.tmp")
@@ -146,6 +146,15 @@ def remove_abandoned(folder: str | os.PathLike[str]) -> int:
     return removed
 
 
+@cache
+def _sweep(folder: Path, process: int) -> None:
+    """:func:`remove_abandoned`, once for a folder and a process: the cache remembers it."""
+    # A folder that cannot be listed may be written to all the same.
+    with contextlib.suppress(OSError):
+        remove_abandoned(folder)
+
+
+@cache
 def _host() -> str:
     """Eight hexadecimal digits of this machine's name."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]

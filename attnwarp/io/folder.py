@@ -51,6 +51,14 @@ def read_dataset(
     Raises:
         FileNotFoundError: nothing there that could be read.
         FileFormatError: both kinds are there, or what is there is damaged or not usable.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Dataset, read_dataset, write_transforms
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=8, height=6, fov_y=40, name="a")
+        >>> write_transforms(".", Dataset([camera], [None]))
+        >>> read_dataset(".", missing_images="none").cameras[0].position.round(9).tolist()
+        [3.0, 0.0, 0.0]
     """
     path = Path(path)
     if format is not None:

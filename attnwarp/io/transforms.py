@@ -301,8 +301,8 @@ def _read_file(
         lenses.append(lens)
         names.append(name)
         paths.append(image)
-    unknown = sorted({key for level in (data, *frames) for key in level} - USED - UNUSED)
-    unknown = [key for key in unknown if key not in CHANGES_THE_PICTURE]
+    keys = {key for level in (data, *frames) for key in level}
+    unknown = sorted(keys - USED - UNUSED - CHANGES_THE_PICTURE.keys())
     if unknown:
         warnings.warn(
             f"{path}: not used, as their meaning is not known: {', '.join(unknown)[:200]}",

@@ -36,6 +36,18 @@ def undistort(
     Raises:
         FileFormatError: a picture that cannot be read.
         ValueError: no camera has a picture, or a lens folds its picture over.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from PIL import Image
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Dataset, Lens, undistort
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=40, height=30, fov_y=60, name="a")
+        >>> Image.new("RGB", (40, 30)).save("a.png")
+        >>> bent = Dataset([camera], [Path("a.png")], lenses=[Lens("brown", (-0.1,))])
+        >>> flat = undistort(bent, "flat")
+        >>> flat.cameras[0].width, flat.lenses
+        (42, [None])
     """
     folder = Path(folder)
     dataset = dataset.select([i for i, path in enumerate(dataset.image_paths) if path is not None])

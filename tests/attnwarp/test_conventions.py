@@ -1,6 +1,8 @@
-"""One test for each line of docs/conventions.md, by numbers that can be worked out in the head."""
+"""Tests for each line of docs/conventions.md, by numbers that can be worked out in the head."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import render
-from attnwarp.warp import angle_between, correspond, in_bounds, resize_mask, sample
+from attnwarp.warp import angle_between, correspond, in_bounds, resize_mask, sample, sample_at
 
 IDENTITY = np.eye(4)
 
@@ -151,3 +153,140 @@ def test_angles_are_degrees():
     assert angle_between(
         torch.tensor([1.0, 0, 0]), torch.tensor([0, 2.0, 0])
     ).item() == pytest.approx(90)
+
+
+def test_a_poses_rotation_is_orthonormal_to_1e_5():
+    stretched = np.diag([1 + 4e-6, 1, 1, 1])  # max |R R^T - I| = 8e-6
+    Camera(camera().K, stretched, 8, 4)
+    with pytest.raises(ValueError, match="not orthonormal"):
+        Camera(camera().K, np.diag([1 + 6e-6, 1, 1, 1]), 8, 4)
+
+
+def test_fx_fy_skew_and_any_principal_point_are_used():
+    # x = 3/4, y = 1/2: u = 10 * 3/4 + 4 * 1/2 - 20, v = 20 * 1/2 + 50: outside of 8 x 4 px.
+    K = np.array([[10.0, 4, -20], [0, 20, 50], [0, 0, 1]])
+    skewed = Camera(K, IDENTITY, 8, 4)
+    xy, _ = skewed.project([1.5, 1.0, 2.0])
+    assert xy.tolist() == [-10.5, 60.0]
+    assert skewed.directions(xy).tolist() == [0.75, 0.5, 1.0]
+    # Resizing by 2 and 3 scales the first and the second row.
+    assert skewed.resize(16, 12).K.tolist() == [[20, 8, -40], [0, 60, 150], [0, 0, 1]]
+
+
+def test_a_picture_is_drawn_with_the_skew_and_the_principal_point():
+    # The centre of the splat, at (0, 0.2, 2), is at u = 4 * 0.1 + 3.1 = 3.5, v = 20 * 0.1 + 0.5 = 2.5.
+    K = np.array([[10.0, 4, 3.1], [0, 20, 0.5], [0, 0, 1]])
+    splat = one_splat(means=torch.tensor([[0.0, 0.2, 2.0]]), scales=torch.tensor([[0.02, 0.02]]))
+    alpha = render(splat, Camera(K, IDENTITY, 8, 5), backend="reference").alpha
+    assert divmod(int(alpha.argmax()), 8) == (2, 3)
+    far = Camera(np.array([[10.0, 0, 1003.5], [0, 10, 2.5], [0, 0, 1]]), IDENTITY, 8, 5)
+    aside = one_splat(means=torch.tensor([[-200.0, 0.0, 2.0]]))  # u = 10 * -100 + 1003.5 = 3.5
+    assert divmod(int(render(aside, far, backend="reference").alpha.argmax()), 8) == (2, 3)
+
+
+@pytest.mark.parametrize("depth", [0.0, -1.0, math.inf, math.nan])
+def test_depth_that_cannot_be_is_undefined(depth):
+    c = correspond(camera(1, 1), camera(1, 1), np.full((1, 1), depth))
+    assert not c.defined.any()
+
+
+def test_quaternions_have_any_length_but_zero():
+    long = one_splat(quats=torch.tensor([[0.0, 0, 0, 250.0]]))
+    assert long.rotations()[0].tolist() == [[-1, 0, 0], [0, -1, 0], [0, 0, 1]]
+    with pytest.raises(ValueError, match="zero quaternion"):
+        one_splat(quats=torch.zeros(1, 4))
+
+
+def test_normals_are_flipped_to_the_camera():
+    for quats in ([1.0, 0, 0, 0], [0.0, 1, 0, 0]):  # the second is turned upside down
+        seen = render(one_splat(quats=torch.tensor([quats])), camera(), backend="reference")
+        normal = seen.normal[2, 4] / seen.alpha[2, 4]
+        assert torch.allclose(normal, torch.tensor([0.0, 0, -1], dtype=normal.dtype), atol=1e-5)
+
+
+def test_features_are_read_at_their_own_size():
+    # 8 px become 2 columns: the centre of the first four pixels is column 0.5.
+    c = correspond(camera(), camera(), np.full((4, 8), 2.0))
+    features = torch.tensor([[[1.0, 3.0]]])
+    warped, _ = sample(features, c)
+    expected = [1 + 2 * min(max((j + 0.5) / 4 - 0.5, 0), 1) for j in range(8)]
+    np.testing.assert_allclose(warped[0, 0].numpy(), expected, atol=1e-6)
+
+
+def test_outside_takes_the_border_and_no_position_gives_zero():
+    right = Camera(camera().K, IDENTITY, 8, 4).moved((1.0, 0, 0))  # sees 5 px further
+    c = correspond(camera(), right, np.full((4, 8), 2.0))
+    warped, mask = sample(torch.arange(1.0, 9).repeat(4, 1)[None], c)
+    assert warped[0, 0, -1] == 8 and not mask[0, -1]
+    lost = correspond(camera(), camera(), np.full((4, 8), math.nan))
+    warped, mask = sample(torch.ones(1, 4, 8), lost)
+    assert (warped == 0).all() and not mask.any()
+
+
+def test_a_grid_of_half_precision_is_refused():
+    random = torch.Generator().manual_seed(0)
+    features = 1 + torch.rand(1, 4, 8, generator=random)
+    grid = 0.5 + torch.rand(9, 9, 2, generator=random) * torch.tensor([7.0, 3.0])
+    # The unit roundoff of each type: what one rounding at the end, and no more, may cost.
+    for dtype, unit in ((torch.float16, 2**-11), (torch.bfloat16, 2**-8)):
+        with pytest.raises(ValueError, match="half precision"):
+            sample_at(features, grid.to(dtype))
+        values = features.to(dtype)
+        exact = sample_at(values.double(), grid.double())
+        error = (sample_at(values, grid).double() - exact).abs() / exact
+        assert error.max() <= unit * (1 + 1e-4)
+
+
+def test_yaw_is_around_the_scene_from_the_source_and_folded():
+    from attnwarp_eval.scene.file import load_scene
+    from attnwarp_eval.world import World
+
+    world = World(load_scene("spheres"), 8)
+    assert len(world.yaw) > 3 and all(0 <= yaw <= 180 for yaw in world.yaw.values())
+
+    def azimuth(a):
+        x, y = (a.position - world.scene.center)[:2]
+        return math.degrees(math.atan2(y, x))
+
+    for name, yaw in world.yaw.items():
+        turn = abs(azimuth(world.targets[name]) - azimuth(world.source))
+        assert yaw == pytest.approx(min(turn, 360 - turn), abs=1e-6)
+
+
+PINNED = {
+    "camera axes": [test_axes_are_x_right_y_down_z_forward],
+    "pose": [
+        test_poses_are_float64_rigid_and_do_not_mirror,
+        test_a_poses_rotation_is_orthonormal_to_1e_5,
+    ],
+    "pixels": [test_the_centre_of_pixel_j_is_at_j_plus_a_half],
+    "resizing by s": [test_resizing_maps_u_to_u_times_s],
+    "principal point": [
+        test_fx_fy_skew_and_any_principal_point_are_used,
+        test_a_picture_is_drawn_with_the_skew_and_the_principal_point,
+    ],
+    "depth": [test_depth_is_along_the_axis_and_not_along_the_ray],
+    "distance": [test_depth_is_along_the_axis_and_not_along_the_ray],
+    "undefined depth": [test_undefined_depth_is_nan, test_depth_that_cannot_be_is_undefined],
+    "a point at or behind a camera": [test_a_point_behind_has_no_pixel],
+    "quaternions": [test_quaternions_are_wxyz, test_quaternions_have_any_length_but_zero],
+    "scales": [test_scales_are_linear_standard_deviations],
+    "splat normals": [test_normals_are_the_thin_axis, test_normals_are_flipped_to_the_camera],
+    "spherical harmonics": [test_harmonics_store_srgb_around_a_half],
+    "images": [test_features_are_channels_first_and_images_channels_last],
+    "world": [test_axes_are_x_right_y_down_z_forward, test_an_origin_keeps_far_worlds_exact],
+    "masks": [test_masks_are_true_where_a_pixel_counts],
+    "angles": [test_angles_are_degrees],
+    "yaw": [test_yaw_is_around_the_scene_from_the_source_and_folded],
+    "size of features": [test_features_are_read_at_their_own_size],
+    "outside the image": [test_outside_takes_the_border_and_no_position_gives_zero],
+    "no position": [test_outside_takes_the_border_and_no_position_gives_zero],
+    "half precision": [test_a_grid_of_half_precision_is_refused],
+}
+
+
+def test_every_line_of_the_page_is_pinned_by_a_test_here():
+    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text()
+    lines = re.findall(r"^\| ([^|]+?) \| [^|]", page, re.MULTILINE)
+    names = [line.replace("`", "") for line in lines if line not in ("what", "---")]
+    assert names == list(PINNED)

@@ -281,3 +281,19 @@ def test_a_folder_that_is_both_kinds_or_none_is_not_guessed(tmp_path):
         read_dataset(tmp_path, format="transforms")
     with pytest.raises(ValueError, match="format: got 'nerf'"):
         read_dataset(tmp_path, format="nerf")
+
+
+@pytest.mark.parametrize("write", [write_binary, write_text])
+def test_an_image_that_stands_twice_is_refused(tmp_path, write):
+    images = poses()
+    images[2] = (*images[2][:4], images[0][4], 0)
+    write(tmp_path, images=images)
+    with pytest.raises(FileFormatError, match=r"image 'b/second view.png' stands twice"):
+        read_dataset(tmp_path, missing_images="none")
+
+
+@pytest.mark.parametrize("write", [write_binary, write_text])
+def test_a_camera_that_stands_twice_is_refused(tmp_path, write):
+    write(tmp_path, cameras=[*CAMERAS, CAMERAS[0]])
+    with pytest.raises(FileFormatError, match="camera 7 stands twice"):
+        read_dataset(tmp_path, missing_images="none")
