@@ -415,7 +415,16 @@ def _write_image(path: Path, rgb: Any) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    app()
+    from attnwarp.errors import missing_extra
+
+    try:
+        app()
+    except ImportError as error:
+        explained = missing_extra(error)
+        if explained is None:
+            raise
+        typer.echo(f"attnwarp: {explained}", err=True)
+        raise SystemExit(USAGE) from None
 
 
 if __name__ == "__main__":

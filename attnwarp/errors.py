@@ -1,11 +1,30 @@
-"""The one kind of error that is a person's to mend: the command line shows its message and exits
-with code 2.
-"""
+"""Errors that the user can mend: the command line prints the message and exits with code 2."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+EXTRAS = {
+    "edit": ("diffusers", "tokenizers", "transformers"),
+    "eval": (
+        "dask",
+        "distributed",
+        "drjit",
+        "jinja2",
+        "markupsafe",
+        "matplotlib",
+        "mitsuba",
+        "open3d",
+        "pydantic",
+        "skimage",
+        "yaml",
+    ),
+    "inspect": ("pyvista",),
+    "gpu": ("gsplat",),
+}
+"""The extras of pyproject.toml -> the modules that each brings and the plain package lacks."""
 
 
 class InputError(ValueError):
@@ -14,7 +33,63 @@ class InputError(ValueError):
     """
 
 
+class MissingExtraError(InputError):
+    """A package that is not installed since only some users need it. The message names its extra.
+
+    Args:
+        module: top-level name of the missing module, one of :data:`EXTRAS`.
+        extra: the extra that brings it.
+    """
+
+    def __init__(self, module: str, extra: str) -> None:
+        super().__init__(
+            f"needs the package {module}, which comes with the extra {extra!r}:"
+            f" pip install 'attnwarp[{extra}]'"
+        )
+        self.module = module
+        self.extra = extra
+
+
+def missing_extra(error: ImportError) -> MissingExtraError | None:
+    """The error to show instead of a failed import; None if no extra brings the module.
+
+    Example:
+        >>> print(missing_extra(ModuleNotFoundError(name="diffusers")))
+        needs the package diffusers, which comes with the extra 'edit': pip install 'attnwarp[edit]'
+    """
+    module = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    if extra is None or not isinstance(error, ModuleNotFoundError):
+        return None
+    return MissingExtraError(module, extra)
+
+
+@contextmanager
+def optional_imports() -> Iterator[None]:
+    """Imports of packages that an extra brings; where one is missing, the error names the extra.
+
+    Raises:
+        MissingExtraError: the package is not installed.
+
+    Example:
+        >>> with optional_imports():
+        ...     import diffusers  # doctest: +SKIP
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        explained = missing_extra(error)
+        if explained is None:
+            raise
+        raise explained from error
+
+
 def suggest(word: str, known: Sequence[str]) -> str:
-    """The end of a message: the known word nearest to a misspelt one; empty where none is near."""
+    """The end of a message: the known word nearest to a misspelt one; empty where none is near.
+
+    Example:
+        >>> suggest("bera", ["bear", "fence"])
+        "; did you mean 'bear'?"
+    """
     near = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

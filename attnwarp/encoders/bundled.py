@@ -23,7 +23,7 @@ from attnwarp.encoders.base import (
 )
 from attnwarp.encoders.nets import ClipSmall, DinoSmall, PerceptualSmall
 from attnwarp.encoders.preprocess import Preprocessing
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, optional_imports
 
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -95,7 +95,8 @@ class BundledClip(_OfSquares):
     """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`."""
 
     def __init__(self, name: str, folder: Path) -> None:
-        from tokenizers import Tokenizer
+        with optional_imports():
+            from tokenizers import Tokenizer
 
         words = folder / f"{name}.tokenizer.json"
         if not words.is_file():

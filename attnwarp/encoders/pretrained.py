@@ -22,7 +22,7 @@ import torch
 from attnwarp.encoders._weights import device_of, full_float32, sha256_of
 from attnwarp.encoders.base import EncoderInfo, Image, Kind, checked_image, checked_texts
 from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preprocessing
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, optional_imports
 
 BATCH = 8
 """Pictures that go through a network together: enough to keep it busy, few enough to fit beside
@@ -201,7 +201,8 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
     _config(folder, name, "clip", ("clip",))
     preprocessing = read_preprocessing(folder)
     tokenizer = _tokenizer(folder, name)
-    from transformers import CLIPModel
+    with optional_imports():
+        from transformers import CLIPModel
 
     model, files = _load(CLIPModel, folder, name, "clip", where)
     side = int(model.config.vision_config.image_size)
@@ -240,7 +241,8 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
     where = device_of(device)
     config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))
     preprocessing = read_preprocessing(folder)
-    from transformers import Dinov2Model, Dinov2WithRegistersModel
+    with optional_imports():
+        from transformers import Dinov2Model, Dinov2WithRegistersModel
 
     kind = Dinov2Model if config["model_type"] == "dinov2" else Dinov2WithRegistersModel
     model, files = _load(kind, folder, name, "dino", where)
@@ -360,7 +362,8 @@ def _silent() -> Iterator[None]:
 
 def _tokenizer(folder: Path, name: str) -> Any:
     """A ``tokenizers.Tokenizer`` that neither pads nor cuts."""
-    from tokenizers import Tokenizer
+    with optional_imports():
+        from tokenizers import Tokenizer
 
     whole, vocabulary, merges = (
         folder / file for file in ("tokenizer.json", "vocab.json", "merges.txt")
@@ -373,7 +376,8 @@ def _tokenizer(folder: Path, name: str) -> Any:
                 f"{name}: {whole}: not a tokenizer ({error}); fetch the file again"
             ) from None
     elif vocabulary.is_file() and merges.is_file():
-        from transformers import CLIPTokenizer
+        with optional_imports():
+            from transformers import CLIPTokenizer
 
         lines = merges.read_text(encoding="utf-8").splitlines()
         pairs = [

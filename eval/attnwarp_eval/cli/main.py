@@ -723,9 +723,15 @@ def main() -> None:
     """Entry point of the console script."""
     import traceback
 
+    from attnwarp.errors import missing_extra
+
     try:
         app()
-    except Exception:
+    except Exception as error:
+        explained = missing_extra(error) if isinstance(error, ImportError) else None
+        if explained is not None:
+            typer.echo(f"attnwarp-eval: {explained}", err=True)
+            raise SystemExit(USAGE) from None
         # Python's own exit code for a crash is 1, which here means a regression.
         traceback.print_exc()
         raise SystemExit(CRASH) from None
