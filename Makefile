@@ -2,23 +2,25 @@
 SHELL := /bin/bash
 BIN := .venv/bin
 RUN ?= runs/demo
-# A worker of the demo needs up to 3 GB.
+# Worker processes of the demo and of the tests; each needs up to 3 GB.
 JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m < 1 ? 1 : m < n ? m : n }' /proc/meminfo)
 
-.PHONY: demo test test-all bench lint venv clean
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
+
+.PHONY: demo test test-all bench docs lint venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
 	@scripts/venv.sh edit,eval
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
-## lint, types and the tests that fit in a coffee break
+## lint, types, layers, and the tests that fit in a coffee break (docs/testing.md)
 test: lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
 
 ## everything, the thorough checks too
 test-all: lint
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 bench: venv
 	$(BIN)/python -m benchmarks.render
