@@ -22,8 +22,15 @@ test: lint
 test-all: lint
 	$(PYTEST)
 
+## every benchmark, one after the other
 bench: venv
-	$(BIN)/python -m benchmarks.render
+	@for file in $$(grep -l '__main__' benchmarks/*.py); do \
+		$(BIN)/python -m "benchmarks.$$(basename "$$file" .py)" || exit; \
+	done
+
+## the documents and the reference of both packages as a site: build/site/index.html
+docs: venv
+	$(BIN)/mkdocs build --strict --quiet
 
 lint: venv
 	$(BIN)/ruff check .

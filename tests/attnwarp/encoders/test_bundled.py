@@ -157,6 +157,7 @@ def test_unknown_words_do_not_drown_the_known_ones(clip):
     assert np.isfinite(clip.texts(["", "🐻 " * 200, "Ein Bär, bitte!"])).all()
 
 
+@pytest.mark.slow
 def test_a_thing_is_found_from_another_side_more_often_than_by_its_colours(dino):
     split = Split(91_000_000, 64, pairs="any", new_shapes=True, bare=True)
     assert looks_of(91_000_000, 0, split)[0].ground == looks_of(91_000_001, 1, split)[0].ground
