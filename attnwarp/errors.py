@@ -73,7 +73,7 @@ def optional_imports() -> Iterator[None]:
 
     Example:
         >>> with optional_imports():
-        ...     import diffusers  # doctest: +SKIP
+        ...     import numpy
     """
     try:
         yield

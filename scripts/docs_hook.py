@@ -21,7 +21,7 @@ LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 
 def public_modules() -> list[str]:
-    """Dotted names of modules with a docstring and at least one public function, class or re-export.
+    """Dotted names of the modules that have a docstring and a public function or class.
 
     A module whose name, or whose package's name, begins with an underscore is private.
     """
@@ -49,9 +49,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     files.append(File.generated(config, "index.md", content=readme))
     listing = ["# Reference", ""]
     for name in public_modules():
-        files.append(
-            File.generated(config, f"api/{name}.md", content=f"# {name}\n\n::: {name}\n")
-        )
+        files.append(File.generated(config, f"api/{name}.md", content=f"# {name}\n\n::: {name}\n"))
         listing.append(f"- [{name}]({name}.md)")
     files.append(File.generated(config, "api/index.md", content="\n".join(listing) + "\n"))
     return files

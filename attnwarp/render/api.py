@@ -181,9 +181,10 @@ def render(
         >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
         >>> splat = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        torch.full((1, 2), 0.2), ...                   torch.ones(1), torch.zeros(1, 1, 3))
-        >>> view = render(splat, Camera.look_at([0, 0, 3], [0, 0, 0], width=64, height=48, fov_y=40,
-        up=[0, 1, 0]))
+        ...                   torch.full((1, 2), 0.2), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], width=64, height=48, fov_y=40,
+        ...                         up=[0, 1, 0])
+        >>> view = render(splat, camera)
         >>> view.color.shape, round(float(view.depth[24, 32]), 4)
         (torch.Size([48, 64, 3]), 3.0)
     """

@@ -23,7 +23,7 @@ the ground, the time of day; whether an edit went in the direction of the words;
 outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`training/worlds.py`). A word
 that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
-On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md ("Measured")
+On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md
 and reports/metrics have the figures.
 
 **Recipe**: `training/naming.py`, then `training/clip.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image

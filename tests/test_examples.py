@@ -1,0 +1,141 @@
+"""The examples of the docstrings and of the documents run, in a folder with what they name."""
+
+import doctest
+import importlib
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Camera, Gaussians
+from attnwarp.io import Dataset, write_ply, write_transforms
+from attnwarp.render import render
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "attnwarp_eval"}
+
+
+def modules_with_examples():
+    for package, folder in PACKAGES.items():
+        for path in sorted(folder.rglob("*.py")):
+            lines = path.read_text().splitlines()
+            if any(">>> " in line and "+SKIP" not in line for line in lines):
+                parts = path.relative_to(folder).with_suffix("").parts
+                yield ".".join((package, *parts)).removesuffix(".__init__")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """The working folder of a user: splats, a capture of eight views with points, and pictures."""
+    import cv2
+
+    generator = torch.Generator().manual_seed(0)
+    splats = Gaussians(
+        "2d",
+        torch.randn(60, 3, generator=generator) * 0.4,
+        torch.nn.functional.normalize(torch.randn(60, 4, generator=generator), dim=1),
+        torch.full((60, 2), 0.15),
+        torch.full((60,), 0.9),
+        torch.randn(60, 1, 3, generator=generator) * 0.5,
+    )
+    for name in ("scene.ply", "point_cloud.ply"):
+        write_ply(tmp_path / name, splats)
+    cameras, paths = [], []
+    for index, angle in enumerate(np.linspace(-0.5, 0.5, 8)):
+        camera = Camera.look_at(
+            [3 * np.sin(angle), -3 * np.cos(angle), 0.5], [0, 0, 0], width=64, height=48, fov_y=40
+        )
+        path = tmp_path / "images" / f"{index}.png"
+        path.parent.mkdir(exist_ok=True)
+        picture = render(splats, camera).color.clamp(0, 1).numpy()
+        cv2.imwrite(str(path), np.round(255 * picture[..., ::-1]).astype(np.uint8))
+        cameras.append(camera)
+        paths.append(path)
+    colors = np.full((60, 3), 128, np.uint8)
+    data = Dataset(cameras, paths, points=splats.means.numpy(), colors=colors)
+    write_transforms(tmp_path / "transforms.json", data)
+    for name in ("my_capture", "my-capture", "DATA"):
+        (tmp_path / name).symlink_to(tmp_path, target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", modules_with_examples())
+def test_examples_of_the_docstrings_give_what_they_print(name, folder):
+    module = importlib.import_module(name)
+    runner = doctest.DocTestRunner(
+        optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.FAIL_FAST
+    )
+    output = []
+    for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
+        runner.run(example, out=output.append)
+    assert runner.failures == 0, "".join(output)
+    assert runner.tries > 0, f"{name}: no example ran"
+
+
+NAMES = {
+    "README.md": "features = torch.rand(8, 64, 64)",
+    "docs/edits.md": """
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.truth import Geometry
+from attnwarp_eval.truth.edits import edit_mask
+""",
+    "docs/metrics-pictures.md": """
+image_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
+mask = np.ones((32, 32), bool)
+distance = lambda a, b: float(np.abs(a - b).mean())
+edited, rendered = {"0": image_srgb}, {"0": target_srgb}
+""",
+    "docs/consistency.md": """
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.truth import Geometry
+scene = load_scene("spheres")
+geometry = Geometry(scene)
+source, target = (camera.resize(32, 32) for camera in scene.cameras[:2])
+source_srgb, target_srgb = np.random.default_rng(0).uniform(size=(2, 32, 32, 3))
+""",
+    "docs/fidelity.md": """
+image_srgb, truth_srgb, original = np.random.default_rng(0).uniform(size=(3, 32, 32, 3))
+mask = np.zeros((32, 32), bool)
+mask[8:24, 8:24] = True
+""",
+    "docs/warping.md": """
+from attnwarp.io import read_dataset, read_ply
+gaussians = read_ply("scene.ply")
+source, target = read_dataset("my_capture").cameras[:2]
+source_features, own_features = torch.rand(2, 8, 64, 64)
+""",
+}
+"""What a page's blocks take for granted. Blocks of pages that are not here run as they are."""
+
+NOT_RUN = {
+    "docs/encoders.md": "weights of the user's own",
+    "docs/fitting.md": "3000 iterations",
+}
+
+
+def blocks(page):
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.M | re.S)
+
+
+PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page) and page not in NOT_RUN])
+def test_examples_of_the_documents_run(page, folder):
+    names = {"torch": torch, "np": np, "__name__": "example"}
+    exec(NAMES.get(page, ""), names)
+    for block in blocks(page):
+        exec(compile(block, page, "exec"), names)
+
+
+@pytest.mark.parametrize("page", NOT_RUN)
+def test_examples_that_do_not_run_are_python(page):
+    assert blocks(page)
+    for block in blocks(page):
+        compile(block, page, "exec")
+        for line in re.findall(r"^from (attnwarp\S*) import (.+)$", block, re.M):
+            module = importlib.import_module(line[0])
+            assert all(hasattr(module, name.strip()) for name in line[1].split(","))
