@@ -1,10 +1,9 @@
-"""One door for all encoders: small bundled ones that need no download, and real ones from a local
-folder.
+"""Encoders of pictures and texts: small bundled ones, and published ones from a local folder.
 
     load_encoder("clip-small").images([picture])
     load_encoder("clip:/models/clip-vit-large-patch14-336").texts(["a photo of a bear statue"])
 
-Nothing heavy is imported until an encoder is loaded, and nothing is ever fetched.
+Nothing heavy is imported until an encoder is loaded, and nothing is ever downloaded.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ BUNDLED: dict[str, tuple[Kind, str]] = {
     ),
     "perceptual-small": ("perceptual", "a small perceptual distance in the manner of LPIPS"),
 }
-"""What ships with the package: name -> (kind, one line)."""
+"""Bundled encoders: name -> (kind, description)."""
 
 REAL: dict[str, tuple[Kind, str]] = {
     "clip:FOLDER": (
@@ -64,21 +63,30 @@ REAL: dict[str, tuple[Kind, str]] = {
         "LPIPS: a torchvision backbone (alex, vgg, squeeze) and its linear layers",
     ),
 }
-"""What is read from a place of the user's own: pattern -> (kind, one line)."""
+"""Encoders read from the user's files: pattern -> (kind, description)."""
 
 _SCHEMES = {pattern.partition(":")[0]: kind for pattern, (kind, _) in REAL.items()}
 
 
 def available() -> dict[str, str]:
-    """The bundled encoders: name -> one line."""
+    """The bundled encoders: name -> description.
+
+    Example:
+        >>> sorted(available())
+        ['clip-small', 'dino-small', 'perceptual-small']
+    """
     return {name: line for name, (_, line) in BUNDLED.items()}
 
 
 def kind_of(name: str) -> Kind:
-    """The kind of an encoder, known from its name alone; nothing is loaded.
+    """The kind of an encoder by its name; nothing is loaded.
 
     Raises:
         InputError: no such name.
+
+    Example:
+        >>> kind_of("dinov2:/models/dinov2-small")
+        'dino'
     """
     scheme, colon, place = name.partition(":")
     if name in BUNDLED:
@@ -111,7 +119,7 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
     Args:
         name: a bundled one (``clip-small``, ``dino-small``, ``perceptual-small``), or
             ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
-        kind: what is needed; an encoder of another kind is refused before it is loaded.
+        kind: the expected kind; an encoder of another kind is refused before it is loaded.
         device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.
 
     Returns:
@@ -119,14 +127,21 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
         :class:`PerceptualDistance` ("perceptual").
 
     Raises:
-        InputError: no such name, another kind than asked for, or weights that are missing or not
-            what they should be; the message says which files go where.
+        InputError: no such name, another kind than expected, or weights that are missing or
+            invalid; the message says which files go where.
+        MissingExtraError: the encoder needs a package that only an extra brings.
+
+    Example:
+        >>> import numpy as np
+        >>> encoder = load_encoder("dino-small", "dino")
+        >>> encoder.tokens([np.zeros((64, 96, 3))]).shape
+        (1, 8, 8, 192)
     """
-    found = kind_of(name)
-    if kind is not None and found != kind:
+    actual = kind_of(name)
+    if kind is not None and actual != kind:
         fitting = ", ".join(n for n, (k, _) in (BUNDLED | REAL).items() if k == kind)
         raise InputError(
-            f"encoder {name!r}: is of kind {found!r}, expected {kind!r}; name one of {fitting}"
+            f"encoder {name!r}: is of kind {actual!r}, expected {kind!r}; name one of {fitting}"
         )
     if name in BUNDLED:
         if importlib.util.find_spec("attnwarp.encoders.bundled") is None:

@@ -1,5 +1,4 @@
-"""Files of weights: finding them, naming them by content, and running them the same way
-everywhere."""
+"""Files of weights: hashing, reading, devices and precision."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from attnwarp.errors import InputError
 
 
 def sha256_of(files: Sequence[Path]) -> str:
-    """SHA-256 of the files' bytes, one after the other in the order of their names."""
+    """SHA-256 of the files' bytes, concatenated in the order of their names."""
     total = hashlib.sha256()
     for path in sorted(files, key=lambda p: p.name):
         with path.open("rb") as stream:
@@ -27,7 +26,7 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
     """The tensors of a .safetensors, .pth, .pt or .bin file, on the CPU; nothing in it is executed.
 
     Raises:
-        InputError: not such a file, or one that holds something else than tensors by name.
+        InputError: the file cannot be read, or holds anything but tensors by name.
     """
     try:
         if path.suffix == ".safetensors":
@@ -37,9 +36,7 @@ def state_of(path: Path) -> dict[str, torch.Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except OSError:
         raise
-    except (
-        Exception
-    ) as error:  # the two readers raise many kinds, all of which mean the same to a person
+    except Exception as error:  # the two readers raise many kinds
         first = str(error).strip().splitlines()[:1]
         raise InputError(
             f"{path}: cannot be read as weights ({''.join(first)}); fetch the file again"

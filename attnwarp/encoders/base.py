@@ -1,5 +1,4 @@
-"""What an encoder is: the protocols that bundled and real ones share, and the checks at their
-doors.
+"""Protocols of encoders, and the validation of their inputs.
 
 Nothing heavy is imported here.
 """
@@ -22,20 +21,18 @@ Image = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class EncoderInfo:
-    """Which encoder gave a figure. It stands beside every result, since figures of two encoders do
-    not compare.
+    """Identity of an encoder, stored beside every result: figures of two encoders do not compare.
 
     Attributes:
-        name: what :func:`attnwarp.encoders.load_encoder` was asked for.
+        name: the argument of :func:`attnwarp.encoders.load_encoder`.
         kind: "clip" (images and texts in one space), "dino" (images alone) or "perceptual" (a
             distance of images).
         source: "bundled", or the folder or file that the weights were read from.
-        weights_sha256: of the weights' file; where there are several, of their bytes in the order
-            of their names.
-        preprocessing: in words, what happens to a picture before the network sees it.
-        size: side in px of the square that the network sees; None: pictures go in at their own
-            size.
-        dim: length of an embedding; None where there is none.
+        weights_sha256: of the weights' file, or of several files' bytes in the order of their
+            names.
+        preprocessing: the steps before the network, in words.
+        size: side in px of the network's square input; None: pictures keep their size.
+        dim: length of an embedding; None for a distance.
     """
 
     name: str
@@ -64,8 +61,8 @@ class ImageEncoder(Protocol):
         """(N, D) float64 embeddings, not normalised; (0, D) of an empty list.
 
         Args:
-            images: N pictures (H, W, 3), sRGB, floating, in [0, 1]; each of its own size. What
-                becomes of a picture does not depend on the others in the list.
+            images: N pictures (H, W, 3), sRGB, floating, in [0, 1], of any sizes. A picture's
+                embedding does not depend on the others in the list.
 
         Raises:
             ValueError: a picture of another shape, dtype or range; the message names its index.
@@ -84,18 +81,16 @@ class TextImageEncoder(ImageEncoder, Protocol):
 
 @runtime_checkable
 class TokenEncoder(ImageEncoder, Protocol):
-    """Pictures to an embedding each and to a grid of patch embeddings, as DINO."""
+    """Pictures to embeddings and to grids of patch embeddings, as DINO."""
 
     def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
-        """(N, h, w, D) float64 embeddings of the patches, row by row as they lie in the
-        preprocessed picture.
-        """
+        """(N, h, w, D) float64 embeddings of the patches of the preprocessed picture, by row."""
         ...
 
 
 @runtime_checkable
 class PerceptualDistance(Protocol):
-    """A distance of pictures that follows what people see, as LPIPS."""
+    """A distance of pictures that follows human judgement, as LPIPS."""
 
     @property
     def about(self) -> EncoderInfo:
@@ -121,7 +116,7 @@ Encoder = ImageEncoder | TextImageEncoder | TokenEncoder | PerceptualDistance
 
 
 def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.NDArray[np.float32]]:
-    """The pictures in float32, as they came in every other respect.
+    """Validate pictures and convert them to float32.
 
     Raises:
         TypeError: one picture where a list was expected.
@@ -136,7 +131,7 @@ def checked_images(images: Sequence[Image], name: str = "images") -> list[npt.ND
 
 
 def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
-    """One picture in float32. Raises ValueError, see :func:`checked_images`."""
+    """Validate one picture and convert it to float32; raises as :func:`checked_images`."""
     array = np.asarray(image)
     if array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
         raise ValueError(
@@ -146,8 +141,7 @@ def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
         raise ValueError(
             f"{name}: got {array.dtype}, expected floating sRGB in [0, 1]; divide 8 bits by 255"
         )
-    # Tested in its own dtype: a float64 of 1e300 must be refused as out of range, not overflow on
-    # the way.
+    # Tested in its own dtype: a float64 of 1e300 is out of range, and must not overflow first.
     if not np.isfinite(array).all():
         raise ValueError(
             f"{name}: {int((~np.isfinite(array)).sum())} values are NaN or infinite, expected none"
@@ -161,7 +155,7 @@ def checked_image(image: Image, name: str = "image") -> npt.NDArray[np.float32]:
 def checked_pairs(
     a: Sequence[Image], b: Sequence[Image]
 ) -> list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
-    """Pairs of pictures in float32, equal in size within each pair.
+    """Validate pairs of pictures, equal in size within each pair, and convert them to float32.
 
     Raises:
         TypeError, ValueError: as :func:`checked_images`; lists of different lengths; a pair of
@@ -170,17 +164,17 @@ def checked_pairs(
     left, right = checked_images(a, "a"), checked_images(b, "b")
     if len(left) != len(right):
         raise ValueError(f"b: got {len(right)} pictures, expected {len(left)}, as a")
-    for i, (one, other) in enumerate(zip(left, right, strict=True)):
-        if one.shape != other.shape:
+    for i, (first, second) in enumerate(zip(left, right, strict=True)):
+        if first.shape != second.shape:
             raise ValueError(
-                f"b[{i}]: got {other.shape[1]} x {other.shape[0]} px, expected {one.shape[1]} x"
-                f" {one.shape[0]}, as a[{i}]"
+                f"b[{i}]: got {second.shape[1]} x {second.shape[0]} px, expected {first.shape[1]} x"
+                f" {first.shape[0]}, as a[{i}]"
             )
     return list(zip(left, right, strict=True))
 
 
 def checked_texts(texts: Sequence[str]) -> list[str]:
-    """The texts.
+    """Validate a list of texts.
 
     Raises:
         TypeError: one string where a list was expected, or something that is not a string.

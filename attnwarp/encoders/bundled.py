@@ -1,5 +1,5 @@
-"""The three encoders that ship with the package: small, trained from nothing by eval/training/,
-read from weights/.
+"""The three bundled encoders, trained from nothing by eval/training/; their weights lie in
+weights/.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     """A bundled encoder by name: "clip-small", "dino-small" or "perceptual-small".
 
     Args:
-        name: which.
-        folder: where ``name``.safetensors lies, and clip-small's tokenizer; the package's own if
-            left out.
+        name: of the encoder.
+        folder: holds ``name``.safetensors, and clip-small's tokenizer; the package's own if left
+            out.
 
     Raises:
         InputError: no such encoder, or weights that are missing or of another network.
@@ -48,20 +48,23 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
     }  # fmt: skip
     if name not in kinds:
         raise InputError(f"encoder {name!r}: not bundled, expected one of {', '.join(kinds)}")
-    made: BundledClip | BundledDino | BundledPerceptual = kinds[name](name, folder)
-    return made
+    encoder: BundledClip | BundledDino | BundledPerceptual = kinds[name](name, folder)
+    return encoder
 
 
 def _info(
-    name: str, kind: Kind, files: Sequence[Path], how: str, size: int | None, dim: int | None
+    name: str,
+    kind: Kind,
+    files: Sequence[Path],
+    preprocessing: str,
+    size: int | None,
+    dim: int | None,
 ) -> EncoderInfo:
-    return EncoderInfo(name, kind, "bundled", sha256_of(files), how, size, dim)
+    return EncoderInfo(name, kind, "bundled", sha256_of(files), preprocessing, size, dim)
 
 
 def _read(net: torch.nn.Module, path: Path) -> None:
-    """Fill a network with the weights of a file, which are stored in half precision and used in
-    single.
-    """
+    """Load weights, stored in half precision, into a network in single precision."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -79,15 +82,15 @@ def _read(net: torch.nn.Module, path: Path) -> None:
 
 
 class _OfSquares:
-    """Pictures in batches of squares."""
+    """Shared by the encoders whose input is a square: preprocessing in batches."""
 
     about: EncoderInfo
     preprocess: Preprocessing
 
     def _batches(self, images: Sequence[Image]) -> Iterator[torch.Tensor]:
-        ready = checked_images(images)
-        for start in range(0, len(ready), BATCH):
-            stack = np.stack([self.preprocess(image) for image in ready[start : start + BATCH]])
+        checked = checked_images(images)
+        for start in range(0, len(checked), BATCH):
+            stack = np.stack([self.preprocess(image) for image in checked[start : start + BATCH]])
             yield torch.from_numpy(stack).to(memory_format=torch.channels_last)
 
 
@@ -98,13 +101,13 @@ class BundledClip(_OfSquares):
         with optional_imports():
             from tokenizers import Tokenizer
 
-        words = folder / f"{name}.tokenizer.json"
-        if not words.is_file():
+        vocabulary_file = folder / f"{name}.tokenizer.json"
+        if not vocabulary_file.is_file():
             raise InputError(
-                f"{words}: missing; install the package again, or train it"
+                f"{vocabulary_file}: missing; install the package again, or train it"
                 " (eval/training/README.md)"
             )
-        self.tokenizer = Tokenizer.from_file(str(words))
+        self.tokenizer = Tokenizer.from_file(str(vocabulary_file))
         self.net = ClipSmall(self.tokenizer.get_vocab_size())
         weights = folder / f"{name}.safetensors"
         _read(self.net, weights)
@@ -112,36 +115,36 @@ class BundledClip(_OfSquares):
             resize=ClipSmall.size, crop=(ClipSmall.size, ClipSmall.size)
         )
         dim = self.net.pool.project.out_features
-        how = f"{self.preprocess}; mean of the picture's embedding and its mirror image's"
-        self.about = _info(name, "clip", [weights, words], how, ClipSmall.size, dim)
+        description = f"{self.preprocess}; mean of the picture's embedding and its mirror image's"
+        self.about = _info(
+            name, "clip", [weights, vocabulary_file], description, ClipSmall.size, dim
+        )
 
     def images(self, images: Sequence[Image]) -> Array:
         """(N, D) float64 embeddings, not normalised.
 
-        Each is the mean with the mirror image's: no caption that was trained on knows left from
-        right, so what a mirror changes is error.
+        Each is the mean of the picture's and its mirror image's: no training caption tells left
+        from right, so any difference between the two is error.
         """
         with full_float32():
-            found = [
+            embeddings = [
                 (0.5 * (self.net.images(batch) + self.net.images(batch.flip(-1)))).double().numpy()
                 for batch in self._batches(images)
             ]
-        return np.concatenate(found) if found else np.zeros((0, self.about.dim or 0))
+        return np.concatenate(embeddings) if embeddings else np.zeros((0, self.about.dim or 0))
 
     def cut(self, text: str) -> int:
-        """How many tokens of a text are dropped because the network takes no more."""
+        """Count of a text's tokens beyond the network's length, which are dropped."""
         return sum(len(rest.ids) - 1 for rest in self.tokenizer.encode(text).overflowing)
 
     def texts(self, texts: Sequence[str]) -> Array:
-        """(N, D) float64 embeddings, not normalised; words that are not in the vocabulary are read
-        in pieces.
-        """
-        said = checked_texts(texts)
-        if not said:
+        """(N, D) float64 embeddings, not normalised; unknown words are split into known pieces."""
+        checked = checked_texts(texts)
+        if not checked:
             return np.zeros((0, self.about.dim or 0))
         with full_float32():
             codes = torch.tensor(
-                [code.ids for code in self.tokenizer.encode_batch(said)], dtype=torch.int64
+                [code.ids for code in self.tokenizer.encode_batch(checked)], dtype=torch.int64
             )
             return self.net.texts(codes).double().numpy()
 
@@ -163,19 +166,19 @@ class BundledDino(_OfSquares):
     def images(self, images: Sequence[Image]) -> Array:
         """(N, D) float64 class tokens, not normalised."""
         with full_float32():
-            found = [self.net(batch)[0].double().numpy() for batch in self._batches(images)]
-        return np.concatenate(found) if found else np.zeros((0, self.net.dim))
+            embeddings = [self.net(batch)[0].double().numpy() for batch in self._batches(images)]
+        return np.concatenate(embeddings) if embeddings else np.zeros((0, self.net.dim))
 
     def tokens(self, images: Sequence[Image]) -> Array:
         """(N, 8, 8, D) float64 patch tokens of the central square, each of 16 x 16 px of 128 x
         128."""
         with full_float32():
-            found = [
+            grids = [
                 self.net(batch)[1].permute(0, 2, 3, 1).double().numpy()
                 for batch in self._batches(images)
             ]
         side = DinoSmall.size // DinoSmall.patch
-        return np.concatenate(found) if found else np.zeros((0, side, side, self.net.dim))
+        return np.concatenate(grids) if grids else np.zeros((0, side, side, self.net.dim))
 
 
 class BundledPerceptual:
@@ -191,9 +194,9 @@ class BundledPerceptual:
         """(N,) float64 distances, 0 for equal pictures; about (strength of the distortion / 5)^2,
         see the model card.
         """
-        found = []
+        distances = []
         with full_float32():
-            for one, other in checked_pairs(a, b):
-                x, y = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (one, other))
-                found.append(float(self.net(x, y)))
-        return np.array(found, dtype=np.float64)
+            for first, second in checked_pairs(a, b):
+                x, y = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (first, second))
+                distances.append(float(self.net(x, y)))
+        return np.array(distances, dtype=np.float64)

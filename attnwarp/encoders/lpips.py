@@ -1,8 +1,8 @@
 """LPIPS from local weights: a torchvision backbone (AlexNet, VGG16, SqueezeNet 1.1) and the
 published linear layers.
 
-The networks are written here, with torchvision's names for their tensors, so that torchvision need
-not be installed.
+The networks are defined here, with torchvision's names of tensors, so torchvision need not be
+installed.
 
 Source: R. Zhang, P. Isola, A. A. Efros, E. Shechtman, O. Wang, "The Unreasonable Effectiveness of
 Deep Features as a Perceptual Metric", CVPR 2018, and its released weights, version 0.1.
@@ -31,9 +31,7 @@ normalisation.
 """
 
 EPSILON = 1e-10
-"""Added to a feature's norm before dividing, as published: it matters only where no channel
-responds at all.
-"""
+"""Added to a feature's norm before dividing, as published; it matters if no channel responds."""
 
 SUFFIXES = (".pth", ".pt", ".bin", ".safetensors")
 
@@ -43,8 +41,8 @@ class Backbone:
     """One of the three networks.
 
     Attributes:
-        name: LPIPS's word for it.
-        file: torchvision's word for its weights.
+        name: in LPIPS.
+        file: of its weights in torchvision.
         taps: index of the last layer of each stage in torchvision's ``features``.
         channels: of each stage.
         smallest: shortest side in px of a picture that reaches the last stage.
@@ -143,8 +141,8 @@ class Lpips:
         backbone: which network.
         network: its ``features``, see :func:`features`.
         weights: the linear layers, one (channels,) tensor a stage.
-        about: what it is.
-        device: where it computes.
+        about: identity, stored with results.
+        device: of the computation.
     """
 
     def __init__(
@@ -168,24 +166,24 @@ class Lpips:
             ValueError: also for pictures smaller than the network can take.
         """
         pairs = checked_pairs(a, b)
-        for i, (one, _) in enumerate(pairs):
-            if min(one.shape[:2]) < self._backbone.smallest:
+        for i, (first, _) in enumerate(pairs):
+            if min(first.shape[:2]) < self._backbone.smallest:
                 raise ValueError(
-                    f"a[{i}]: got {one.shape[1]} x {one.shape[0]} px, expected sides of at least "
-                    f"{self._backbone.smallest} px for LPIPS with {self._backbone.name}"
+                    f"a[{i}]: got {first.shape[1]} x {first.shape[0]} px, expected sides of at"
+                    f" least {self._backbone.smallest} px for LPIPS with {self._backbone.name}"
                 )
         # Pair by pair: VGG's first stage holds 64 floats a pixel, 134 MB for one pair of 512 x 512.
-        return np.array([self._pair(one, other) for one, other in pairs], dtype=np.float64)
+        return np.array([self._pair(first, second) for first, second in pairs], dtype=np.float64)
 
     def _pair(self, a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> float:
         if np.array_equal(a, b):
             return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
         with full_float32():
-            both = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2).to(self._device)
+            pair = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2).to(self._device)
             shift, scale = (
                 torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
             )
-            x = (2 * both - 1 - shift) / scale
+            x = (2 * pair - 1 - shift) / scale
             total = 0.0
             stage = 0
             for i, layer in enumerate(self._network):
@@ -207,13 +205,13 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
             ``lin0.model.1.weight``, ...), or a folder with torchvision's state dict of a backbone
             (``features.0.weight``, ...) and one or more of the published files of linear layers, of
             which the fitting one is taken.
-        name: what the caller named it by.
+        name: the name in errors and results.
         device: "cpu" or "cuda".
 
     Raises:
         InputError: nothing there, something missing, or more than one that fits.
     """
-    where = device_of(device)
+    torch_device = device_of(device)
     if place.is_file():
         files = [place]
     elif place.is_dir():
@@ -227,24 +225,24 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
     for path in files:
         state = state_of(path)
         layers = _backbone_tensors(state)
-        found = next((b for b in BACKBONES.values() if layers and _fits(b, layers)), None)
-        if found is not None:
-            networks.append((path, found, layers))
+        matching = next((b for b in BACKBONES.values() if layers and _fits(b, layers)), None)
+        if matching is not None:
+            networks.append((path, matching, layers))
         if lines := _linear_tensors(state):
             linears.append((path, lines))
     if len(networks) != 1:
-        what = (
+        count = (
             "no backbone"
             if not networks
             else "several backbones: " + ", ".join(p.name for p, _, _ in networks)
         )
-        raise InputError(f"{name}: {place} holds {what}, expected one. {_HOW}")
+        raise InputError(f"{name}: {place} holds {count}, expected one. {_HOW}")
     path, backbone, layers = networks[0]
     fitting = [(p, ws) for p, ws in linears if tuple(w.numel() for w in ws) == backbone.channels]
     if len(fitting) != 1:
-        what = "no" if not fitting else "several files of"
+        count = "no" if not fitting else "several files of"
         raise InputError(
-            f"{name}: {place} holds {what} linear layers for {backbone.name}, expected one file."
+            f"{name}: {place} holds {count} linear layers for {backbone.name}, expected one file."
             f" {_HOW}"
         )
     used = sorted({path, fitting[0][0]})
@@ -263,7 +261,7 @@ def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:
             " resized"
         ),
     )
-    return Lpips(backbone, network, fitting[0][1], about, where)
+    return Lpips(backbone, network, fitting[0][1], about, torch_device)
 
 
 _HOW = (
@@ -295,9 +293,9 @@ def _fits(backbone: Backbone, layers: dict[str, torch.Tensor]) -> bool:
 
 def _linear_tensors(state: dict[str, torch.Tensor]) -> list[torch.Tensor]:
     pattern = re.compile(r"(?:module\.)?lin(\d+)\.model\.\d+\.weight")
-    found = {
+    weights = {
         int(m[1]): value.detach().flatten()
         for key, value in state.items()
         if (m := pattern.fullmatch(key))
     }
-    return [found[i] for i in sorted(found)]
+    return [weights[i] for i in sorted(weights)]

@@ -1,9 +1,7 @@
-"""What happens to a picture before a pretrained network sees it, read from the file that lies
-beside the weights.
+"""Preprocessing of pictures for pretrained networks, read from the file beside the weights.
 
-The resizing is Pillow's own filter, as in the encoders' reference pipelines, but on floating
-values: those pipelines round to 8 bits before and after it, which here would turn differences below
-1/255 into noise.
+Resizing uses Pillow's filter, as the reference pipelines do, but on floating values. Those
+pipelines round to 8 bits before and after it, which would turn differences below 1/255 into noise.
 """
 
 from __future__ import annotations
@@ -24,19 +22,19 @@ CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 _FILES = ("preprocessor_config.json", "processor_config.json")
 _FAMILIES = ("CLIPImageProcessor", "CLIPFeatureExtractor", "BitImageProcessor")
 _FILTERS = {0: "nearest", 1: "Lanczos", 2: "bilinear", 3: "bicubic", 4: "box", 5: "Hamming"}
-"""Pillow's numbers for its filters, which are what the file holds."""
+"""Pillow's numbers of its filters, as the file stores them."""
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """Resize, crop, scale, normalise; in this order, each left out where it is None.
+    """Resize, crop, scale, normalise, in this order; None leaves a step out.
 
     Attributes:
         resize: side in px that the shorter edge is resized to (the other one rounded down), or
             (height, width).
         resample: Pillow's number of the filter.
         crop: (height, width) in px, cut from the centre; a smaller picture is padded with black.
-        scale: what [0, 1] is multiplied by, 1 for networks that expect [0, 1].
+        scale: factor applied to [0, 1]; 1 for networks that expect [0, 1].
         mean, std: per channel, after the scaling.
     """
 
@@ -49,7 +47,7 @@ class Preprocessing:
 
     @property
     def shape(self) -> tuple[int, int] | None:
-        """(height, width) of what comes out; None where it depends on the picture."""
+        """(height, width) of the output; None if it depends on the picture."""
         return self.crop or (self.resize if isinstance(self.resize, tuple) else None)
 
     def __call__(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -79,8 +77,7 @@ class Preprocessing:
 def resize(
     image: npt.NDArray[np.float32], size: tuple[int, int], resample: int = 3
 ) -> npt.NDArray[np.float32]:
-    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, which widens it when a picture
-    gets smaller.
+    """(H, W, 3) in [0, 1] to (h, w, 3) with a filter of Pillow's, antialiased when shrinking.
 
     Args:
         image: the picture.
@@ -97,9 +94,8 @@ def resize(
     channels = []
     for c in range(3):
         channel = np.ascontiguousarray(image[..., c])
-        # One axis, then the other, as in 8 bits, where the overshoot is cut off after each. Which
-        # axis comes first is Pillow's affair where a picture is squeezed to another shape; the
-        # cut-off values differ there, and no others.
+        # Width, then height, each clipped, as Pillow does in 8 bits. If the aspect ratio changes,
+        # Pillow may take height first; then clipped values differ, and no others.
         for shape in ((size[1], image.shape[0]), (size[1], size[0])):
             channel = np.asarray(Image.fromarray(channel).resize(shape, resample)).clip(0, 1)
         channels.append(channel)
@@ -110,32 +106,32 @@ def center_crop(image: npt.NDArray[np.float32], size: tuple[int, int]) -> npt.ND
     """The central (h, w) px of (H, W, 3); black where the picture is smaller."""
     out = np.zeros((*size, image.shape[2]), image.dtype)
     window = []
-    for have, want in zip(image.shape[:2], size, strict=True):
-        start = (have - want) // 2
-        low, high = max(start, 0), min(start + want, have)
+    for side, target in zip(image.shape[:2], size, strict=True):
+        start = (side - target) // 2
+        low, high = max(start, 0), min(start + target, side)
         window.append((slice(low - start, high - start), slice(low, high)))
     out[window[0][0], window[1][0]] = image[window[0][1], window[1][1]]
     return out
 
 
-def _target(image: npt.NDArray[np.float32], wanted: int | tuple[int, int]) -> tuple[int, int]:
-    if isinstance(wanted, tuple):
-        return wanted
+def _target(image: npt.NDArray[np.float32], size: int | tuple[int, int]) -> tuple[int, int]:
+    if isinstance(size, tuple):
+        return size
     height, width = image.shape[:2]
-    long = int(wanted * max(height, width) / min(height, width))
-    return (wanted, long) if height <= width else (long, wanted)
+    longer = int(size * max(height, width) / min(height, width))
+    return (size, longer) if height <= width else (longer, size)
 
 
 def read_preprocessing(folder: Path) -> Preprocessing:
     """Read preprocessor_config.json, or the part of processor_config.json that newer versions
     write.
 
-    What the file leaves out is as CLIP's: shorter edge to 224 px, bicubic, the central 224 x 224
-    px, CLIP's mean and deviation.
+    Missing keys take CLIP's values: shorter edge to 224 px, bicubic, the central 224 x 224 px,
+    CLIP's mean and deviation.
 
     Raises:
-        InputError: neither file, not JSON, or something that is not known here; the message names
-            file and key.
+        InputError: no such file, not JSON, or an unsupported value; the message names file and
+            key.
     """
     path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
     if path is None:
@@ -143,34 +139,39 @@ def read_preprocessing(folder: Path) -> Preprocessing:
             f"{folder}: no {' or '.join(_FILES)}; place the one that was published with the weights"
             " there"
         )
-    said = read_json(path)
+    config = read_json(path)
     if path.name == _FILES[1]:
-        said = said.get("image_processor") or {}
+        config = config.get("image_processor") or {}
     family = (
-        said.get("image_processor_type")
-        or said.get("feature_extractor_type")
+        config.get("image_processor_type")
+        or config.get("feature_extractor_type")
         or "CLIPImageProcessor"
     )
     if str(family).removesuffix("Fast").removesuffix("Pil") not in _FAMILIES:
         raise InputError(
             f"{path}: image_processor_type is {family!r}, expected one of {', '.join(_FAMILIES)}"
         )
-    if said.get("do_pad"):
+    if config.get("do_pad"):
         raise InputError(
             f"{path}: do_pad is true, which is not supported; encoders that pad are not known here"
         )
-    rescale = float(said.get("rescale_factor", 1 / 255)) if said.get("do_rescale", True) else 1.0
-    normalise = said.get("do_normalize", True)
+    rescale = (
+        float(config.get("rescale_factor", 1 / 255)) if config.get("do_rescale", True) else 1.0
+    )
+    normalise = config.get("do_normalize", True)
     try:
         return Preprocessing(
-            resize=_size(said.get("size", 224), edge=True) if said.get("do_resize", True) else None,
-            resample=_resample(said.get("resample", 3)),
-            crop=_pair(said.get("crop_size", 224)) if said.get("do_center_crop", True) else None,
-            # The file speaks of 0 .. 255. A factor of 1/255 that was rounded on its way must still
-            # give exactly 1.
+            resize=_size(config.get("size", 224), edge=True)
+            if config.get("do_resize", True)
+            else None,
+            resample=_resample(config.get("resample", 3)),
+            crop=_pair(config.get("crop_size", 224))
+            if config.get("do_center_crop", True)
+            else None,
+            # The file's factor is for values of 0 to 255. A rounded 1/255 must give exactly 1.
             scale=1.0 if abs(rescale * 255 - 1) < 1e-6 else rescale * 255,
-            mean=_three(said.get("image_mean", CLIP_MEAN)) if normalise else (0.0, 0.0, 0.0),
-            std=_three(said.get("image_std", CLIP_STD)) if normalise else (1.0, 1.0, 1.0),
+            mean=_three(config.get("image_mean", CLIP_MEAN)) if normalise else (0.0, 0.0, 0.0),
+            std=_three(config.get("image_std", CLIP_STD)) if normalise else (1.0, 1.0, 1.0),
         )
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(

@@ -1,9 +1,8 @@
-"""CLIP and DINOv2 from a folder of one's own, in the format of the transformers package. Nothing is
-ever fetched.
+"""CLIP and DINOv2 from a local folder in the format of transformers. Nothing is ever downloaded.
 
-What transformers does silently and would give figures that look fine is refused here: tensors that
-the file lacks (they are filled with random numbers), a tokenizer of another model (every text then
-reads its first token), a model of another kind.
+Three mistakes give plausible figures in transformers and are refused here: tensors that the file
+lacks (it fills them with random numbers), a tokenizer of another model (every text is read at its
+first token), and a model of another kind.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ from attnwarp.encoders.preprocess import Preprocessing, read_json, read_preproce
 from attnwarp.errors import InputError, optional_imports
 
 BATCH = 8
-"""Pictures that go through a network together: enough to keep it busy, few enough to fit beside
-ViT-L's weights.
+"""Pictures in a batch: enough to use all cores, few enough to fit in memory beside ViT-L's weights.
 """
 
 _ASK = {
@@ -45,9 +43,7 @@ _FILES = {
 
 
 class _Pictures:
-    """What CLIP and DINOv2 share: pictures through preprocessing and network, batch by batch, in
-    float32.
-    """
+    """Shared by CLIP and DINOv2: preprocessing and network, batch by batch, in float32."""
 
     def __init__(
         self, about: EncoderInfo, preprocessing: Preprocessing, device: torch.device
@@ -59,30 +55,29 @@ class _Pictures:
     def _run(
         self, images: Sequence[Image], network: Callable[[torch.Tensor], torch.Tensor]
     ) -> list[npt.NDArray[np.float64]]:
-        """One result a picture. Only neighbours of equal size share a batch."""
+        """One result per picture. Only neighbours of equal size share a batch."""
         if isinstance(images, np.ndarray) and images.ndim == 3:
             raise TypeError(
                 f"images: got one picture of shape {images.shape}, expected a list of pictures"
             )
-        done: list[npt.NDArray[np.float64]] = []
+        results: list[npt.NDArray[np.float64]] = []
         for start in range(0, len(images), BATCH):
-            ready = [
+            batch = [
                 self._preprocess(checked_image(images[i], f"images[{i}]"))
                 for i in range(start, min(start + BATCH, len(images)))
             ]
-            for _, equal in groupby(ready, key=lambda picture: picture.shape):
+            for _, equal in groupby(batch, key=lambda picture: picture.shape):
                 with full_float32():
                     out = network(torch.from_numpy(np.stack(list(equal))).to(self._device))
-                done.extend(out.double().cpu().numpy())
-        return done
+                results.extend(out.double().cpu().numpy())
+        return results
 
 
 class Clip(_Pictures):
     """CLIP; see :class:`attnwarp.encoders.TextImageEncoder`.
 
-    Embeddings are those behind the two projections, as the field compares them. Texts longer than
-    the network takes (77 tokens with the published ones) are cut, as the field does; ``cut`` says
-    which.
+    Embeddings are the outputs of the two projections. Texts longer than the network takes (77
+    tokens with the published ones) are cut; ``cut`` counts the dropped tokens.
     """
 
     def __init__(
@@ -107,8 +102,7 @@ class Clip(_Pictures):
         """(N, D) float64, not normalised."""
         rows: list[npt.NDArray[np.float64]] = []
         for text in checked_texts(texts):
-            # One at a time: a few prompts, and no padding that a row would have to be independent
-            # of.
+            # One at a time: prompts are few, and padding could change a row.
             ids = self._ids(text)[0]
             with full_float32():
                 out = _pooled(
@@ -120,7 +114,7 @@ class Clip(_Pictures):
         return np.array(rows, dtype=np.float64).reshape(len(rows), self._dim)
 
     def cut(self, text: str) -> int:
-        """How many tokens of a text are dropped because the network takes no more."""
+        """Count of a text's tokens beyond the network's length, which are dropped."""
         return self._ids(text)[1]
 
     @property
@@ -130,15 +124,15 @@ class Clip(_Pictures):
     def _ids(self, text: str) -> tuple[list[int], int]:
         ids = list(self._tokenizer.encode(text).ids)
         over = max(0, len(ids) - self._length)
-        # The text is read off at the end token, so a cut one ends with it too.
+        # The network reads a text at its end token, so a cut text ends with it too.
         return (ids[: self._length - 1] + ids[-1:] if over else ids), over
 
 
 class Dino(_Pictures):
     """DINOv2, with registers or without; see :class:`attnwarp.encoders.TokenEncoder`.
 
-    A picture's embedding is the class token, and a patch's its own token, both behind the last
-    normalisation.
+    The embedding of a picture is the class token, that of a patch its own token, both after the
+    last normalisation.
     """
 
     def __init__(
@@ -190,21 +184,21 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
     Args:
         folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
             its index), preprocessor_config.json, and tokenizer.json or vocab.json with merges.txt.
-        name: what the caller named it by.
+        name: the name in errors and results.
         device: "cpu" or "cuda".
 
     Raises:
-        InputError: a file is missing or is not what it should be; the message says which, and how
-            to get it.
+        InputError: a file is missing or invalid; the message says which, and how to get it.
+        MissingExtraError: transformers is not installed.
     """
-    where = device_of(device)
+    torch_device = device_of(device)
     _config(folder, name, "clip", ("clip",))
     preprocessing = read_preprocessing(folder)
     tokenizer = _tokenizer(folder, name)
     with optional_imports():
         from transformers import CLIPModel
 
-    model, files = _load(CLIPModel, folder, name, "clip", where)
+    model, files = _load(CLIPModel, folder, name, "clip", torch_device)
     side = int(model.config.vision_config.image_size)
     if preprocessing.shape != (side, side):
         raise InputError(
@@ -222,7 +216,7 @@ def load_clip(folder: Path, *, name: str, device: str = "cpu") -> Clip:
         side,
         int(model.config.projection_dim),
     )
-    return Clip(model, tokenizer, about, preprocessing, where)
+    return Clip(model, tokenizer, about, preprocessing, torch_device)
 
 
 def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
@@ -231,21 +225,21 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
     Args:
         folder: with config.json, model.safetensors (or pytorch_model.bin, or either in parts with
             its index) and preprocessor_config.json.
-        name: what the caller named it by.
+        name: the name in errors and results.
         device: "cpu" or "cuda".
 
     Raises:
-        InputError: a file is missing or is not what it should be; the message says which, and how
-            to get it.
+        InputError: a file is missing or invalid; the message says which, and how to get it.
+        MissingExtraError: transformers is not installed.
     """
-    where = device_of(device)
+    torch_device = device_of(device)
     config = _config(folder, name, "dino", ("dinov2", "dinov2_with_registers"))
     preprocessing = read_preprocessing(folder)
     with optional_imports():
         from transformers import Dinov2Model, Dinov2WithRegistersModel
 
     kind = Dinov2Model if config["model_type"] == "dinov2" else Dinov2WithRegistersModel
-    model, files = _load(kind, folder, name, "dino", where)
+    model, files = _load(kind, folder, name, "dino", torch_device)
     shape, patch = preprocessing.shape, int(model.config.patch_size)
     if shape is not None and min(shape) < patch:
         raise InputError(
@@ -262,7 +256,7 @@ def load_dinov2(folder: Path, *, name: str, device: str = "cpu") -> Dino:
         size,
         int(model.config.hidden_size),
     )
-    return Dino(model, about, preprocessing, where)
+    return Dino(model, about, preprocessing, torch_device)
 
 
 def _config(folder: Path, name: str, kind: Kind, types: tuple[str, ...]) -> dict[str, Any]:
@@ -314,7 +308,7 @@ def _load(
     files = _weight_files(folder, name, kind)
     try:
         with _silent():
-            model, said = model_class.from_pretrained(
+            model, loading_info = model_class.from_pretrained(
                 str(folder), local_files_only=True, output_loading_info=True, dtype=torch.float32,
                 use_safetensors=files[0].suffix == ".safetensors",
             )  # fmt: skip
@@ -329,11 +323,11 @@ def _load(
         raise InputError(
             f"{name}: the weights in {folder} cannot be loaded: {first}; fetch its files again"
         ) from None
-    absent = sorted(str(key) for key in said["missing_keys"])
-    if absent:
+    missing = sorted(str(key) for key in loading_info["missing_keys"])
+    if missing:
         raise InputError(
-            f"{name}: {files[0]} lacks {len(absent)} tensors that config.json calls for,"
-            f" {absent[0]} first; the files are not of one model. {_how(kind, folder)}"
+            f"{name}: {files[0]} lacks {len(missing)} tensors that config.json calls for,"
+            f" {missing[0]} first; the files are not of one model. {_how(kind, folder)}"
         )
     bad = next(
         (key for key, value in model.state_dict().items() if not bool(torch.isfinite(value).all())),
@@ -346,7 +340,7 @@ def _load(
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Neither its progress bar nor its advice: what matters of it is checked here and raised."""
+    """Silence transformers' progress bar and advice; the checks here replace them."""
     from transformers.utils import logging as chatter
 
     level, bars = chatter.get_verbosity(), chatter.is_progress_bar_enabled()
@@ -365,42 +359,41 @@ def _tokenizer(folder: Path, name: str) -> Any:
     with optional_imports():
         from tokenizers import Tokenizer
 
-    whole, vocabulary, merges = (
+    tokenizer_file, vocabulary_file, merges_file = (
         folder / file for file in ("tokenizer.json", "vocab.json", "merges.txt")
     )
-    if whole.is_file():
+    if tokenizer_file.is_file():
         try:
-            tokenizer = Tokenizer.from_str(whole.read_text(encoding="utf-8"))
+            tokenizer = Tokenizer.from_str(tokenizer_file.read_text(encoding="utf-8"))
         except Exception as error:  # the Rust side raises a bare Exception
             raise InputError(
-                f"{name}: {whole}: not a tokenizer ({error}); fetch the file again"
+                f"{name}: {tokenizer_file}: not a tokenizer ({error}); fetch the file again"
             ) from None
-    elif vocabulary.is_file() and merges.is_file():
+    elif vocabulary_file.is_file() and merges_file.is_file():
         with optional_imports():
             from transformers import CLIPTokenizer
 
-        lines = merges.read_text(encoding="utf-8").splitlines()
+        lines = merges_file.read_text(encoding="utf-8").splitlines()
         pairs = [
             tuple(line.split())
             for line in lines
             if line.strip() and not line.startswith("#version")
         ]
-        odd = next((pair for pair in pairs if len(pair) != 2), None)
-        if odd is not None:
+        bad_pair = next((pair for pair in pairs if len(pair) != 2), None)
+        if bad_pair is not None:
             raise InputError(
-                f"{name}: {merges}: a line reads {' '.join(odd)!r}, expected two words; fetch it"
-                " again"
+                f"{name}: {merges_file}: a line reads {' '.join(bad_pair)!r}, expected two words;"
+                " fetch it again"
             )
         try:
-            # By value and by these names: an older version's vocab_file= is ignored, and leaves two
-            # tokens.
-            built: Any = CLIPTokenizer
-            tokenizer = built(vocab=read_json(vocabulary), merges=pairs)._tokenizer
+            # By these names: an older version's vocab_file= is ignored and leaves two tokens.
+            tokenizer_class: Any = CLIPTokenizer
+            tokenizer = tokenizer_class(vocab=read_json(vocabulary_file), merges=pairs)._tokenizer
         except InputError:
             raise
         except Exception as error:  # as above
             raise InputError(
-                f"{name}: {vocabulary} and {merges} do not fit each other ({error})"
+                f"{name}: {vocabulary_file} and {merges_file} do not fit each other ({error})"
             ) from None
     else:
         raise InputError(
@@ -413,13 +406,10 @@ def _tokenizer(folder: Path, name: str) -> Any:
 
 
 def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> None:
-    """Refuse a tokenizer that is not this model's; the network would read the wrong token and say
-    nothing.
-    """
+    """Refuse another model's tokenizer: the network would silently read the wrong token."""
     first, last = tokenizer.encode("a").ids[0], tokenizer.encode("a").ids[-1]
     top = max(tokenizer.get_vocab().values())
-    # 2 is what old files say whatever the tokenizer; the network then takes the highest number, as
-    # the first ones did.
+    # Old files hold 2 for any tokenizer; the network then reads at the highest token number.
     expected = top if config.eos_token_id == 2 else config.eos_token_id
     if first == last or last != expected or top >= config.vocab_size:
         raise InputError(
@@ -430,7 +420,7 @@ def _fitting_tokenizer(tokenizer: Any, config: Any, folder: Path, name: str) -> 
 
 
 def _pooled(output: Any) -> torch.Tensor:
-    """Versions of transformers differ: an object with a pooled part, or that part itself."""
+    """The pooled output: some versions of transformers return it inside an object."""
     return output if isinstance(output, torch.Tensor) else output.pooler_output
 
 

@@ -90,12 +90,12 @@ def assess(
 
     def figures() -> list[dict[str, Any]]:
         if name == "clip-small":
-            found = questions.clip_figures(encoder, sets)
+            results = questions.clip_figures(encoder, sets)
         elif name == "dino-small":
-            found = questions.dino_figures(encoder, sets)
+            results = questions.dino_figures(encoder, sets)
         else:
-            found = questions.perceptual_figures(encoder, sets["test"].images)
-        return [f.to_dict() for f in found]
+            results = questions.perceptual_figures(encoder, sets["test"].images)
+        return [f.to_dict() for f in results]
 
     trained = figures()
     facts = _facts(name, encoder, out) | {"seconds": _seconds(encoder), "threads": threads}

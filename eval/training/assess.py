@@ -1,8 +1,7 @@
-"""What the encoders can do on what they have never seen: the figures of the model cards, each with
-an interval.
+"""Accuracy of the encoders on unseen data: the figures of the model cards, each with an interval.
 
-Every figure is given for the trained network and for one of the same shape with random weights;
-where it says something, for raw pixels and colour histograms too.
+Every figure is given for the trained network and for one of the same shape with random weights; some
+also for raw pixels and colour histograms.
 """
 
 from __future__ import annotations
@@ -49,8 +48,8 @@ class Figure:
         low, high: 95 % interval, bootstrapped over worlds: pictures of one world are not
             independent.
         count: answers.
-        chance: what guessing would give; None where that says nothing.
-        asked: the share that was asked for; None where none was.
+        chance: value of guessing; None if that says nothing.
+        asked: the required share; None if none is required.
     """
 
     what: str
@@ -92,7 +91,7 @@ def as_float(images: npt.NDArray[np.uint8]) -> list[Image]:
 
 def _unit(x: npt.ArrayLike) -> Array:
     x = np.asarray(x, dtype=np.float64)
-    # What has no length has no direction: it stays zero, as like to everything as to nothing.
+    # A vector without length has no direction: it stays zero, with cosine 0 to everything.
     return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)
 
 
@@ -140,7 +139,7 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
         sets: "test" (new shapes), "test-new-pairs" (colours an object never had), "test-rendered"
             (by Mitsuba).
     """
-    found = []
+    figures = []
     titles = {
         "test": "new shapes",
         "test-new-pairs": "new pairs of colour and object",
@@ -153,48 +152,50 @@ def clip_figures(encoder: TextImageEncoder, sets: dict[str, Pictures]) -> list[F
         for what in ("object", "color", "material", "ground", "time")
     }
     for name, pictures in sets.items():
-        images, shown = embedded[name], pictures.attributes
-        kinds = np.array(FINISHES)[shown[:, 1]]
+        images, true_attributes = embedded[name], pictures.attributes
+        kinds = np.array(FINISHES)[true_attributes[:, 1]]
         material = np.array([MATERIALS.index(k) if k in MATERIALS else -1 for k in kinds])
         one_colored = np.isin(kinds, ["plain", "shiny"])
         questions: list[tuple[str, npt.NDArray[np.int64], npt.NDArray[np.bool_], float | None]] = [
-            ("object", shown[:, 0], np.ones(len(shown), bool), 0.9),
-            ("color", shown[:, 2], one_colored, 0.9),
+            ("object", true_attributes[:, 0], np.ones(len(true_attributes), bool), 0.9),
+            ("color", true_attributes[:, 2], one_colored, 0.9),
             ("material", material, material >= 0, 0.9),
-            ("ground", shown[:, 4], np.ones(len(shown), bool), None),
-            ("time", shown[:, 5], np.ones(len(shown), bool), None),
+            ("ground", true_attributes[:, 4], np.ones(len(true_attributes), bool), None),
+            ("time", true_attributes[:, 5], np.ones(len(true_attributes), bool), None),
         ]
-        for what, truth, where, asked in questions:
-            if not where.any():
+        for what, truth, applies, asked in questions:
+            if not applies.any():
                 continue
-            guess = (images[where] @ labels[what].T).argmax(axis=1)
+            guess = (images[applies] @ labels[what].T).argmax(axis=1)
             chance = 1 / len(labels[what])
-            found.append(
+            figures.append(
                 figure(
                     f"name the {what}, {titles[name]}",
-                    guess == truth[where],
-                    pictures.world[where],
+                    guess == truth[applies],
+                    pictures.world[applies],
                     chance=chance,
                     asked=asked,
                 )
             )
         if len(np.unique(pictures.world)) >= 64:
-            found.append(
+            figures.append(
                 _retrieval(encoder, images, pictures, f"the caption among 64, {titles[name]}")
             )
-    found.append(_direction(encoder, embedded["test"], sets["test"]))
-    found.append(_viewpoint(embedded["test"], sets["test"], labels))
-    return found
+    figures.append(_direction(encoder, embedded["test"], sets["test"]))
+    figures.append(_viewpoint(embedded["test"], sets["test"], labels))
+    return figures
 
 
 def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, what: str) -> Figure:
-    """Rank 1 of a picture's own caption among those of 63 others of other worlds; one that is true
-    too is no error.
+    """Rank 1 of a picture's own caption among 63 captions of other worlds; another true caption is no
+    error.
     """
     rng = np.random.default_rng(1)
     first = np.flatnonzero((pictures.view == 0) & (pictures.look == 0))
-    said = pictures.attributes
-    texts = _unit(encoder.texts([sentence(tuple(int(v) for v in said[k]), rng) for k in first]))
+    true_attributes = pictures.attributes
+    texts = _unit(
+        encoder.texts([sentence(tuple(int(v) for v in true_attributes[k]), rng) for k in first])
+    )
     right = []
     for place, k in enumerate(first):
         others = rng.choice(np.delete(np.arange(len(first)), place), 63, replace=False)
@@ -202,13 +203,15 @@ def _retrieval(encoder: TextImageEncoder, images: Array, pictures: Pictures, wha
             [*others, place]
         )  # the right one last: the first of equals wins, so a tie is no find
         best = choice[(images[k] @ texts[choice].T).argmax()]
-        right.append(bool(true_of(said[first[best]][None], said[k][None])[0, 0]))
+        right.append(
+            bool(true_of(true_attributes[first[best]][None], true_attributes[k][None])[0, 0])
+        )
     return figure(what, right, pictures.world[first], chance=1 / 64, asked=0.6)
 
 
 def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> Figure:
-    """Which of 8 edits was made: cos of the change of pictures and the change of captions, as the
-    field's metric has it.
+    """Which of 8 edits was made, by the cosine of the change of pictures and of captions, as
+    directional similarity.
     """
     rng = np.random.default_rng(2)
     index = {
@@ -228,7 +231,7 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
             # Others change one attribute of the same picture too: surface, ground or time.
             part = int(rng.integers(3))
             drawn = attributes(old[0], draw_look(old[0], rng, pairs="any"))
-            other = (
+            candidate = (
                 (old[0], *drawn[1:4], *old[4:])
                 if part == 0
                 else (*old[:4], drawn[4], old[5])
@@ -236,19 +239,19 @@ def _direction(encoder: TextImageEncoder, images: Array, pictures: Pictures) -> 
                 else (*old[:5], drawn[5])
             )
             if (
-                other != old
-                and other not in targets
-                and not true_of(np.array([other]), np.array([new]))[0, 0]
+                candidate != old
+                and candidate not in targets
+                and not true_of(np.array([candidate]), np.array([new]))[0, 0]
             ):
-                targets.append(other)
+                targets.append(candidate)
         seed = int(rng.integers(2**31))
-        # One seed for all sentences: they differ in what they say, not in how.
+        # One seed for all sentences: they differ in attributes, not in wording.
         texts = encoder.texts(
-            [sentence(said, np.random.default_rng(seed)) for said in (old, *targets)]
+            [sentence(words, np.random.default_rng(seed)) for words in (old, *targets)]
         )
         away = _unit(_unit(texts[1:]) - _unit(texts[:1]))
         if np.array_equal(pictures.images[after], pictures.images[before]):
-            continue  # what was changed is not in the picture: there is no direction
+            continue  # the change is out of sight: there is no direction
         likeness = away @ _unit(images[after] - images[before])
         right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
         worlds.append(world)
@@ -337,11 +340,11 @@ def dino_figures(
             its own place) and "test-moved" (each on another ground at another time).
         parts: worlds for the correspondence of parts.
     """
-    found = []
-    where = {
+    figures = []
+    places = {
         "test-bare": "all on the same grass", "test": "each in its own place", "test-moved": "moved to another ground and time",
     }  # fmt: skip
-    for name, words in where.items():
+    for name, words in places.items():
         pictures = sets[name]
         features = {"class token": encoder.images(as_float(pictures.images))}
         features |= {
@@ -352,8 +355,8 @@ def dino_figures(
             right, worlds = nearest(values, pictures, look=1 if name == "test-moved" else 0)
             asked = 0.85 if what == "class token" and name == "test-bare" else None
             title = f"the thing from another side among 64, {words}: {what}"
-            found.append(figure(title, right, worlds, chance=1 / 64, asked=asked))
-    return found + part_figures(encoder, parts)
+            figures.append(figure(title, right, worlds, chance=1 / 64, asked=asked))
+    return figures + part_figures(encoder, parts)
 
 
 def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -> list[Figure]:
@@ -372,41 +375,41 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
     for k in range(count):
         world = draw_world(first + k, new_shapes=True, thing=k % len(OBJECTS))
         look = looks_of(world.seed, world.thing, SPLITS["test"])[0]
-        (one,), hits = render(world, [look], SIZE, view=0)
-        (two,), other = render(world, [look], SIZE, view=1)
+        (first_image,), first_hits = render(world, [look], SIZE, view=0)
+        (second_image,), second_hits = render(world, [look], SIZE, view=1)
         camera = world.scene(look, SIZE).cameras[1]
         place = np.arange(side) * (SIZE // side) + SIZE // side // 2
         y, x = np.meshgrid(place, place, indexing="ij")
-        on = (hits.object_id[y, x] == 0).ravel()
-        points = hits.point[y, x].reshape(-1, 3)[on]
+        on_thing = (first_hits.object_id[y, x] == 0).ravel()
+        points = first_hits.point[y, x].reshape(-1, 3)[on_thing]
         if not len(points):
             continue
         xy, depth = camera.project(points)
         inside = np.isfinite(xy).all(axis=1) & (xy > 0).all(axis=1) & (xy < SIZE).all(axis=1)
         px = np.floor(np.nan_to_num(xy)).astype(int).clip(0, SIZE - 1)
-        seen = other.depth[px[:, 1], px[:, 0]]
-        good = inside & (np.abs(seen - depth) < 0.02 * depth)
-        if not good.any():
+        depth_of_second = second_hits.depth[px[:, 1], px[:, 0]]
+        visible = inside & (np.abs(depth_of_second - depth) < 0.02 * depth)
+        if not visible.any():
             continue
-        tokens = encoder.tokens(as_float(np.stack([one, two])))
+        tokens = encoder.tokens(as_float(np.stack([first_image, second_image])))
         means = (
-            np.stack([one, two])
+            np.stack([first_image, second_image])
             .reshape(2, side, SIZE // side, side, SIZE // side, 3)
             .transpose(0, 1, 3, 2, 4, 5)
         )
         patches = means.reshape(2, side, side, -1).astype(np.float64)
         centers = np.stack([x, y], axis=-1).reshape(-1, 2) + 0.0
-        truth = xy[good]
+        truth = xy[visible]
         for name, grid in (("patch tokens", tokens), ("raw patches", patches)):
             flat = _unit(
                 grid.reshape(2, side * side, -1)
                 - grid.reshape(2, side * side, -1).mean(axis=1, keepdims=True)
             )
-            match = (flat[0][on][good] @ flat[1].T).argmax(axis=1)
+            match = (flat[0][on_thing][visible] @ flat[1].T).argmax(axis=1)
             rows[name] += list(np.linalg.norm(centers[match] - truth, axis=1) < 0.1 * SIZE)
-        thing = np.argwhere(other.object_id == 0)[:, ::-1].mean(axis=0)
+        thing = np.argwhere(second_hits.object_id == 0)[:, ::-1].mean(axis=0)
         rows["middle of the thing"] += list(np.linalg.norm(thing - truth, axis=1) < 0.1 * SIZE)
-        worlds += [world.seed] * int(good.sum())
+        worlds += [world.seed] * int(visible.sum())
     return [
         figure(f"parts from another side, within a tenth of the picture: {name}", right, worlds)
         for name, right in rows.items()
@@ -428,13 +431,13 @@ def ssim_distance(a: Image, b: Image) -> float:
     """1 - SSIM, by scikit-image."""
     from skimage.metrics import structural_similarity
 
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "channel_axis": 2,
         "data_range": 1.0,
         "gaussian_weights": True,
         "sigma": 1.5,
     }
-    return 1 - float(structural_similarity(a, b, use_sample_covariance=False, **how))
+    return 1 - float(structural_similarity(a, b, use_sample_covariance=False, **options))
 
 
 def perceptual_figures(
@@ -452,7 +455,7 @@ def perceptual_figures(
         "one kind": (TRAIN_KINDS, 0.0),
         "kinds never seen": (HELD_OUT_KINDS, 0.0),
     }
-    found = []
+    figures = []
     for what, (kinds, across) in families.items():
         rng = np.random.default_rng([4, len(what)])
         right: dict[str, list[bool]] = {name: [] for name in distances}
@@ -462,7 +465,7 @@ def perceptual_figures(
                 right[name].append(distance(x, weak) < distance(x, strong))
         for name, answers in right.items():
             asked = 0.95 if name == "perceptual" and what == "all kinds" else None
-            found.append(
+            figures.append(
                 figure(
                     f"the stronger of two distortions, {what}: {name}",
                     answers,
@@ -471,7 +474,7 @@ def perceptual_figures(
                     asked=asked,
                 )
             )
-    return found
+    return figures
 
 
 def test_sets(data: Path) -> dict[str, Pictures]:

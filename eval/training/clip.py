@@ -1,9 +1,8 @@
 """Recipe of clip-small: pictures and sentences in one space, by contrast.
 
-A batch holds the looks of a world side by side, which differ in one attribute, and for every
-sentence another with one attribute wrong. A sentence that happens to be true of another picture of
-the batch is no negative: both know what they show, so such pairs are left out of the sum. The image
-tower comes from :mod:`training.naming`, which taught it shapes.
+A batch holds all looks of a world, which differ in one attribute, and for every sentence another
+with one wrong attribute. Pairs of a picture and another picture's sentence that is true of it are
+left out of the sum. The image tower starts from :mod:`training.naming`.
 """
 
 from __future__ import annotations
@@ -45,14 +44,12 @@ EPOCHS = 8
 BATCH = 128
 CROP = 96
 SCALE = (0.6, 0.95)
-"""Shares of a picture's side that a crop of 96 px shows: things are as large in it, on average, as
-in the whole picture at the encoder's size, of which the crop leaves out background that costs
-time."""
+"""Shares of a picture's side that a crop of 96 px shows. Things are on average as large in it as in
+the whole picture at the encoder's size; the crop saves the time for background."""
 PEAK = 1e-3
 SCRAMBLED = 0.25
-"""Share of pictures whose colours are scrambled: they have no part in the contrast, and their thing
-alone is asked by name. Without them things in colours that training never showed them in were named
-in 88.8 %, and 95.7 % over all."""
+"""Share of pictures with scrambled colours: they are left out of the contrast, and only their thing is
+a target. Without them, things in colours new to them were named in 88.8 % (95.7 % over all)."""
 VISION = 0.4
 """Share of the learning rate for the image tower, which has learned much already."""
 VOCABULARY = 1024
@@ -61,14 +58,14 @@ Ints = npt.NDArray[np.int64]
 
 
 def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
-    """Byte-level byte pairs learned from captions: any text can be written with it, known words in
-    a token or two.
+    """Byte-level byte pairs learned from captions: any text can be encoded, and a word of the captions
+    takes a token or two.
     """
     rng = np.random.default_rng([SEED, 10])
     corpus = []
     for _ in range(sentences):
-        shown = _any_attributes(rng)
-        corpus.append(sentence(told(shown, rng), rng, fillers=True))
+        drawn = _any_attributes(rng)
+        corpus.append(sentence(told(drawn, rng), rng, fillers=True))
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
@@ -100,15 +97,15 @@ def tokens(tokenizer: Tokenizer, sentences: list[str]) -> torch.Tensor:
     return torch.tensor([code.ids for code in tokenizer.encode_batch(sentences)], dtype=torch.int64)
 
 
-def true_of(said: Ints, shown: Ints) -> npt.NDArray[np.bool_]:
+def true_of(captions: Ints, images: Ints) -> npt.NDArray[np.bool_]:
     """(N images, M captions) whether each caption is true of each picture; colours of a pair have
     no order.
     """
-    a, b = shown[:, None], said[None]
+    a, b = images[:, None], captions[None]
     same = (b == -1) | (a == b)
     swapped = (a[..., 2] == b[..., 3]) & (a[..., 3] == b[..., 2])
     colors = (same[..., 2] & same[..., 3]) | swapped
-    # "a red ball" is said of a single colour; a red and white one is another thing.
+    # "a red ball" means a single colour; a red and white one has another caption.
     single = (b[..., 1] == -1) & (b[..., 2] >= 0)
     finish = np.where(
         single, np.isin(a[..., 1], [FINISHES.index("plain"), FINISHES.index("shiny")]), same[..., 1]
@@ -116,9 +113,9 @@ def true_of(said: Ints, shown: Ints) -> npt.NDArray[np.bool_]:
     return same[..., 0] & finish & colors & same[..., 4] & same[..., 5]
 
 
-def wrong(said: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
-    """The caption with one of the attributes that it says replaced."""
-    thing, finish, color, second, ground, time = said
+def wrong(caption: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
+    """The caption with one of its attributes replaced."""
+    thing, finish, color, second, ground, time = caption
     ways = [k for k, v in (("thing", thing), ("ground", ground), ("time", time)) if v >= 0]
     if finish >= 0 or color >= 0:
         ways += ["surface"]
@@ -127,29 +124,28 @@ def wrong(said: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
     if second >= 0:
         ways.append("swap")
     way = ways[int(rng.integers(len(ways)))] if ways else "thing"
-    made: tuple[int, ...]
+    changed: tuple[int, ...]
     while True:
-        other = _any_attributes(rng)
+        drawn = _any_attributes(rng)
         match way:
             case "thing":
-                made = (other[0], finish, color, second, ground, time)
+                changed = (drawn[0], finish, color, second, ground, time)
             case "ground":
-                made = (thing, finish, color, second, other[4], time)
+                changed = (thing, finish, color, second, drawn[4], time)
             case "time":
-                made = (thing, finish, color, second, ground, other[5])
+                changed = (thing, finish, color, second, ground, drawn[5])
             case _ if finish == -1 or FINISHES[finish] == "shiny":
-                made = (thing, finish, int(rng.integers(len(COLORS))), second, ground, time)
+                changed = (thing, finish, int(rng.integers(len(COLORS))), second, ground, time)
                 if rng.uniform() < 0.3:
-                    made = (thing, *other[1:4], ground, time)
+                    changed = (thing, *drawn[1:4], ground, time)
             case _:
-                made = (thing, *other[1:4], ground, time)
-        if made != said:
-            return made
+                changed = (thing, *drawn[1:4], ground, time)
+        if changed != caption:
+            return changed
 
 
 def pseudo_word(rng: np.random.Generator) -> str:
-    """A word that nobody knows, so that the text tower learns to read past those it does not
-    know."""
+    """A word without meaning, so that the text tower learns to ignore unknown words."""
     starts, ends = (
         ("b", "br", "cl", "d", "fl", "gr", "k", "l", "m", "pr", "s", "st", "t", "v", "z"),
         ("ck", "l", "m", "n", "rd", "sh", "t", "x", ""),
@@ -187,19 +183,19 @@ def contrast(
         t = model.texts(texts)
     t = F.normalize(t.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * i @ t.T
-    mine = torch.arange(n)
-    also = truth.clone()
-    also[mine, mine] = False
-    logits = logits.masked_fill(also, -torch.inf)
-    by_image = F.cross_entropy(logits, mine)
-    by_text = F.cross_entropy(logits[:, :n].T, mine)
+    diagonal = torch.arange(n)
+    also_true = truth.clone()
+    also_true[diagonal, diagonal] = False
+    logits = logits.masked_fill(also_true, -torch.inf)
+    by_image = F.cross_entropy(logits, diagonal)
+    by_text = F.cross_entropy(logits[:, :n].T, diagonal)
     return 0.5 * (by_image + by_text)
 
 
 def naming_loss(
     model: ClipSmall,
     images: torch.Tensor,
-    shown: Ints,
+    attributes: Ints,
     tokenizer: Tokenizer,
     rng: np.random.Generator,
 ) -> torch.Tensor:
@@ -227,28 +223,30 @@ def naming_loss(
     ):
         spans.append((column, len(texts), len(texts) + count))
         for value in range(count):
-            said = [-1] * 6
-            said[column] = value
+            caption = [-1] * 6
+            caption[column] = value
             if column == 1 and FINISHES[value] in COLORED:
-                said[2], said[3] = rng.choice(len(COLORS), 2, replace=False)
-                said[3] = said[3] if FINISHES[value] in TWO_COLORED else -1
-            texts.append(sentence(tuple(int(v) for v in said), rng))
+                caption[2], caption[3] = rng.choice(len(COLORS), 2, replace=False)
+                caption[3] = caption[3] if FINISHES[value] in TWO_COLORED else -1
+            texts.append(sentence(tuple(int(v) for v in caption), rng))
     with torch.autocast("cpu", torch.bfloat16):
         words = model.texts(tokens(tokenizer, texts))
     words = F.normalize(words.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * images @ words.T
     total = torch.zeros(())
     for column, low, high in spans:
-        asked = shown[:, column] >= 0
+        asked = attributes[:, column] >= 0
         if (
             column == 1
-        ):  # what a colour is said of is told from its pattern or its shine alone only by chance
-            asked &= ~np.isin(shown[:, 1], [FINISHES.index(f) for f in COLORED])
+        ):  # without its colour, a coloured finish cannot be told from pattern or shine
+            asked &= ~np.isin(attributes[:, 1], [FINISHES.index(f) for f in COLORED])
         if column == 2:
-            asked &= np.isin(shown[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
+            asked &= np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
         if asked.any():
             rows = torch.from_numpy(np.flatnonzero(asked))
-            loss = F.cross_entropy(logits[rows, low:high], torch.from_numpy(shown[asked, column]))
+            loss = F.cross_entropy(
+                logits[rows, low:high], torch.from_numpy(attributes[asked, column])
+            )
             total = total + (2 if column == 0 else 1) * loss
     return total / (len(spans) + 1)
 
@@ -296,24 +294,29 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             images = crops(
                 np.stack([sets[k].pictures.images[r] for k, r in rows]), CROP, rng, scale=SCALE
             )
-            shown = np.stack([sets[k].pictures.attributes[r] for k, r in rows])
-            which = rng.uniform(size=BATCH) < SCRAMBLED
-            images = scrambled(images, which, rng)
-            shown[which, 1:] = -1
-            kept = np.flatnonzero(~which)
-            said = [told(tuple(int(v) for v in row), rng) for row in shown[kept]]
-            false = [wrong(s, rng) for s in said]
-            texts = [_scattered(sentence(s, rng, fillers=True), rng) for s in [*said, *false]]
-            truth = torch.from_numpy(true_of(np.array([*said, *false]), shown[kept]))
+            attributes = np.stack([sets[k].pictures.attributes[r] for k, r in rows])
+            is_scrambled = rng.uniform(size=BATCH) < SCRAMBLED
+            images = scrambled(images, is_scrambled, rng)
+            attributes[is_scrambled, 1:] = -1
+            whole = np.flatnonzero(~is_scrambled)
+            captions = [told(tuple(int(v) for v in row), rng) for row in attributes[whole]]
+            false_captions = [wrong(s, rng) for s in captions]
+            texts = [
+                _scattered(sentence(s, rng, fillers=True), rng)
+                for s in [*captions, *false_captions]
+            ]
+            truth = torch.from_numpy(
+                true_of(np.array([*captions, *false_captions]), attributes[whole])
+            )
             with torch.autocast("cpu", torch.bfloat16):
                 features = model.pool.features(model.vision(images)[-1])
                 embedded = model.pool.project(features)
-                guessed = heads(features, shown)
+                guessed = heads(features, attributes)
             embedded = F.normalize(embedded.float(), dim=-1)
             apart = contrast(
-                model, embedded[torch.from_numpy(kept)], tokens(tokenizer, texts), truth
+                model, embedded[torch.from_numpy(whole)], tokens(tokenizer, texts), truth
             )
-            named = naming_loss(model, embedded, shown, tokenizer, rng)
+            named = naming_loss(model, embedded, attributes, tokenizer, rng)
             loss = apart + named + guessed
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
@@ -323,7 +326,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return dict(zip(("contrast", "names", "heads"), sums / each, strict=True))
 
     checkpoint = out / "clip-small.pt"
-    # The image tower's start is part of what this comes from.
+    # The checkpoint depends on the first stage's settings too.
     recipe = settings(globals()) | {"naming": naming.recipe()}
     Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs, recipe).train(
         epoch

@@ -1,4 +1,4 @@
-"""What the recipes share: crops, the learning rate, and checkpoints that training goes on from."""
+"""Shared by the recipes: crops, the learning rate, and checkpoints."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def placed_crops(
 
 
 def channels_last(model: Model) -> Model:
-    """The model with its convolutions laid out as a CPU likes them."""
+    """The model with its convolutions channels last, which is faster on a CPU."""
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return model
 
@@ -83,8 +83,8 @@ def rate(step: int, total: int, peak: float, warm: int) -> float:
     """The learning rate: linear up to ``peak``, then half a cosine down to a hundredth of it."""
     if step < warm:
         return peak * (step + 1) / warm
-    done = (step - warm) / max(1, total - warm)
-    return peak * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+    progress = (step - warm) / max(1, total - warm)
+    return peak * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
 def groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
@@ -95,34 +95,34 @@ def groups(model: torch.nn.Module, decay: float) -> list[dict[str, Any]]:
 
 
 def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
-    """What a recipe says: its constants, by their upper-case names, and which pictures it takes.
+    """Settings of a recipe: its constants, by their upper-case names, and its pictures.
 
     Args:
-        module: the recipe's ``globals()``; what it imports in upper case, such as the words for
-            colours, is part of it.
+        module: the recipe's ``globals()``, imported constants such as the words for colours
+            included.
         splits: names of the pictures that it is trained on, in :data:`training.data.SPLITS`.
     """
     from training.data import DATA_PROTOCOL, SPLITS
 
     plain = (bool, int, float, str, tuple, list, dict)
-    found = {
+    constants = {
         name: value for name, value in module.items() if name.isupper() and isinstance(value, plain)
     }
-    return found | {
+    return constants | {
         "data": {"protocol": DATA_PROTOCOL, **{name: asdict(SPLITS[name]) for name in splits}}
     }
 
 
 @dataclass
 class Run:
-    """A training run that can be killed and gone on with: its state is written after every epoch.
+    """A training run that can be killed and resumed: its state is written after every epoch.
 
     Attributes:
         path: of the checkpoint.
         state: everything that has a ``state_dict``, by name.
         epochs: how many in all.
-        recipe: what else the result depends on, see :func:`settings`; written into the checkpoint,
-            which goes on with no other.
+        recipe: the other settings of the result, see :func:`settings`; written into the checkpoint,
+            which can be resumed with no other.
     """
 
     path: Path
@@ -148,15 +148,15 @@ class Run:
             first, seconds = int(stored["epoch"]), float(stored["seconds"])
         for number in range(first, self.epochs):
             start = time.perf_counter()
-            said = epoch(number)
-            taken = time.perf_counter() - start
-            seconds += taken
-            words = ", ".join(f"{k} {v:.4g}" for k, v in said.items())
-            print(f"epoch {number + 1}/{self.epochs}: {words}, {taken:.0f} s", flush=True)
+            losses = epoch(number)
+            spent = time.perf_counter() - start
+            seconds += spent
+            words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
+            print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
             temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
-            kept = {name: thing.state_dict() for name, thing in self.state.items()}
+            states = {name: thing.state_dict() for name, thing in self.state.items()}
             torch.save(
-                {**kept, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)},
+                {**states, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)},
                 temporary,
             )
             temporary.replace(self.path)
@@ -167,21 +167,19 @@ class Run:
             raise InputError(
                 f"{self.path}: does not say which recipe it was made by, so it cannot be gone on with; {remedy}"
             )
-        was, now = json.loads(stored), json.loads(json.dumps(recipe))  # tuples are lists there
-        for name in (*now, *was):
-            if (name in was) != (name in now) or was.get(name) != now.get(name):
-                made, asked = (
-                    _short(one[name]) if name in one else "nothing" for one in (was, now)
+        before, now = json.loads(stored), json.loads(json.dumps(recipe))  # tuples are lists there
+        for name in (*now, *before):
+            if (name in before) != (name in now) or before.get(name) != now.get(name):
+                stored_value, new_value = (
+                    _short(one[name]) if name in one else "nothing" for one in (before, now)
                 )
                 raise InputError(
-                    f"{self.path}: was made with {name} = {made}, got {asked}; {remedy}, or restore the setting"
+                    f"{self.path}: was made with {name} = {stored_value}, got {new_value}; {remedy}, or restore the setting"
                 )
 
 
 def minutes(*paths: Path) -> float | None:
-    """How long the trainings behind some checkpoints took together; None where one is not at hand
-    or does not say.
-    """
+    """Total training time of some checkpoints; None if one is missing or does not record it."""
     total = 0.0
     for path in paths:
         seconds = torch.load(path, weights_only=True).get("seconds") if path.exists() else None
@@ -192,5 +190,5 @@ def minutes(*paths: Path) -> float | None:
 
 
 def _short(value: Any, most: int = 120) -> str:
-    said = json.dumps(value)
-    return said if len(said) <= most else f"{said[:most]}..."
+    text = json.dumps(value)
+    return text if len(text) <= most else f"{text[:most]}..."

@@ -116,10 +116,10 @@ def looks_of(seed: int, thing: int, split: Split) -> list[Look]:
     if split.bare:
         return [replace(first, ground=GROUNDS.index("grass"), time=TIMES.index("day"))]
     if split.moved:
-        other = draw_look(thing, rng, pairs="any")
-        while other.ground == first.ground or other.time == first.time:
-            other = draw_look(thing, rng, pairs="any")
-        return [first, replace(first, ground=other.ground, time=other.time)]
+        second = draw_look(thing, rng, pairs="any")
+        while second.ground == first.ground or second.time == first.time:
+            second = draw_look(thing, rng, pairs="any")
+        return [first, replace(first, ground=second.ground, time=second.time)]
     # What the test for directions changes is drawn like everything else.
     what = ("surface", "surface", "ground", "time")[int(rng.integers(4))]
     return [
@@ -155,8 +155,8 @@ def render_world(
         yield np.rint(255 * image).astype(np.uint8), attributes(world.thing, looks[0]), 0, 0
         return
     for view in range(world.views):
-        made, _ = pictures(world, looks, size, view=view)
-        for look, image in enumerate(made):
+        images, _ = pictures(world, looks, size, view=view)
+        for look, image in enumerate(images):
             yield image, attributes(world.thing, looks[look]), view, look
 
 
@@ -164,16 +164,16 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
     rows = []
     for seed in range(start, min(start + split.shard, split.first + split.worlds)):
         rows += [
-            (image, shown, seed, view, look)
-            for image, shown, view, look in render_world(seed, split)
+            (image, values, seed, view, look)
+            for image, values, view, look in render_world(seed, split)
         ]
-    images, shown, world, view, look = zip(*rows, strict=True)
+    images, values, world, view, look = zip(*rows, strict=True)
     temporary = path.with_suffix(f".{os.getpid()}.tmp")
     with temporary.open("wb") as file:
         np.savez(
             file,
             images=np.stack(images),
-            attributes=np.array(shown),
+            attributes=np.array(values),
             world=world,
             view=view,
             look=look,
@@ -198,19 +198,19 @@ def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
             task = bar.add_task(
                 f"pictures: {name}", total=len(files), completed=len(files) - len(missing)
             )
-            for done in as_completed(
+            for finished in as_completed(
                 [pool.submit(_make_shard, path, split, start) for path, start in missing]
             ):
-                done.result()
+                finished.result()
                 bar.advance(task)
     return files
 
 
 def load(folder: Path, name: str, workers: int = 2) -> Pictures:
     """The pictures of a split, rendered where they are missing."""
-    found: dict[str, list[npt.NDArray]] = {}
+    columns: dict[str, list[npt.NDArray]] = {}
     for path in make(folder, name, workers):
         with np.load(path) as stored:
             for key in stored.files:
-                found.setdefault(key, []).append(stored[key])
-    return Pictures(**{key: np.concatenate(parts) for key, parts in found.items()})
+                columns.setdefault(key, []).append(stored[key])
+    return Pictures(**{key: np.concatenate(parts) for key, parts in columns.items()})

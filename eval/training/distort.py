@@ -1,9 +1,8 @@
 """Distortions of known strength, on one scale from 0 (unseen) to 5 (ruined).
 
-The scale is ours, not people's: within a kind it follows the parameter, which nobody would order
-otherwise. Between kinds it says little more than what is plain to see, such as that a shift by a
-pixel is weaker than a blur of two; pairs of different kinds are therefore only used a full step
-apart.
+The scale is defined here, not measured on people. Within a kind, it follows the parameter, so its
+order is beyond doubt. Between kinds, it is coarse: a shift by one pixel is weaker than a blur of
+two. So pairs of different kinds differ by at least a full step.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""What clip-small's image tower learns before it meets sentences: to name each attribute of a
-picture, by linear heads.
+"""First stage of clip-small: linear heads name each attribute of a picture, to train the image tower.
 
-In whole sentences a colour and a ground nearly tell a batch's pictures apart, and a text tower that
-cannot tell nouns apart gives pictures no reason to: shapes, which are harder, went unlearned for
-long. Here every picture of a batch has its own geometry. The heads are used in training alone.
+In whole sentences, colour and ground nearly identify a picture of the batch, so shapes, which are
+harder, are learned late. Here every picture of a batch has its own geometry. The heads are used in
+training alone.
 """
 
 from __future__ import annotations
@@ -31,19 +30,17 @@ SCALE = (0.5, 0.85)
 """Shares of a picture's side: the thing stands about the middle, and background costs time."""
 PEAK = 2e-3
 SCRAMBLED = 0.3
-"""Share of pictures whose colours are scrambled and of which the thing alone is asked: a thing must
-be known in a colour in which it was never seen."""
+"""Share of pictures with scrambled colours, for which only the thing is a target: it must be
+recognised in colours that training never shows it in."""
 SMOOTHING = 0.05
 KEPT = 200
-"""Worlds of "train-shapes" that are not trained on: what to change in a recipe is decided by them,
-not by the tests.
-"""
+"""Held-out worlds of "train-shapes": recipes are tuned on them, not on the test sets."""
 
 Ints = npt.NDArray[np.int64]
 
 
 class Heads(nn.Module):
-    """One linear guess for every attribute, from the picture's features."""
+    """A linear classifier per attribute, of the picture's features."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -61,13 +58,13 @@ class Heads(nn.Module):
         parts = self.guess(x).float().split(list(self.counts.values()), dim=1)
         return dict(zip(self.counts, parts, strict=True))
 
-    def forward(self, x: torch.Tensor, shown: Ints) -> torch.Tensor:
+    def forward(self, x: torch.Tensor, attributes: Ints) -> torch.Tensor:
         """Cross-entropy of (N, dim) features with what is shown, (N, 6), meant over the attributes;
         -1 is not asked.
         """
         total = torch.zeros(())
         for column, scores in self.scores(x).items():
-            asked = torch.from_numpy(shown[:, column])
+            asked = torch.from_numpy(attributes[:, column])
             if bool((asked >= 0).any()):
                 loss = F.cross_entropy(scores, asked, ignore_index=-1, label_smoothing=SMOOTHING)
                 total = total + (2 if column == 0 else 1) * loss
@@ -76,18 +73,18 @@ class Heads(nn.Module):
 
 @dataclass(frozen=True)
 class Part:
-    """A split as training goes through it.
+    """A split, in the units that training draws.
 
     Attributes:
         pictures: of the split.
         views: for each view of each world, the rows of its looks.
-        kept: rows that are not trained on.
+        held_out: rows that are not trained on.
         times: how often an epoch shows it.
     """
 
     pictures: Pictures
     views: list[Ints]
-    kept: Ints
+    held_out: Ints
     times: int = 1
 
 
@@ -103,16 +100,16 @@ def pictures_of(data: Path) -> list[Part]:
     ):
         pictures = load(data, name)
         worlds = np.unique(pictures.world)
-        kept = (
+        held_out = (
             np.isin(pictures.world, worlds[-KEPT:])
             if name == "train-shapes"
             else np.zeros(len(pictures), bool)
         )
         keys = pictures.world * 8 + pictures.view
-        order = np.flatnonzero(~kept)
+        order = np.flatnonzero(~held_out)
         order = order[np.argsort(keys[order], kind="stable")]
         views = list(np.split(order, np.flatnonzero(np.diff(keys[order])) + 1))
-        parts.append(Part(pictures, views, np.flatnonzero(kept), times))
+        parts.append(Part(pictures, views, np.flatnonzero(held_out), times))
     return parts
 
 
@@ -156,18 +153,18 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
             chosen = [units[u] for u in order[step * BATCH : (step + 1) * BATCH]]
             drawn = [(sets[k].pictures, int(rows[rng.integers(len(rows))])) for k, rows in chosen]
             images = crops(np.stack([p.images[r] for p, r in drawn]), CROP, rng, scale=SCALE)
-            shown = np.stack([p.attributes[r] for p, r in drawn])
-            which = rng.uniform(size=BATCH) < SCRAMBLED
-            images = scrambled(images, which, rng)
-            shown[which, 1:] = -1
+            attributes = np.stack([p.attributes[r] for p, r in drawn])
+            is_scrambled = rng.uniform(size=BATCH) < SCRAMBLED
+            images = scrambled(images, is_scrambled, rng)
+            attributes[is_scrambled, 1:] = -1
             with torch.autocast("cpu", torch.bfloat16):
-                loss = heads(pool.features(vision(images)[-1]), shown)
+                loss = heads(pool.features(vision(images)[-1]), attributes)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(vision.parameters(), 1.0)
             optimizer.step()
             total += float(loss.detach())
-        return {"heads": total / each, **_kept_right(sets, model, heads)}
+        return {"heads": total / each, **_held_out_accuracy(sets, model, heads)}
 
     checkpoint = out / "clip-small-naming.pt"
     state = {"vision": vision, "norm": pool.norm, "heads": heads, "optimizer": optimizer}
@@ -176,17 +173,17 @@ def warm_start(sets: list[Part], out: Path, *, epochs: int = EPOCHS) -> Path:
 
 
 def recipe() -> dict[str, Any]:
-    """What the checkpoint depends on."""
+    """Settings and data that a checkpoint depends on."""
     return settings(globals(), "train", "train-rendered", "train-moved", "train-shapes")
 
 
 @torch.no_grad()
-def _kept_right(sets: list[Part], model: ClipSmall, heads: Heads) -> dict[str, float]:
-    """Shares of things and colours named right in the worlds that are kept from training."""
+def _held_out_accuracy(sets: list[Part], model: ClipSmall, heads: Heads) -> dict[str, float]:
+    """Shares of things and colours named right in the held-out worlds."""
     model.eval()
     right: dict[str, list[npt.NDArray[np.bool_]]] = {"things": [], "colours": []}
     for part in sets:
-        for rows in np.array_split(part.kept, max(1, len(part.kept) // 100)):
+        for rows in np.array_split(part.held_out, max(1, len(part.held_out) // 100)):
             if not len(rows):
                 continue
             x = torch.from_numpy(part.pictures.images[rows]).permute(0, 3, 1, 2).float().div(255)
@@ -195,8 +192,8 @@ def _kept_right(sets: list[Part], model: ClipSmall, heads: Heads) -> dict[str, f
                 scores = heads.scores(
                     model.pool.features(model.vision(x.to(memory_format=torch.channels_last))[-1])
                 )
-            shown = part.pictures.attributes[rows]
-            right["things"].append(scores[0].argmax(1).numpy() == shown[:, 0])
-            colored = np.isin(shown[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
-            right["colours"].append((scores[2].argmax(1).numpy() == shown[:, 2])[colored])
+            attributes = part.pictures.attributes[rows]
+            right["things"].append(scores[0].argmax(1).numpy() == attributes[:, 0])
+            colored = np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
+            right["colours"].append((scores[2].argmax(1).numpy() == attributes[:, 2])[colored])
     return {f"{what} named": float(np.concatenate(v).mean()) for what, v in right.items() if v}

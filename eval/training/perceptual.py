@@ -1,8 +1,7 @@
-"""Recipe of perceptual-small: a distance of pictures that puts distortions in the order of their
-strengths.
+"""Recipe of perceptual-small: a distance of pictures that orders distortions by their strengths.
 
 Features and channel weights are learned together, on photographs and renderings, from pairs of
-distortions of which one is known to be the stronger (:mod:`training.distort`).
+distortions with a stronger one by construction (:mod:`training.distort`).
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ Image = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """Where crops come from: photographs of any size, and renderings."""
+    """Sources of crops: photographs of any size, and renderings."""
 
     photos: list[npt.NDArray[np.uint8]]
     renders: npt.NDArray[np.uint8]
@@ -87,13 +86,13 @@ def photographs(names: tuple[str, ...]) -> list[npt.NDArray[np.uint8]]:
     import skimage.data
 
     folder = Path(skimage.data.__file__).parent
-    found: list[npt.NDArray[np.uint8]] = []
+    images: list[npt.NDArray[np.uint8]] = []
     for name in names:
         image = cv2.imread(str(folder / name), cv2.IMREAD_COLOR)
         if image is None:
             raise FileNotFoundError(f"{folder / name}: not in this scikit-image")
-        found.append(np.ascontiguousarray(image[..., ::-1]).astype(np.uint8))
-    return found
+        images.append(np.ascontiguousarray(image[..., ::-1]).astype(np.uint8))
+    return images
 
 
 def triple(

@@ -1,7 +1,7 @@
 """Pictures of random worlds by ray casting: every look of a world from one set of rays.
 
-Direct light of sun and sky on the surfaces, as :mod:`attnwarp_eval.truth.shading` has it, and one reflection for
-what is shiny or of metal. About twenty pictures a second; Mitsuba, which renders a share of the data, makes five.
+Direct light of sun and sky on the surfaces, as in :mod:`attnwarp_eval.truth.shading`, and one reflection on
+shiny and metal surfaces. About twenty pictures a second; Mitsuba, which renders a share of the data, makes five.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ def pictures(world: World, looks: Sequence[Look], size: int, *, view: int = 0) -
     geometry = Geometry(Scene(SceneSpec.model_validate(world.spec(looks[0], size, statue=False))))
     camera = scenes[0].cameras[view]
     hits = geometry.trace(camera)
-    seen = hits.valid
-    points, normals, ids = hits.point[seen], hits.normal[seen], hits.primitive_id[seen]
+    hit = hits.valid
+    points, normals, ids = hits.point[hit], hits.normal[hit], hits.primitive_id[hit]
     directions = camera.directions() @ camera.rotation
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-    free = [(d, geometry.reached(points + 2 * geometry.extent * d, points, ids)) for d in hemisphere(normals, SKY_RAYS)]
-    mirrored = _mirrored(geometry, points, normals, directions[seen], ids)
+    sky_rays = [(d, geometry.reached(points + 2 * geometry.extent * d, points, ids)) for d in hemisphere(normals, SKY_RAYS)]
+    mirrored = _mirrored(geometry, points, normals, directions[hit], ids)
     out = []
     for scene, look in zip(scenes, looks, strict=True):
-        radiance = _sky(scene, directions.reshape(-1, 3)).reshape(*seen.shape, 3)
-        radiance[seen] = _radiance(scene, look, geometry, points, normals, ids, directions[seen], free, mirrored)
+        radiance = _sky(scene, directions.reshape(-1, 3)).reshape(*hit.shape, 3)
+        radiance[hit] = _radiance(scene, look, geometry, points, normals, ids, directions[hit], sky_rays, mirrored)
         out.append(np.rint(255 * to_srgb(radiance)).astype(np.uint8))
     return out, hits
 
@@ -65,18 +65,18 @@ def pictures(world: World, looks: Sequence[Look], size: int, *, view: int = 0) -
 def _mirrored(
     geometry: Geometry, points: Array, normals: Array, directions: Array, ids: npt.NDArray[np.int64]
 ) -> tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]]:
-    """Where the object's mirror directions lead: direction, which of the points, and what they meet there."""
-    mine = np.flatnonzero(geometry.object_of(ids) == 0)
-    d, n = directions[mine], normals[mine]
+    """Mirror rays of the object: direction, index of the point, and the point and normal that each hits."""
+    on_object = np.flatnonzero(geometry.object_of(ids) == 0)
+    d, n = directions[on_object], normals[on_object]
     away = d - 2 * np.einsum("ij,ij->i", d, n)[:, None] * n
-    met = geometry.trace_rays(points[mine] + 1e-4 * geometry.extent * n, away)
-    hit = np.isfinite(met.point).all(axis=-1)
-    return away, mine, met.point[hit], met.normal[hit], np.where(hit, np.cumsum(hit) - 1, -1)
+    reflected_hits = geometry.trace_rays(points[on_object] + 1e-4 * geometry.extent * n, away)
+    hit = np.isfinite(reflected_hits.point).all(axis=-1)
+    return away, on_object, reflected_hits.point[hit], reflected_hits.normal[hit], np.where(hit, np.cumsum(hit) - 1, -1)
 
 
 def _radiance(
     scene: Scene, look: Look, geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
-    directions: Array, free: list[tuple[Array, npt.NDArray[np.bool_]]],
+    directions: Array, sky_rays: list[tuple[Array, npt.NDArray[np.bool_]]],
     mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
 ) -> Array:  # fmt: skip
     color = _albedo(scene, look, geometry, points, ids)
@@ -85,34 +85,34 @@ def _radiance(
         if isinstance(spec, SunSpec):
             toward = sun_direction(spec)
             cosine = normals @ toward
-            lit = np.flatnonzero(cosine > 0)
-            lit = lit[geometry.reached(points[lit] + 2 * geometry.extent * toward, points[lit], ids[lit])]
-            light[lit] += cosine[lit, None] * spec.irradiance * np.array(linear_rgb(spec.color))
-    for direction, reached in free:
-        light += np.where(reached[:, None], _sky(scene, direction), 0) * (np.pi / len(free))
+            facing = np.flatnonzero(cosine > 0)
+            facing = facing[geometry.reached(points[facing] + 2 * geometry.extent * toward, points[facing], ids[facing])]
+            light[facing] += cosine[facing, None] * spec.irradiance * np.array(linear_rgb(spec.color))
+    for direction, reached in sky_rays:
+        light += np.where(reached[:, None], _sky(scene, direction), 0) * (np.pi / len(sky_rays))
     radiance = color * light / np.pi
     finish = FINISHES[look.finish]
     if finish != "shiny" and finish not in REFLECTANCE:
         return radiance
-    away, mine, there, _, index = mirrored
-    # What a mirror ray meets is shown under an even light: its own shadows are not traced.
+    away, on_object, reflected_points, _, index = mirrored
+    # Surfaces in a reflection get an even light: their shadows are not traced.
     ambient = _sky(scene, np.array([[0.0, 0.0, 1.0]]))[0] * 0.6 + _sun(scene) * 0.25
     reflected = _sky(scene, away) + _glint(scene, away, look)
     hit = index >= 0
     if hit.any():
         ground = np.array([linear_rgb(c) for c in scene.spec.objects[1].texture.colors]).mean(axis=0)  # type: ignore[union-attr]
-        low = there[index[hit]][:, 2:3] < 1e-3
+        low = reflected_points[index[hit]][:, 2:3] < 1e-3
         reflected[hit] = np.where(low, ground, 0.25) * ambient
-    cosine = np.clip(-np.einsum("ij,ij->i", directions[mine], normals[mine]), 0, 1)[:, None]
+    cosine = np.clip(-np.einsum("ij,ij->i", directions[on_object], normals[on_object]), 0, 1)[:, None]
     if finish == "shiny":
         base = np.full(3, 0.04)
         fresnel = base + (1 - base) * (1 - cosine) ** 5
-        radiance[mine] = (1 - fresnel) * radiance[mine] + fresnel * reflected
+        radiance[on_object] = (1 - fresnel) * radiance[on_object] + fresnel * reflected
         return radiance
     base = np.array(REFLECTANCE[finish])
     fresnel = base + (1 - base) * (1 - cosine) ** 5
     # A rough metal scatters some of the light about it, which the mirror ray alone would miss.
-    radiance[mine] = fresnel * (0.65 * reflected + 0.35 * light[mine] / np.pi)
+    radiance[on_object] = fresnel * (0.65 * reflected + 0.35 * light[on_object] / np.pi)
     return radiance
 
 
@@ -120,9 +120,9 @@ def _albedo(scene: Scene, look: Look, geometry: Geometry, points: Array, ids: np
     objects = geometry.object_of(ids)
     color = np.zeros((len(points), 3))
     for k, item in enumerate(scene.spec.objects):
-        mine = objects == k
-        if mine.any():
-            color[mine] = albedo(item.texture, points[mine])
+        on_object = objects == k
+        if on_object.any():
+            color[on_object] = albedo(item.texture, points[on_object])
     tint = geometry.tint(points, ids)
     return color if look.statue else color * tint
 

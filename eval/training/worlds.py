@@ -303,7 +303,7 @@ class World:
 
     def _clutter(self, rng: np.random.Generator) -> list[dict[str, Any]]:
         """Small muted things around, never of the object's kind, and sometimes a wall or a hedge."""
-        found = []
+        items = []
         for k in range(int(rng.integers(0, 5))):
             angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 4.0)
             place = [round(float(far * np.cos(angle)), 2), round(float(far * np.sin(angle)), 2), 0.0]
@@ -332,7 +332,7 @@ class World:
                     }
                     place = [round(1.4 * place[0], 2), round(1.4 * place[1], 2), 0.0]
             scale = round(float(rng.uniform(2.0, 3.5) if kind == "tree" else rng.uniform(0.35, 0.7)), 2)
-            found.append(
+            items.append(
                 {"name": f"clutter{k}", "shape": {**shape, "position": place, "scale": scale}, "texture": texture}
             )
         for k in range(int(rng.integers(0, 3))):
@@ -357,8 +357,8 @@ class World:
                     "mortar": "#b5aa9c",
                     "size": [0.5, 0.2],
                 }
-            found.append({"name": f"wall{k}", "shape": box, "texture": texture})
-        return found
+            items.append({"name": f"wall{k}", "shape": box, "texture": texture})
+        return items
 
     def scene(self, look: Look, size: int) -> Scene:
         """The scene itself, which Mitsuba renders with its real materials."""
