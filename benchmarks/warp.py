@@ -12,7 +12,8 @@ ratios within a round.
 
 The yardstick of memory is a copy of the bytes that a warp must move, the source's tokens once and
 the result's once, by the same threads in the same rounds. A warp's share of the bandwidth is the
-copy's time over its own. Taps counted are those of weight above 0, times channels.
+copy's time over its own; a blend moves other bytes and has none. Taps counted are those of weight
+above 0, times channels.
 """
 
 from __future__ import annotations
@@ -196,7 +197,7 @@ def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
                 case.round()
     rows = [row for case in cases for row in case.rows()]
     for row in rows:
-        if "bytes" in row:
+        if row["contestant"] in ("copy", "tokens", "maps"):
             row["bandwidth_share"] = 1 / row["times_copy"]
     return {"threads": thread_count(), "rounds": rounds, "rows": rows}
 
