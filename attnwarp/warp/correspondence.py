@@ -100,6 +100,18 @@ def correspond(
 
     Raises:
         ValueError: the depth has another size than ``target``, or is not of a floating type.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> c.xy[0, 0].tolist()
+        [2.5, 0.5]
     """
     check.one_of(pixel_centers, get_args(PixelCenters), "pixel_centers")
     depth = valid_depth(target_depth, "target_depth")
@@ -144,6 +156,18 @@ def correspond_at(
         size: (h, w) of the target's feature grid.
         source_size: (h, w) of the source's; by default the source image scaled as the target's is.
         interpolation, spread: as in :func:`resize_depth`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond_at
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond_at(source, target, np.full((8, 8), 2.0), (4, 4))
+        >>> c.xy[0, 0].tolist()  # half as many pixels
+        [1.5, 0.5]
     """
     if source_size is None:
         source_size = layer_size(source, target, size)
@@ -163,6 +187,14 @@ def layer_size(source: Camera, target: Camera, size: tuple[int, int]) -> tuple[i
 
     Raises:
         ValueError: the fraction does not give whole numbers.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import layer_size
+        >>> wide, square = (Camera(np.eye(3), np.eye(4), width, 64) for width in (128, 64))
+        >>> layer_size(wide, square, (8, 8))
+        (8, 16)
     """
     h, w = size[0] * source.height / target.height, size[1] * source.width / target.width
     if h != round(h) or w != round(w):
@@ -178,6 +210,18 @@ def in_bounds(correspondence: Correspondence, size: tuple[int, int] | None = Non
 
     With half centres that is 0 <= x <= W. With integer centres the method takes the index for the
     position, so it is the index that is held against 0 <= u < W.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, in_bounds
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> in_bounds(c)[0].tolist()
+        [True, True, True, True, True, True, False, False]
     """
     h, w = size if size is not None else (correspondence.source.height, correspondence.source.width)
     x, y = correspondence.xy.unbind(-1)

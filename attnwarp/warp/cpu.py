@@ -390,7 +390,12 @@ def _parts(
 
 
 def _floating(value: Array, name: str) -> np.ndarray:
-    tensor = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.asarray(value))
+    # torch takes no array that may not be written.
+    tensor = (
+        value.detach()
+        if isinstance(value, Tensor)
+        else torch.from_numpy(np.require(value, requirements="W"))
+    )
     if not tensor.dtype.is_floating_point:
         raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
     return (tensor.float() if tensor.dtype in _STORED else tensor).cpu().numpy()

@@ -46,6 +46,13 @@ def resize_depth(
 
     Returns:
         (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp.warp import resize_depth
+        >>> step = torch.tensor([[1.0, 1.0, 1.0, 2.0]])
+        >>> resize_depth(step, (1, 2)).tolist()  # no depth between two surfaces
+        [[1.0, nan]]
     """
     source = valid_depth(depth, "depth")
     h, w = size
@@ -111,6 +118,12 @@ def depth_slope(depth: Array) -> Tensor:
 
     Returns:
         (H, W) float64; an axis without a defined neighbour adds 0, an undefined pixel gives NaN.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp.warp import depth_slope
+        >>> depth_slope(torch.tensor([[1.0, 1.5, 2.0, 9.0]])).tolist()
+        [[0.5, 0.5, 0.5, 7.0]]
     """
     z = as_float64(depth, "depth")
     check.shape(z, ("H", "W"), "depth")

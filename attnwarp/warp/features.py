@@ -61,6 +61,20 @@ class FeatureWarp:
 
         Raises:
             ValueError: another shape than the source grid's, or a type that cannot be blended.
+
+        Example:
+            >>> import numpy as np, torch
+            >>> from attnwarp import Camera
+            >>> from attnwarp.warp import Surface, warp_surfaces
+            >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+            >>> shift = np.eye(4)
+            >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+            >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+            >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
+            >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
+            >>> layer.warp_tokens(column)[0, :4, 0].tolist()
+            [1.0, 2.0, 3.0, 3.0]
         """
         self._check_tokens(source)
         taps = self._tokens_taps(source)
@@ -85,6 +99,22 @@ class FeatureWarp:
         Raises:
             ValueError: shapes that do not fit, a type that cannot be blended, ``alpha`` out of
                 range, ``in_place`` with a gradient.
+
+        Example:
+            >>> import numpy as np, torch
+            >>> from attnwarp import Camera
+            >>> from attnwarp.warp import Surface, warp_surfaces
+            >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+            >>> shift = np.eye(4)
+            >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+            >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+            >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+            >>> layer = warp_surfaces(source, target, wall, wall).at((4, 4))
+            >>> column = torch.arange(4.0).repeat(4).reshape(1, 16, 1)
+            >>> layer.mask[0].tolist()
+            [True, True, True, False]
+            >>> layer.blend_tokens(column, torch.zeros(1, 16, 1), 0.5)[0, :4, 0].tolist()
+            [0.5, 1.0, 1.5, 0.0]
         """
         self._check_tokens(source)
         self._check_blend(source, new, alpha, in_place)

@@ -24,6 +24,12 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
 
     Returns:
         (h, w) bool.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp.warp import resize_mask
+        >>> resize_mask(torch.tensor([[True, True, True, False, False, False]]), (1, 2)).tolist()
+        [[True, False]]
     """
     check.one_of(mode, get_args(MaskResize), "mode")
     if mask.dtype != torch.bool:

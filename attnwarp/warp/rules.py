@@ -26,7 +26,20 @@ misses whole."""
 
 
 def in_front(correspondence: Correspondence) -> Tensor:
-    """The point lies in front of the source camera (z > 0)."""
+    """The point lies in front of the source camera (z > 0).
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, in_front
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> bool(in_front(c).all())
+        True
+    """
     return correspondence.z > 0
 
 
@@ -44,6 +57,18 @@ def opaque(
         target_alpha: (H, W) in [0, 1]; left out, every pixel passes.
         source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every
             pixel passes.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, opaque
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> opaque(c, 0.5, target_alpha=np.eye(8))[0].tolist()
+        [True, False, False, False, False, False, False, False]
     """
     mask = torch.ones(correspondence.z.shape, dtype=torch.bool)
     if target_alpha is not None:
@@ -76,6 +101,18 @@ def depth_agrees(
         relative: tolerance as a fraction of z, :data:`EXACT_DEPTH_TOLERANCE` for exact depth.
         slope: pixels of the source's depth slope to allow.
         spread: as in :func:`attnwarp.warp.depth.resize_depth`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, depth_agrees
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> depth_agrees(c, np.full((8, 8), 1.5)).any().item()  # something stands before it
+        False
     """
     depth = as_float64(source_depth, "source_depth")
     seen = sample_depth(depth, correspondence, spread=spread)
@@ -95,6 +132,19 @@ def photometric(
 
     Args:
         source_image: (h, w, C) and target_image: (H, W, C), before any edit, sRGB in [0, 1].
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, photometric
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> black, grey = np.zeros((8, 8, 3)), np.full((8, 8, 3), 0.15)
+        >>> [photometric(c, black, grey, limit).all().item() for limit in (0.2, 0.1)]
+        [True, False]
     """
     source = as_float64(source_image, "source_image")
     target = as_float64(target_image, "target_image")
@@ -114,6 +164,19 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
     Args:
         target_normal: (H, W, 3) world normals of either sign and any length; zero and NaN are
             undefined.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, facing
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
+        >>> facing(c, normal).all().item()
+        True
     """
     normal, defined = _normals(correspondence, target_normal)
     return defined & (
@@ -124,7 +187,21 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
 def source_incidence(
     correspondence: Correspondence, target_normal: Array, angle: float = 60.0
 ) -> Tensor:
-    """:func:`facing`, and the source sees the surface within ``angle`` degrees of its normal."""
+    """:func:`facing`, and the source sees the surface within ``angle`` degrees of its normal.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, source_incidence
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
+        >>> source_incidence(c, normal, 20.0)[4].tolist()  # within 20 degrees of the source's axis
+        [True, True, True, True, True, False, False, False]
+    """
     normal, defined = _normals(correspondence, target_normal)
     points = correspondence.points
     toward = -points
@@ -141,6 +218,19 @@ def camera_frame(
 
     The two normals stand in the axes of two different cameras, so that the angle between them holds
     the cameras' relative rotation: the same surface seen by a rolled camera fails.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import camera_frame, correspond
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> normal = np.broadcast_to([0.0, 0, -1], (8, 8, 3))
+        >>> camera_frame(c, normal).all().item()
+        True
     """
     normal, defined = _normals(correspondence, target_normal)
     source = _flip(_rotate(correspondence.source, normal), correspondence.points)
@@ -163,6 +253,17 @@ def gaussian_filter(
 
     Returns:
         (N,) bool.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.warp import gaussian_filter
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.2), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=8, height=8, fov_y=40, up=[0, 1, 0])
+        >>> above, below = (Camera.look_at([0, 0, z], [0, 0, 0], **view) for z in (3, -3))
+        >>> gaussian_filter(disc, above, below, "facing").tolist()
+        [False]
     """
     check.one_of(rule, get_args(GaussianFilter), "rule")
     if rule == "none":
@@ -194,6 +295,12 @@ def angle_between(a: Tensor, b: Tensor) -> Tensor:
 
     2 atan2(|a/|a| - b/|b||, |a/|a| + b/|b||) (Kahan, "How futile are mindless assessments of
     roundoff", 2006), which keeps its digits near 0 and 180 where an arccosine loses half of them.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp.warp import angle_between
+        >>> round(float(angle_between(torch.tensor([2.0, 0, 0]), torch.tensor([0, 1.0, 0]))), 4)
+        90.0
     """
     a = a / torch.linalg.vector_norm(a, dim=-1, keepdim=True)
     b = b / torch.linalg.vector_norm(b, dim=-1, keepdim=True)

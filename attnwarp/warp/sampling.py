@@ -42,6 +42,20 @@ def sample(
 
     Raises:
         ValueError: another number of axes, a type that cannot be blended, an unknown mode.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, sample
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> import torch
+        >>> warped, mask = sample(torch.arange(8.0).expand(1, 8, 8), c)
+        >>> warped[0, 0].tolist()  # beyond the border its value is taken
+        [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 7.0, 7.0]
     """
     if features.ndim not in (3, 4):
         raise ValueError(
@@ -67,6 +81,12 @@ def sample_at(
 
     Raises:
         ValueError: a half-precision or integer ``xy``: bfloat16 cannot even tell 256.5 from 257.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp.warp import sample_at
+        >>> sample_at(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[[1.0, 0.5]]])).tolist()
+        [[[2.0]]]
     """
     check.one_of(mode, ("bilinear", "nearest"), "mode")
     if xy.dtype not in (torch.float32, torch.float64):
@@ -162,6 +182,18 @@ def sample_depth(
 
     Returns:
         (H, W) float64, NaN outside the source image and where the taps do not answer.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond, sample_depth
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> c = correspond(source, target, np.full((8, 8), 2.0))
+        >>> sample_depth(np.full((8, 8), 2.0), c)[0, 4:].tolist()
+        [2.0, 2.0, nan, nan]
     """
     depth = valid_depth(source_depth, "source_depth")
     xy = positions_in(correspondence, depth.shape[1], depth.shape[0])

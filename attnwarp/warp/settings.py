@@ -195,6 +195,11 @@ def preset(name: str, **changes: Any) -> WarpSettings:
 
     Raises:
         ValueError: an unknown preset or field, or a value out of range; the message names it.
+
+    Example:
+        >>> from attnwarp.warp import preset
+        >>> preset("corrected", opaque=0.9).opaque
+        0.9
     """
     check.one_of(name, list(PRESETS), "preset")
     return WarpSettings.from_dict({**PRESETS[name].to_dict(), **changes})

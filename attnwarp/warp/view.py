@@ -137,6 +137,21 @@ def warp_surfaces(
     Raises:
         ValueError: a rule needs something that is not given; the message names the rule and what it
             needs.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import Surface, warp_surfaces
+        >>> K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+        >>> shift = np.eye(4)
+        >>> shift[0, 3] = 0.5  # the source stands to the left: 8 * 0.5 / 2 px at depth 2
+        >>> target, source = Camera(K, np.eye(4), 8, 8), Camera(K, shift, 8, 8)
+        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+        >>> view = warp_surfaces(source, target, wall, wall)
+        >>> view.mask[0].tolist()
+        [True, True, True, True, True, True, False, False]
+        >>> list(view.rules)
+        ['defined', 'in_bounds', 'in_front', 'opaque', 'depth_agrees', 'facing']
     """
     check.one_of(backend, get_args(Backend), "backend")
     if backend != "reference":
@@ -230,6 +245,18 @@ def warp_view(
             serves many targets.
         backend: of the renderer, as in :func:`attnwarp.render.render`.
         warp_backend: of the warp, as in :func:`warp_surfaces`.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.warp import warp_view
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=16, height=16, fov_y=40, up=[0, 1, 0])
+        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], **view)
+        >>> view = warp_view(disc, camera, camera)
+        >>> view.mask[8, 8].item(), view.at((4, 4)).mask.shape
+        (True, torch.Size([4, 4]))
     """
     keep = gaussian_filter(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
@@ -267,7 +294,20 @@ def render_surface(
     backend: str = "auto",
 ) -> Surface:
     """Depth, normals, alpha and colour of splats as ``settings`` wants them rendered, on the
-    CPU."""
+    CPU.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.warp import render_surface
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=16, height=16, fov_y=40, up=[0, 1, 0])
+        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], **view)
+        >>> surface = render_surface(disc, camera)
+        >>> surface.depth.shape, round(float(surface.depth[8, 8]), 4)
+        (torch.Size([16, 16]), 3.0)
+    """
     from attnwarp.render import render
 
     depth = settings.depth

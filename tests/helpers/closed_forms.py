@@ -1,4 +1,4 @@
-"""Cameras, spheres and planes whose views are known in closed form."""
+"""Cameras, spheres and planes whose views have a closed form."""
 
 import numpy as np
 import torch

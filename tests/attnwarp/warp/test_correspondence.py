@@ -22,10 +22,10 @@ def test_a_plane_moves_by_its_homography(change):
     depth = plane_depth(target, normal, offset)
     c = correspond(source, target, depth)
     expected = apply(homography(source, target, normal, offset), target.pixel_centers())
-    known = c.defined.numpy()
-    assert known.sum() > 1000
+    defined = c.defined.numpy()
+    assert defined.sum() > 1000
     # 1e-4 px is the bound of the hard case; float64 leaves about 1e-11.
-    assert np.abs(c.xy.numpy() - expected)[known].max() < 1e-9
+    assert np.abs(c.xy.numpy() - expected)[defined].max() < 1e-9
 
 
 @pytest.mark.parametrize("focal", [1.0, 30.0, 1e3, 1e5])

@@ -32,8 +32,8 @@ def test_features_of_any_size_are_read_at_u_times_s(size):
         homography(source, target, (1, 0, 0), 0.0),
         target.resize(w, h).pixel_centers() * [512 / w, 512 / h],
     )
-    known = layer.defined.numpy()
-    assert np.abs(layer.xy.numpy() * [512 / w, 512 / h] - exact)[known].max() < 1e-6
+    answered = layer.defined.numpy()
+    assert np.abs(layer.xy.numpy() * [512 / w, 512 / h] - exact)[answered].max() < 1e-6
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float16, 5e-4), (torch.bfloat16, 4e-3)])
@@ -169,9 +169,9 @@ def test_the_sources_own_depth_answers_where_its_taps_do():
     seen = sample_depth(source_depth, c)
     inside = in_bounds(c)
     assert torch.isnan(seen[~inside]).all()
-    known = torch.isfinite(seen)
-    assert known.sum() > 0.3 * inside.sum()
+    answered = torch.isfinite(seen)
+    assert answered.sum() > 0.3 * inside.sum()
     # Inverse depth is linear on a plane, except where the border clamps a tap: within half a pixel
     # of the image's end.
-    inner = known & ((c.xy > 0.5) & (c.xy < 127.5)).all(-1)
+    inner = answered & ((c.xy > 0.5) & (c.xy < 127.5)).all(-1)
     assert (seen / c.z - 1)[inner].abs().max() < 1e-9

@@ -1,10 +1,16 @@
 """Settings and presets."""
 
+import dataclasses
 import json
+import re
+from pathlib import Path
 
 import pytest
+import torch
+from closed_forms import orbit, shell
 
 from attnwarp.warp.settings import PRESETS, WarpSettings, preset
+from attnwarp.warp.view import warp_view
 
 
 def test_presets_go_through_json_and_back():
@@ -17,19 +23,73 @@ def test_presets_go_through_json_and_back():
     assert WarpSettings(normal_angle=60).to_dict() == WarpSettings(normal_angle=60.0).to_dict()
 
 
-def test_the_presets_are_the_table():
-    paper, released, corrected = (PRESETS[name] for name in ("paper", "released", "corrected"))
-    column = lambda field: tuple(getattr(p, field) for p in (paper, released, corrected))  # noqa: E731
-    assert column("gaussian_filter") == ("printed", "camera_frame", "none")
-    assert column("normal_test") == ("none", "none", "facing")
-    assert column("bounds") == ("target", "source", "source")
-    assert column("pixel_centers") == ("half", "integer", "half")
-    assert column("photometric") == (None, 0.2, None)
-    assert column("in_front") == (False, False, True)
-    assert column("depth_agreement") == (False, False, True)
-    assert column("depth") == ("intersection", "center", "intersection")
-    assert column("depth_statistic") == ("expected", "expected", "median")
-    assert column("mask_resize") == ("area", "bilinear", "area")
+def test_the_presets_are_the_table_of_the_docs():
+    text = (Path(__file__).parents[3] / "docs/warping.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\S+) \| (\S+) \| (\S+) \|$", text, re.MULTILINE)
+    documented = {name: cells for name, *cells in rows}
+    written = {None: "none", True: "true", False: "false"}
+    for field in dataclasses.fields(WarpSettings):
+        values = [getattr(PRESETS[name], field.name) for name in ("paper", "released", "corrected")]
+        if field.name in documented:
+            assert [written.get(value, str(value)) for value in values] == documented[field.name]
+        else:
+            assert len(set(values)) == 1, field.name
+    assert set(documented) <= {field.name for field in dataclasses.fields(WarpSettings)}
+
+
+def test_every_field_changes_what_it_says():
+    """A field that nothing reads could hold any value: each changed alone moves a result."""
+    splats, source, target = shell(3000), orbit(0, size=40), orbit(50, size=40, height=0.8)
+    segment = torch.zeros(40, 40, dtype=torch.bool)
+    segment[:, 18:] = True
+    # Two bare rules, so that no other one hides what a field does.
+    bare = preset("released", photometric=None, segment=False, gaussian_filter="none")
+    agreement, incidence = {"depth_agreement": True}, {"normal_test": "source_incidence"}
+    changes = {
+        "pixel_centers": ("half", {}),
+        "bounds": ("target", {}),
+        "in_front": (True, {}),
+        "opaque": (0.9, {}),
+        "depth_agreement": (True, {}),
+        "depth_relative": (0.3, agreement),
+        "depth_slope": (5.0, agreement),
+        "photometric": (0.02, {}),
+        "segment": (True, {}),
+        "normal_test": ("facing", {}),
+        "gaussian_filter": ("printed", {}),
+        "normal_angle": (20.0, incidence),
+        "depth": ("intersection", {}),
+        "depth_statistic": ("median", {}),
+        "depth_interpolation": ("nearest", {}),
+        "depth_spread": (0.001, {}),
+        "mask_resize": ("nearest", {}),
+    }
+    assert set(changes) == {field.name for field in dataclasses.fields(WarpSettings)}
+
+    def result(settings, views):
+        view = warp_view(splats, *views, settings, target_segment=segment)
+        layer = view.at((13, 13), source_size=(13, 13))
+        parts = (view.correspondence.xy, view.mask, layer.correspondence.xy, layer.mask)
+        return [torch.nan_to_num(part.double()) for part in parts]
+
+    # The source stands inside the sphere in one pair, and is larger than the target in another.
+    pairs = [
+        (source, target),
+        (orbit(0, size=40, distance=0.5), target),
+        (source.resize(60, 60), target),
+    ]
+    for name, (value, needs) in changes.items():
+        start = dataclasses.replace(bare, **needs)
+        changed = dataclasses.replace(start, **{name: value})
+        before, after = (
+            [result(settings, views) for views in pairs] for settings in (start, changed)
+        )
+        same = all(
+            torch.equal(a, b)
+            for one, other in zip(before, after, strict=True)
+            for a, b in zip(one, other, strict=True)
+        )
+        assert not same, name
 
 
 @pytest.mark.parametrize(

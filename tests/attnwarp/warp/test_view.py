@@ -119,8 +119,8 @@ def test_both_doors_give_the_same_view():
     splats, source, target = shell(5000), orbit(0, size=64), orbit(30, size=64)
     for name, settings in PRESETS.items():
         whole = warp_view(splats, source, target, settings)
-        kept = splats.select(gaussian_filter(splats, source, target, settings.gaussian_filter))
-        seen = render_surface(kept, target, settings)
+        filtered = splats.select(gaussian_filter(splats, source, target, settings.gaussian_filter))
+        seen = render_surface(filtered, target, settings)
         seen = dataclasses.replace(seen, image=render_surface(splats, target, settings).image)
         parts = warp_surfaces(
             source, target, seen, render_surface(splats, source, settings), settings

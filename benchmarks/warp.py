@@ -1,0 +1,259 @@
+"""How fast views and attention features are warped: ``python -m benchmarks.warp``.
+
+One process. All contestants of a case take turns, round after round, so that a slow moment of the
+machine falls on all of them. The table has the median over rounds, and ratios are medians of the
+ratios within a round.
+
+- A pair: the correspondence, every rule and the mask at image size, and feature grids of 1/8 and
+  1/16; beside it the definition in torch, and the render of the target that it starts from.
+- Tokens (2, h*w, C): the warp, and the fused blend; beside them torch's ``grid_sample`` and
+  kornia's ``warp_frame_depth`` (which reprojects) on the same features as (2, C, h, w), the
+  definition in torch, and one addition of the warped tokens.
+
+The yardstick of memory is a copy of the bytes that a warp must move, the source's tokens once and
+the result's once, by the same threads in the same rounds. A warp's share of the bandwidth is the
+copy's time over its own; a blend moves other bytes and has none. Taps counted are those of weight
+above 0, times channels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render.api import render
+from attnwarp.render.threads import ranges, run_jobs, thread_count
+from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
+from attnwarp.warp._kernels import sampling as kernels
+
+SPLATS = 40_000
+YAW = 20.0
+BATCH = 2
+ALPHA = 0.7
+
+
+@dataclass
+class Case:
+    """Contestants that take turns, and their wall and processor times in seconds, a row a round."""
+
+    name: str
+    contestants: dict[str, Callable[[], object]]
+    yardstick: str
+    counters: dict[str, int] = field(default_factory=dict)
+    wall: dict[str, list[float]] = field(default_factory=dict)
+    cpu: dict[str, list[float]] = field(default_factory=dict)
+
+    def round(self) -> None:
+        """Time every contestant once."""
+        for name, work in self.contestants.items():
+            start, start_cpu = time.perf_counter(), time.process_time()
+            work()
+            self.cpu.setdefault(name, []).append(time.process_time() - start_cpu)
+            self.wall.setdefault(name, []).append(time.perf_counter() - start)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One line of the table for each contestant."""
+        base = self.cpu[self.yardstick]
+        return [
+            {
+                "case": self.name,
+                "contestant": name,
+                "wall_ms": 1e3 * statistics.median(self.wall[name]),
+                "wall_best_ms": 1e3 * min(self.wall[name]),
+                "cpu_ms": 1e3 * statistics.median(self.cpu[name]),
+                f"times_{self.yardstick}": statistics.median(
+                    a / b for a, b in zip(self.cpu[name], base, strict=True)
+                ),
+                **self.counters,
+            }
+            for name in self.contestants
+        ]
+
+
+def shell(count: int = SPLATS) -> Gaussians:
+    """A unit sphere of flat splats on a Fibonacci lattice."""
+    k = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / count), np.pi * (1 + math.sqrt(5)) * k
+    x, y = np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar)
+    z = np.cos(polar)
+    # The rotation that takes the z axis to the normal.
+    quats = np.stack([1 + z, -y, x, np.zeros(count)], axis=-1)
+    means = torch.from_numpy(np.stack([x, y, z], axis=-1)).float()
+    return Gaussians(
+        "2d",
+        means,
+        torch.from_numpy(quats).float(),
+        torch.full((count, 2), 0.6 * math.sqrt(4 * math.pi / count)),
+        torch.full((count,), 0.99),
+        Gaussians.sh_from_rgb(0.5 + 0.4 * means),
+    )
+
+
+def views(size: int) -> tuple[Camera, Camera]:
+    """Source and target, 20 degrees apart, at 3 radii from the sphere, which fills the picture."""
+    cameras = []
+    for yaw in (0.0, math.radians(YAW)):
+        position = (3 * math.sin(yaw), -3 * math.cos(yaw), 0.5)
+        cameras.append(Camera.look_at(position, (0, 0, 0), width=size, height=size, fov_y=42))
+    return cameras[0], cameras[1]
+
+
+def grids(view: WarpedView, size: int) -> tuple[FeatureWarp, FeatureWarp]:
+    """The two feature grids of a latent model: 1/8 and 1/16 of the image."""
+    return view.at((size // 8, size // 8)), view.at((size // 16, size // 16))
+
+
+def pair_case(size: int) -> Case:
+    """A pair of views from rendered surfaces, with its grids."""
+    splats, (source, target) = shell(), views(size)
+    seen, other = (render_surface(splats, camera) for camera in (target, source))
+    return Case(
+        f"pair {size}",
+        {
+            "warp": lambda: grids(warp_surfaces(source, target, seen, other), size),
+            "definition": lambda: grids(
+                warp_surfaces(source, target, seen, other, backend="reference"), size
+            ),
+            "render": lambda: render(splats, target, backend="cpu"),
+        },
+        "render",
+        {"pixels": size * size},
+    )
+
+
+def tokens_case(grid: int, channels: int, dtype: torch.dtype, *, others: bool) -> Case:
+    """Tokens of one layer; ``others``: with contestants from outside, which take float32 maps."""
+    size = 8 * grid
+    splats, (source, target) = shell(), views(size)
+    seen, other = (render_surface(splats, camera) for camera in (target, source))
+    layer = warp_surfaces(source, target, seen, other).at((grid, grid))
+    generator = torch.Generator().manual_seed(0)
+    tokens = torch.randn(BATCH, grid * grid, channels, generator=generator).to(dtype)
+    new, result = torch.randn(tokens.shape, generator=generator).to(dtype), tokens.clone()
+    maps = tokens.transpose(1, 2).reshape(BATCH, channels, grid, grid).contiguous()
+    raw = torch.int16 if dtype.itemsize == 2 else dtype
+    begin, end = (t.view(raw).numpy() for t in (tokens, result))
+    pieces = ranges(grid * grid, max(1, grid * grid // (4 * thread_count())))
+    contestants: dict[str, Callable[[], object]] = {
+        "copy": lambda: run_jobs(kernels.copy_rows, [(*p, begin, end) for p in pieces]),
+        "tokens": lambda: layer.warp_tokens(tokens),
+        "blend in place": lambda: layer.blend_tokens(tokens, new, ALPHA, in_place=True),
+        "blend": lambda: layer.blend_tokens(tokens, new, ALPHA),
+        "tokens + addition": lambda: layer.warp_tokens(tokens) + new,
+        "maps": lambda: layer.warp(maps),
+    }
+    if others:
+        contestants |= _others(layer, maps)
+    with torch.no_grad():
+        taps = int((layer._tokens_taps(tokens).weight > 0).sum()) * BATCH * channels
+    moved = 2 * tokens.numel() * tokens.element_size()
+    counters = {"taps": taps, "bytes": moved}
+    name = f"tokens ({BATCH}, {grid * grid}, {channels}) {str(dtype).removeprefix('torch.')}"
+    return Case(name, contestants, "copy", counters)
+
+
+def _others(layer: FeatureWarp, maps: Tensor) -> dict[str, Callable[[], object]]:
+    from kornia.geometry.depth import warp_frame_depth
+
+    definition = FeatureWarp(layer.correspondence, layer.mask, "reference")
+    tokens = maps.flatten(2).transpose(1, 2).contiguous()
+    c = layer.correspondence
+    size = torch.tensor([c.source.width, c.source.height])
+    grid = torch.where(c.defined[..., None], 2 * c.xy / size - 1, 0).float()
+    grid = grid[None].expand(len(maps), -1, -1, -1).contiguous()
+    depth = torch.nan_to_num(c.target_depth).float().expand(len(maps), 1, -1, -1)
+    pose = torch.from_numpy(c.source.relative_to(c.target)).float().expand(len(maps), -1, -1)
+    K = torch.from_numpy(c.source.K.copy()).float().expand(len(maps), -1, -1)
+    return {
+        "definition": lambda: definition.warp_tokens(tokens),
+        "grid_sample": lambda: torch.nn.functional.grid_sample(
+            maps, grid, padding_mode="border", align_corners=False
+        ),
+        "kornia": lambda: warp_frame_depth(maps, depth, pose, K),
+    }
+
+
+def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
+    """Time the cases; all of the table, as JSON values."""
+    with torch.no_grad():
+        for case in cases:
+            for work in case.contestants.values():
+                work()  # compiled, or read from the cache
+        for _ in range(rounds):
+            for case in cases:
+                case.round()
+    rows = [row for case in cases for row in case.rows()]
+    for row in rows:
+        if row["contestant"] in ("copy", "tokens", "maps"):
+            row["bandwidth_share"] = 1 / row["times_copy"]
+    return {"threads": thread_count(), "rounds": rounds, "rows": rows}
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result for a person, as Markdown."""
+    lines = [
+        f"{result['threads']} threads, {result['rounds']} rounds, medians; ratios of cpu time",
+        "",
+        "| case | contestant | wall ms (best) | cpu ms | of the render | of a copy | of bandwidth"
+        " | Mtaps |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in result["rows"]:
+        cells = [
+            row["case"],
+            row["contestant"],
+            f"{row['wall_ms']:.2f} ({row['wall_best_ms']:.2f})",
+            f"{row['cpu_ms']:.2f}",
+            f"{row['times_render']:.2f}" if "times_render" in row else "",
+            f"{row['times_copy']:.2f}" if "times_copy" in row else "",
+            f"{100 * row['bandwidth_share']:.0f} %" if "bandwidth_share" in row else "",
+            f"{row['taps'] / 1e6:.1f}" if "taps" in row else "",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.warp", description="Time the warp of views and features."
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="a pair at 256 and tokens (2, 1024, 320), 3 rounds"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=15, help="times each case is measured (default 15)"
+    )
+    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        cases = [pair_case(256), tokens_case(32, 320, torch.float32, others=True)]
+    else:
+        cases = [pair_case(size) for size in (256, 512, 1024)]
+        for grid in (64, 32):
+            for channels in (320, 640, 1280):
+                cases.append(tokens_case(grid, channels, torch.float32, others=True))
+            cases.append(tokens_case(grid, 320, torch.float16, others=False))
+            cases.append(tokens_case(grid, 320, torch.bfloat16, others=False))
+    result = run(cases, 3 if options.quick else options.rounds)
+    print(table(result))
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
