@@ -312,7 +312,4 @@ def test_the_outline_of_a_huge_splat_far_outside_of_the_picture_is_not_lost(kind
         crossed += bool(inner.any()) and not bool(inner.all())
         actual = render(splat, camera, backend="cpu").alpha.double()
         assert float((actual - truth)[inner].abs().max()) < 1e-6
-        # Nor is anything drawn outside of it, but for what alpha may be rounded by.
-        outer = truth < constants.ALPHA_MIN - 1e-6
-        assert float(actual[outer].abs().max() if outer.any() else 0) == 0
     assert crossed == 6
