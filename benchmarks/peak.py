@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from attnwarp.render._kernels import lanes as L
-from attnwarp.render._kernels.layout import jit
+from attnwarp.render._kernels.compilation import jit
+from attnwarp.render._kernels.lanes import fma, load, store
 
 CHAINS = 12
 """Independent chains of 16 lanes: enough to hide the latency of both multiply-add units, few enough
@@ -24,14 +24,14 @@ def multiply_add(rounds, result):
     In explicit vectors: left to itself LLVM uses half of the width on processors that it believes
     to be slower with all of it, and a peak measured so is half of the true one.
     """
-    b, c = L.load(result, 0), L.load(result, 16)
+    b, c = load(result, 0), load(result, 16)
     a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = a8 = a9 = a10 = a11 = c
     for _ in range(rounds):
         for _ in range(64):
-            a0, a1, a2, a3 = L.fma(a0, b, c), L.fma(a1, b, c), L.fma(a2, b, c), L.fma(a3, b, c)
-            a4, a5, a6, a7 = L.fma(a4, b, c), L.fma(a5, b, c), L.fma(a6, b, c), L.fma(a7, b, c)
-            a8, a9, a10, a11 = L.fma(a8, b, c), L.fma(a9, b, c), L.fma(a10, b, c), L.fma(a11, b, c)
-    L.store(result, 0, a0 + a1 + a2 + a3 + a4 + a5 + a6 + a7 + a8 + a9 + a10 + a11)
+            a0, a1, a2, a3 = fma(a0, b, c), fma(a1, b, c), fma(a2, b, c), fma(a3, b, c)
+            a4, a5, a6, a7 = fma(a4, b, c), fma(a5, b, c), fma(a6, b, c), fma(a7, b, c)
+            a8, a9, a10, a11 = fma(a8, b, c), fma(a9, b, c), fma(a10, b, c), fma(a11, b, c)
+    store(result, 0, a0 + a1 + a2 + a3 + a4 + a5 + a6 + a7 + a8 + a9 + a10 + a11)
 
 
 def start():

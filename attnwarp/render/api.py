@@ -55,6 +55,31 @@ class Render:
             "splats", "pairs" and "contributing", "cuda" only "splats".
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
+
+    Example:
+        A disc that faces the camera: its normals point back at it, and beside it nothing is drawn.
+
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.render import render
+        >>> disc = Gaussians(
+        ...     "2d",
+        ...     means=torch.zeros(1, 3),
+        ...     quats=torch.tensor([[1.0, 0, 0, 0]]),
+        ...     scales=torch.full((1, 2), 0.2),
+        ...     opacities=torch.full((1,), 0.5),
+        ...     sh=torch.zeros(1, 1, 3),
+        ... )
+        >>> camera = Camera.look_at(
+        ...     [0, 0, 3], [0, 0, 0], width=65, height=49, fov_y=40, up=[0, 1, 0]
+        ... )
+        >>> view = render(disc, camera)
+        >>> bool(view.valid[24, 32]), bool(view.valid[0, 0]), bool(view.depth[0, 0].isnan())
+        (True, False, True)
+        >>> [round(float(n), 4) + 0.0 for n in view.normal[24, 32]]
+        [0.0, 0.0, 0.5]
+        >>> bool(torch.isclose(view.weight[0], view.alpha.sum()))
+        True
     """
 
     color: Tensor
@@ -145,7 +170,7 @@ def render(
     ``features``), ``pose`` and ``background``, from every output (of ``Render.counters`` and the
     mask ``valid`` there are none). Backend "cuda" is the
     exception: none from ``weight``, and ``median_depth`` and ``distortion_l1`` are NaN, so a loss
-        must not use them.
+    must not use them.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
@@ -180,13 +205,24 @@ def render(
         >>> import torch
         >>> from attnwarp import Camera, Gaussians
         >>> from attnwarp.render import render
-        >>> splat = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
-        ...                   torch.full((1, 2), 0.2), torch.ones(1), torch.zeros(1, 1, 3))
-        >>> camera = Camera.look_at([0, 0, 3], [0, 0, 0], width=64, height=48, fov_y=40,
-        ...                         up=[0, 1, 0])
+        >>> splat = Gaussians(
+        ...     "2d",
+        ...     means=torch.zeros(1, 3),
+        ...     quats=torch.tensor([[1.0, 0, 0, 0]]),
+        ...     scales=torch.full((1, 2), 0.2),
+        ...     opacities=torch.full((1,), 0.9),
+        ...     sh=Gaussians.sh_from_rgb(torch.tensor([[1.0, 0.5, 0.0]])),
+        ... )
+        >>> camera = Camera.look_at(
+        ...     [0, 0, 3], [0, 0, 0], width=65, height=49, fov_y=40, up=[0, 1, 0]
+        ... )
         >>> view = render(splat, camera)
-        >>> view.color.shape, round(float(view.depth[24, 32]), 4)
-        (torch.Size([48, 64, 3]), 3.0)
+        >>> view.color.shape
+        torch.Size([49, 65, 3])
+        >>> [round(float(c), 4) for c in view.color[24, 32]]
+        [0.9, 0.45, 0.0]
+        >>> round(float(view.depth[24, 32]), 4)
+        3.0
     """
     if not isinstance(gaussians, Gaussians):
         raise TypeError(f"gaussians: got {type(gaussians).__name__}, expected attnwarp.Gaussians")

@@ -18,18 +18,18 @@ def _cases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_fit_agrees_with_scipy_in_factors_and_intervals() -> None:
     x, z, y = _cases()
-    found = bench.fit({"x": x.tolist(), "z": z.tolist()}, y.tolist())
-    assert found is not None
+    result = bench.fit({"x": x.tolist(), "z": z.tolist()}, y.tolist())
+    assert result is not None
     factors, covariance = optimize.curve_fit(
         lambda d, a, b: a * d[0] + b * d[1], np.stack([x, z]), y, sigma=y
     )
     reach = stats.t.ppf(0.975, 28) * np.sqrt(np.diag(covariance))
     for name, factor, r in zip("xz", factors, reach, strict=True):
-        assert found[name] == pytest.approx([factor, factor - r, factor + r], rel=1e-4)
-        assert found[name][1] < {"x": 2, "z": 5}[name] < found[name][2]
+        assert result[name] == pytest.approx([factor, factor - r, factor + r], rel=1e-4)
+        assert result[name][1] < {"x": 2, "z": 5}[name] < result[name][2]
     residual = y - factors[0] * x - factors[1] * z
-    assert found["r2"] == pytest.approx(1 - residual.var() / y.var(), rel=1e-4)
-    assert 0.02 < found["typical_error"] < 0.08
+    assert result["r2"] == pytest.approx(1 - residual.var() / y.var(), rel=1e-4)
+    assert 0.02 < result["typical_error"] < 0.08
 
 
 def test_fit_refuses_what_cases_do_not_determine() -> None:
@@ -38,22 +38,40 @@ def test_fit_refuses_what_cases_do_not_determine() -> None:
     assert bench.fit({"x": x, "again": [3 * v for v in x]}, y) is None
 
 
+def test_a_row_is_worked_out_from_its_measurements() -> None:
+    """By hand: shares are medians of the rounds' own quotients, not a quotient of medians."""
+    case = bench.Case(
+        "3d",
+        512,
+        50_000,
+        0.1,
+        forward=[0.010, 0.011, 0.040],
+        forward_cpu=[0.01, 0.02, 0.04],
+        both=[0.030, 0.031, 0.032],
+        both_cpu=[0.05, 0.06, 0.07],
+        peak=[1e11, 2e11, 1e11],
+        counters={"pairs": 8_000_000, "composited": 6_000_000, "contributing": 5_000_000},
+    )
+    row = bench.row(case)
+    # 1 / (time x peak): 1e-9, 2.5e-10 and 2.5e-10; times 45 operations a pair.
+    assert row["fma_share"] == pytest.approx(0.09, abs=1e-9)
+    assert row["fma_share_composited"] == pytest.approx(0.0675, abs=1e-9)
+    assert (row["forward_ms"], row["forward_best_ms"], row["forward_cpu_ms"]) == (11, 10, 20)
+    assert row["backward_over_forward"] == 2.0
+    # 8 million pairs in 11 ms.
+    assert row["gigapairs_per_second"] == pytest.approx(0.727, abs=5e-4)
+
+
 def test_a_small_run_ends_in_a_table() -> None:
     sizes = [(16, 40), (16, 80), (32, 40), (32, 160), (48, 100)]
-    result = bench.run(
-        [bench.Case("2d", size, count, 0.1) for size, count in sizes], rounds=1, gsplat=0
-    )
+    cases = [bench.Case("2d", size, count, 0.1) for size, count in sizes]
+    result = bench.run(cases, rounds=1, gsplat=0)
     assert [row["splats"] for row in result["cases"]] == [count for _, count in sizes]
-    for row in result["cases"]:
+    for case, row in zip(cases, result["cases"], strict=True):
         assert 0 < row["contributing"] <= row["composited"] <= row["pairs"]
-        assert row["fma_share"] == pytest.approx(
-            45e-9
-            * row["pairs"]
-            / row["forward_cpu_ms"]
-            * 1e3
-            / result["fma_peak_gflops_per_thread"],
-            rel=0.9,
-        )
+        (seconds,), (peak,) = case.forward_cpu, case.peak
+        # Rounded to four digits behind the point.
+        assert row["fma_share"] == pytest.approx(45 * row["pairs"] / (seconds * peak), abs=6e-5)
         assert 0 < row["forward_bytes"] < row["forward_backward_bytes"]
     text = bench.table(result)
     assert "ns a pair" in text and "bytes a splat" in text and "by pairs alone" in text

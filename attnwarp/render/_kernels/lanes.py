@@ -223,7 +223,7 @@ def narrow(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
 
 
 @intrinsic
-def where(typing: Any, chosen: Any, yes: Any, no: Any) -> Any:
+def select(typing: Any, chosen: Any, yes: Any, no: Any) -> Any:
     """``yes`` in the lanes that are chosen, ``no`` in the others."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -234,7 +234,7 @@ def where(typing: Any, chosen: Any, yes: Any, no: Any) -> Any:
 
 
 @intrinsic
-def least(typing: Any, x: Any, y: Any) -> Any:
+def minimum(typing: Any, x: Any, y: Any) -> Any:
     """The smaller one in each lane; y where one is NaN."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -245,7 +245,7 @@ def least(typing: Any, x: Any, y: Any) -> Any:
 
 
 @intrinsic
-def most(typing: Any, x: Any, y: Any) -> Any:
+def maximum(typing: Any, x: Any, y: Any) -> Any:
     """The larger one in each lane; y where one is NaN."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -285,7 +285,7 @@ def _approach(builder: Any, x: Any, name: str) -> tuple[Any, Any]:
 
 
 @intrinsic
-def inverse(typing: Any, x: Any) -> Any:
+def reciprocal(typing: Any, x: Any) -> Any:
     """1 / x to the last bit or two; anything where x is 0, infinite or below 1e-38 (float64:
     1e-308).
 
@@ -307,7 +307,7 @@ def inverse(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
-def inverse_root(typing: Any, x: Any) -> Any:
+def reciprocal_sqrt(typing: Any, x: Any) -> Any:
     """1 / sqrt(x) of float64, to the last bits; anything where x is 0, negative or infinite."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -331,7 +331,7 @@ def inverse_root(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
-def rough_root(typing: Any, x: Any) -> Any:
+def approximate_sqrt(typing: Any, x: Any) -> Any:
     """A square root of x > 0 that is right or too large by at most 1.3e-4 of itself: several times
     as fast.
     """
@@ -364,9 +364,9 @@ def _unary(name: str, document: str) -> Any:
     return operation
 
 
-down = _unary("floor", "Largest whole number that is not above x, in each lane.")
-up = _unary("ceil", "Smallest whole number that is not below x, in each lane.")
-magnitude = _unary("fabs", "x without its sign, in each lane.")
+floor = _unary("floor", "Largest whole number that is not above x, in each lane.")
+ceil = _unary("ceil", "Smallest whole number that is not below x, in each lane.")
+absolute = _unary("fabs", "x without its sign, in each lane.")
 
 
 @intrinsic
@@ -392,7 +392,7 @@ def fraction(typing: Any, x: Any) -> Any:
 
 
 @intrinsic
-def flipped(typing: Any, chosen: Any) -> Any:
+def invert(typing: Any, chosen: Any) -> Any:
     """The lanes that are not chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -402,7 +402,7 @@ def flipped(typing: Any, chosen: Any) -> Any:
 
 
 @intrinsic
-def times_power(typing: Any, x: Any, shifted: Any) -> Any:
+def times_power_of_2(typing: Any, x: Any, shifted: Any) -> Any:
     """x 2^k, where ``shifted`` is k + 1.5 2^23, so that k is its lowest bits; no range is
     checked."""
 
@@ -416,7 +416,7 @@ def times_power(typing: Any, x: Any, shifted: Any) -> Any:
 
 
 @intrinsic
-def total(typing: Any, x: Any) -> Any:
+def sum_lanes(typing: Any, x: Any) -> Any:
     """Sum of the lanes, in an order that never changes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -459,7 +459,7 @@ _fold8, _fold4, _fold2, _fold1 = (_fold(half) for half in (8, 4, 2, 1))
 
 
 @register_jitable(inline="always")
-def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-untyped-def]
+def sum_each(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-untyped-def]
     """The sums of the lanes of sixteen vectors, as one vector: a transposition that adds on its
     way.
     """
@@ -469,8 +469,8 @@ def totals(a, b, c, d, e, f, g, h, i, j, k, m, n, o, p, q):  # type: ignore[no-u
 
 
 @register_jitable(inline="always")
-def totals8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
-    """As :func:`totals` of eight; the sums stand twice."""
+def sum_each8(a, b, c, d, e, f, g, h):  # type: ignore[no-untyped-def]
+    """As :func:`sum_each` of eight; the sums stand twice."""
     low = _fold2(_fold4(_fold8(a, b), _fold8(c, d)), _fold4(_fold8(e, f), _fold8(g, h)))
     return _fold1(low, low)
 
@@ -480,7 +480,7 @@ def _as_bits(builder: Any, chosen: Any) -> Any:
 
 
 @intrinsic
-def count(typing: Any, chosen: Any) -> Any:
+def count_true(typing: Any, chosen: Any) -> Any:
     """How many lanes are chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -490,7 +490,7 @@ def count(typing: Any, chosen: Any) -> Any:
 
 
 @intrinsic
-def some(typing: Any, chosen: Any) -> Any:
+def any_true(typing: Any, chosen: Any) -> Any:
     """Whether any lane is chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -501,7 +501,7 @@ def some(typing: Any, chosen: Any) -> Any:
 
 
 @intrinsic
-def as_bits(typing: Any, chosen: Any) -> Any:
+def to_bits(typing: Any, chosen: Any) -> Any:
     """A bit for each lane that is chosen."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -511,7 +511,7 @@ def as_bits(typing: Any, chosen: Any) -> Any:
 
 
 @intrinsic
-def spread(typing: Any, array: Any, item: Any) -> Any:
+def broadcast(typing: Any, array: Any, item: Any) -> Any:
     """The number at ``item`` of a float32 array, counted flat, in every lane."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -523,7 +523,7 @@ def spread(typing: Any, array: Any, item: Any) -> Any:
 
 
 @intrinsic
-def having(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
+def with_any_bit(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
     """Which of sixteen int32 of ``array`` from ``item`` on, counted flat, have one of these bits: a
     bit for each.
     """
@@ -540,7 +540,7 @@ def having(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
 
 
 @intrinsic
-def lowest(typing: Any, bits: Any) -> Any:
+def lowest_bit(typing: Any, bits: Any) -> Any:
     """The place of the lowest bit that is set; ``bits`` must not be 0."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -550,7 +550,7 @@ def lowest(typing: Any, bits: Any) -> Any:
 
 
 @intrinsic
-def store_ends(typing: Any, array: Any, item: Any, first: Any, last: Any) -> Any:
+def store_intervals(typing: Any, array: Any, item: Any, first: Any, last: Any) -> Any:
     """Put first | last << 16, of sixteen whole numbers each, into an int32 array from ``item`` on,
     counted flat.
     """
@@ -565,7 +565,7 @@ def store_ends(typing: Any, array: Any, item: Any, first: Any, last: Any) -> Any
 
 
 @intrinsic
-def store_whole(typing: Any, array: Any, item: Any, value: Any) -> Any:
+def store_integers(typing: Any, array: Any, item: Any, value: Any) -> Any:
     """Put sixteen whole numbers into an int32 array from ``item`` on, counted flat."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -578,18 +578,18 @@ def store_whole(typing: Any, array: Any, item: Any, value: Any) -> Any:
 
 def _swap(step: int) -> Any:
     @intrinsic
-    def swapped(typing: Any, x: Any) -> Any:
+    def swap(typing: Any, x: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             places = ir.Constant(INTS, [k ^ step for k in range(WIDTH)])
             return builder.shuffle_vector(args[0], ir.Constant(FLOATS, ir.Undefined), places)
 
         return lanes(lanes), codegen
 
-    swapped.__doc__ = f"Lane k of x in lane k ^ {step}."
-    return swapped
+    swap.__doc__ = f"Lane k of x in lane k ^ {step}."
+    return swap
 
 
-swapped1, swapped2 = _swap(1), _swap(2)
+swap1, swap2 = _swap(1), _swap(2)
 
 
 QUAD = ir.VectorType(ir.FloatType(), 4)
@@ -597,7 +597,7 @@ FOUR = ir.VectorType(ir.IntType(32), 4)
 
 
 @intrinsic
-def copy_whole4(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
+def copy4_integers(typing: Any, array: Any, item: Any, source: Any, begin: Any) -> Any:
     """Four int32 of ``source`` from ``begin`` on to ``array`` from ``item`` on; both counted
     flat."""
 

@@ -1,165 +1,288 @@
-# mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""What the kernels of the CPU backend hand to one another: rows of the table of splats, lists, the
-camera as numbers.
+"""The data that the CPU kernels share: named structures of arrays, and the layout of their rows.
 
-And the decorators that every module of kernels is compiled by.
+A structure is a ``NamedTuple`` of arrays: numba passes its members one by one, at no cost. A row's
+layout is a ``NamedTuple`` of column numbers, so that ``row[SPLAT.cut]`` reads as what it is.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
-import numba as nb
 import numpy as np
-from llvmlite import ir
-from numba.core import cgutils
-from numba.extending import intrinsic
 
-from attnwarp.render import constants as K
+from attnwarp.render import constants
 
-# NaN and infinity are left to IEEE rules: selects rely on comparisons with them.
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-def fingerprint(folder: Path = Path(__file__).parent) -> str:
-    """SHA-256 of all that is compiled here: the modules of ``folder``, and the constants beside
-    it."""
-    files = [*sorted(folder.glob("*.py")), folder.parent / "constants.py"]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-
-
-FINGERPRINT = fingerprint()
-
-
-def _compiled(**options: Any) -> Any:
-    """numba's decorator, with a cache on disk that is thrown away when any of the modules changes.
-    Left to itself numba looks at the function's own file only, and would go on with what was
-    inlined from others."""
-
-    def decorate(function: Any) -> Any:
-        dispatcher = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options)(
-            function
-        )
-        # There is none where numba is told to compile nothing.
-        file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if file is not None:
-            file._source_stamp = FINGERPRINT
-        return dispatcher
-
-    return decorate
-
-
-jit = _compiled()
-# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,
-# and two threads that count the same array up and down for every splat spend a third of their time
-# on it. Such kernels allocate nothing.
-bare = _compiled(_nrt=False)
-inlined = _compiled(inline="always")
-
-f32 = np.float32
-f64 = np.float64
-u64 = np.uint64
-
-TILE = K.TILE
+# A tile is SQUARES squares of 4 x 4 pixels; a square's 16 pixels are the lanes of one vector.
+TILE = constants.TILE
 PIXELS = TILE * TILE
-SIDE = TILE // 4  # squares of 4 x 4 pixels along a tile
+SIDE = TILE // 4  # squares along a tile's edge
 SQUARES = SIDE * SIDE
-EVERY = (1 << SQUARES) - 1  # a bit for each
+EVERY_SQUARE = (1 << SQUARES) - 1  # one bit each
+# Squares as bits: those of the tile's first quarter (2 x 2 squares); and the bits that the number
+# of a square has in common with the first square of its quarter.
+QUARTER = 0x33
+QUARTER_CORNER = 10
 
-# A projected splat is a row of 192 bytes, three cache lines: WIDE columns of float64, then float32.
-# The table is passed twice, as float64 (M, COLUMNS) and as float32 (M, 2 COLUMNS), "thin", in which
-# column c >= WIDE stands at c + WIDE. The reference point is the projected centre, or the principal
-# point for a 2D splat whose centre is not in front; coefficients are per pixel of offset from it,
-# and are moved to each quarter of a tile in float64.
-X0, Y0 = 0, 1
-UX, UY, U0, VX, VY, V0, WX, WY, W0 = (
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-)  # 2D: u = U / W, v = V / W, z = Z0 / W
-CA, CB, CC, LX, LY, RXX, RXY, RYY = 2, 3, 4, 5, 6, 7, 8, 9  # 3D: conic; z = Z0 l / (l^2 + r)
-WIDE = 11
-Z0, ZLO, ZHI, OPACITY = 11, 12, 13, 14
-GRADIENTS = 15  # columns up to here carry gradients
-FILTER, WMAX, CUT = (
-    15,
-    17,
-    18,
-)  # whether there is a screen filter; nothing shows where W > WMAX, or if CUT < 0
-IZ0, WTOP, WLOW = 19, 20, 21  # 2D: 1 / z = IZ0 W, with W no more than WTOP and no less than WLOW
-IZLO = 20  # 3D: 1 / ZLO
-NORMAL, VALUES = 22, 25  # world normal, and the first three channels
-COLUMNS = 24
-F11, F12, F22 = (
-    20,
-    21,
-    22,
-)  # 3D: rho = (F11 dx + F12 dy)^2 + (F22 dy)^2, float64 behind the others; no cancellation
-
-# A splat as it is laid out for a tile: a row of float32 with the table's columns; and what depends
-# on where pixels are counted from, which is kept in float64 for the tile's middle, followed by its
-# slopes in x and y: 8 numbers each.
-ROW = 32
-EXACT = 24
-AT_U, AT_V, AT_W, SCREEN_X, SCREEN_Y, AT_X, AT_Y = range(7)  # SCREEN: X and Y times the root of 2
-QUARTER = 0x33  # its squares, as bits, from its first one on
-CORNER = 10  # the bits that the number of a square has in common with its quarter's first one
-
-# An entry of a tile's list is a splat's place in the order of depth, and above it one bit for each
-# of the tile's squares of 4 x 4 pixels that the splat may show in.
+# An entry of a tile's list: a splat's place in the order of depth, and above it one bit for each
+# of the tile's squares that the splat may show in.
 PLACE_BITS = 32
 PLACE = (1 << PLACE_BITS) - 1
 
-# A run of tiles: the first one, how many, and its first column of squares; from CODES on, for each
-# row of squares, its columns as first | last << 16.
-RUN, CODES = 8, 4
-HUGE = 1e30
 ROOT2 = math.sqrt(2)
 
 
-def _asking(write: int) -> Any:
-    @intrinsic
-    def ask(typing: Any, array: Any, item: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            data = cgutils.create_struct_proxy(signature.args[0])(context, builder, args[0]).data
-            pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
-            word = ir.IntType(32)
-            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
-            call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-            builder.call(call, [pointer, word(write), word(3), word(1)])
-            return word(0)
+class View(NamedTuple):
+    """The camera, and which picture is asked for."""
 
-        return nb.int32(array, nb.int64), codegen
+    rotation: np.ndarray  # (3, 3) float64, world to camera
+    translation: np.ndarray  # (3,) float64, world to camera, with the splats' origin moved in
+    fx: float
+    skew: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float
+    discs: bool  # kind "2d", else "3d"
+    by_center: bool  # a splat's depth is its centre's
+    antialiased: bool
+    harmonic: bool  # values are spherical harmonics, else features
 
-    return ask
+
+class Splats(NamedTuple):
+    """N splats as they come in; gradients in them have the same form."""
+
+    means: np.ndarray  # (N, 3)
+    quats: np.ndarray  # (N, 4) wxyz
+    scales: np.ndarray  # (N, 2 or 3)
+    opacities: np.ndarray  # (N,)
+    values: np.ndarray  # (N, 3 K) float32 harmonics or (N, C) features
 
 
-# Ask for the cache line of an array's item (counted flat) before it is needed, to be read or to be
-# written.
-prefetch, prefetch_to_write = _asking(0), _asking(1)
+class Tiles(NamedTuple):
+    """The grid of tiles."""
 
-# view: the camera as numbers, float64. Rows of R, then t (with the splats' origin moved in), then
-# the intrinsics.
-R00, TX, FX, SKEW, FY, CX, CY, WIDTH, HEIGHT, NEAR, FLAT, CENTER, ANTIALIASED, HARMONIC = (
-    0, 9, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23,
-)  # fmt: skip
-VIEW = 24
+    across: int
+    down: int
+    order: np.ndarray  # (tiles,) int64, the order in which tiles are visited
 
-# A splat's outline, as :func:`project` leaves it for :func:`outline`: a row of 16 float32, in
-# pixels from (X0, Y0). Where its first row of squares begins, less Y0 and what is above that row;
-# the ellipse's middle in y, top, 1 / top; half of the chord through its middle, how far the chords'
-# middles move to the right a row, half width, height of its right tip, middle in x; the squared
-# radius of the filter's disc, and the radius; what is added to a left and to a right end, for its
-# place in the picture; a row's height. Then the first and the last row of squares: none if the last
-# is above the first, and no ellipse if the first is negative.
-(SHAPE_Y, SHAPE_EY, SHAPE_TOP, SHAPE_SHRINK, SHAPE_HALF, SHAPE_LEAN, SHAPE_WIDE, SHAPE_TIP, SHAPE_EX, SHAPE_SQUARE,
- SHAPE_RADIUS, SHAPE_LEFT, SHAPE_RIGHT, SHAPE_HIGH, SHAPE_FIRST, SHAPE_LAST) = range(16)  # fmt: skip
+
+class Table(NamedTuple):
+    """Projected splats in the order of depth: rows of three cache lines, seen in two types.
+
+    Columns below SINGLE are float64: column c is ``doubles[k, c]``. Columns from SINGLE on are
+    float32: column c is ``singles[k, SINGLE + c]``.
+    """
+
+    doubles: np.ndarray  # (M, ROW_DOUBLES) float64
+    singles: np.ndarray  # (M, 2 ROW_DOUBLES) float32, the same memory
+    features: np.ndarray  # (M, C) float32 if there are more than 3 channels, else no rows
+
+
+ROW_DOUBLES = 24
+SINGLE = 11
+GRADIENTS = 15  # columns below this one carry gradients
+
+
+class SplatColumns(NamedTuple):
+    """Columns of the table that both kinds have. Lengths in pixels or scene units.
+
+    The reference point is the projected centre, or the principal point for a 2D splat whose centre
+    is not in front. Coefficients are per pixel of offset from it.
+    """
+
+    center_x: int = 0  # the reference point
+    center_y: int = 1
+    depth: int = 11  # of the centre; for a 2D splat not in front, its distance
+    depth_low: int = 12  # bounds of z at a pixel: the splat's own extent, and near
+    depth_high: int = 13
+    opacity: int = 14
+    inverse_depth_low: int = 16
+    cut: int = 18  # drawn where rho <= cut; -1: nowhere
+    normal: int = 22  # (3) in world axes
+    values: int = 25  # (3) the first three channels
+
+
+class DiscColumns(NamedTuple):
+    """Columns of a 2D splat: u = U / W, v = V / W, z = depth / W, each of U, V, W linear."""
+
+    u_x: int = 2
+    u_y: int = 3
+    u_0: int = 4
+    v_x: int = 5
+    v_y: int = 6
+    v_0: int = 7
+    w_x: int = 8
+    w_y: int = 9
+    w_0: int = 10
+    filtered: int = 15  # 1 if the screen filter draws it too, else 0
+    w_most: int = 17  # the plane is nearer than near where W is larger
+    inverse_depth: int = 19
+    w_high: int = 20  # bounds of W within the splat's extent
+    w_low: int = 21
+
+
+class EllipsoidColumns(NamedTuple):
+    """Columns of a 3D splat: z = depth l / (l^2 + r), l linear and r a quadratic form."""
+
+    conic_xx: int = 2
+    conic_xy: int = 3
+    conic_yy: int = 4
+    peak_x: int = 5  # l = 1 + peak_x dx + peak_y dy
+    peak_y: int = 6
+    peak_xx: int = 7  # r = peak_xx dx^2 + 2 peak_xy dx dy + peak_yy dy^2
+    peak_xy: int = 8
+    peak_yy: int = 9
+    # float64, behind the float32 columns: rho = (factor_xx dx + factor_xy dy)^2 + (factor_yy dy)^2,
+    # the conic without the cancellation in it.
+    factor: int = 20  # (3) xx, xy, yy
+
+
+SPLAT, DISC, ELLIPSOID = SplatColumns(), DiscColumns(), EllipsoidColumns()
+
+
+class RowColumns(NamedTuple):
+    """A splat laid out for a tile: ROW float32, the table's columns and these."""
+
+    step: int = 28  # 1 + its place in the tile's list
+    factor: int = 29  # (3) of a 3D splat: xx, xy, yy
+
+
+ROW = 32
+TILE_ROW = RowColumns()
+
+
+class LinearTerms(NamedTuple):
+    """What is linear in a pixel's position. For 3D splats rho = u^2 + v^2."""
+
+    u: int = 0
+    v: int = 1
+    w: int = 2
+    screen_x: int = 3  # x and y times the root of 2, or NO_FILTER
+    screen_y: int = 4
+    x: int = 5  # offset from the reference point
+    y: int = 6
+
+
+# In float64 for the middle of a tile: 8 values, their slopes in x, their slopes in y. In float32
+# for the middle of a quarter: 8 values.
+LINEAR = LinearTerms()
+SLOPE_X, SLOPE_Y = 8, 16
+MOMENTS = 24
+NO_FILTER = 1e15  # screen_x of a splat without a screen filter; its square is NOWHERE
+NOWHERE = 1e30  # rho where nothing is drawn
+
+
+class OutlineColumns(NamedTuple):
+    """A splat's outline, 16 float32 in pixels from the reference point: an ellipse, and for 2D
+    splats the disc of the screen filter."""
+
+    row_y: int = 0  # top of the picture's first row of squares
+    middle_y: int = 1  # of the ellipse
+    top: int = 2  # half height
+    inverse_top: int = 3
+    half_chord: int = 4  # half of the chord through the middle
+    lean: int = 5  # how far the chords' middles move to the right a pixel down
+    half_width: int = 6
+    tip_y: int = 7  # of the rightmost point, from the middle
+    middle_x: int = 8
+    radius_squared: int = 9  # of the disc
+    radius: int = 10
+    left: int = 11  # added to a left end and to a right end: the reference point, and the slack
+    right: int = 12
+    row_height: int = 13
+    first_row: int = 14  # rows of squares; NO_ELLIPSE in place of the first if it is none
+    last_row: int = 15  # less than the first if it shows nowhere
+
+
+OUTLINE = OutlineColumns()
+OUTLINE_SIZE = 16
+NO_ELLIPSE = -1
+
+
+class RunColumns(NamedTuple):
+    """A run of tiles in a row that a splat may show in: RUN_SIZE int32."""
+
+    tile: int = 0  # the first one
+    tiles: int = 1  # how many
+    column: int = 2  # its first column of squares
+    intervals: int = 4  # (SIDE) for each row of squares its columns, first | last << 16
+
+
+RUN = RunColumns()
+RUN_SIZE = 8
+
+
+class Runs(NamedTuple):
+    """The runs of consecutive splats, and what they change in the lengths of the tiles' lists."""
+
+    runs: np.ndarray  # (room, RUN_SIZE) int32
+    counts: np.ndarray  # (M,) int32, runs of each splat
+    changes: np.ndarray  # (tiles + 1,) int32: 1 added where a run begins, taken away behind its end
+
+
+class Lists(NamedTuple):
+    """The splats of each tile: tile t's are entries[starts[t] : starts[t] + counts[t]]."""
+
+    starts: np.ndarray  # (tiles,) int64
+    counts: np.ndarray  # (tiles,) int64
+    entries: np.ndarray  # (.) int64, see PLACE
+
+
+class Pictures(NamedTuple):
+    """What is drawn, and what the backward pass needs of it; H x W pixels, float32."""
+
+    color: np.ndarray  # (H, W, C)
+    alpha: np.ndarray  # (H, W)
+    depth: np.ndarray  # (H, W)
+    median: np.ndarray  # (H, W)
+    normal: np.ndarray  # (H, W, 3)
+    l1: np.ndarray  # (H, W)
+    l2: np.ndarray  # (H, W)
+    state: np.ndarray  # (5, H, W), see STATE; (5, 0, W) if there is no backward pass
+
+
+class StatePlanes(NamedTuple):
+    """The planes of ``Pictures.state``."""
+
+    transmittance: int = 0  # behind all splats
+    last_step: int = 1  # 1 + place in the list of the last splat drawn; 0: none
+    median_step: int = 2
+    inverse_depth: int = 3  # mean of 1 / z
+    variance: int = 4  # of 1 / z, times alpha
+
+
+STATE = StatePlanes()
+
+
+class Progress(NamedTuple):
+    """What was done in each tile, and the weights of the lists' entries."""
+
+    processed: np.ndarray  # (tiles,) int64, entries of its list
+    tested: np.ndarray  # (tiles,) int64, pairs whose intersection was computed
+    composited: np.ndarray  # (tiles,) int64, pairs in a square that the splat draws to
+    contributing: np.ndarray  # (tiles,) int64, pairs drawn
+    opaque: np.ndarray  # (tiles,) bool, every pixel has ended
+    weights: np.ndarray  # (entries,) float32
+
+
+class Upstream(NamedTuple):
+    """Gradients of the loss in the outputs, float32."""
+
+    color: np.ndarray  # (H, W, C)
+    alpha: np.ndarray  # (H, W)
+    depth: np.ndarray  # (H, W)
+    median: np.ndarray  # (H, W)
+    normal: np.ndarray  # (H, W, 3)
+    l1: np.ndarray  # (H, W)
+    l2: np.ndarray  # (H, W)
+    weight: np.ndarray  # (M,), in the order of depth
+
+
+class Rows(NamedTuple):
+    """A row of gradients for each entry of a group of tiles."""
+
+    starts: np.ndarray  # (tiles,) int64, a tile's first row
+    rows: np.ndarray  # (., GRADIENTS + 3 + max(3, C)) float32: columns, normal, values

@@ -1,573 +1,643 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""Splats as the camera sees them: their order, outline, depth and colour, eight at once in
-float64."""
+"""Projection: splats as the camera sees them, eight at once in float64.
+
+Every ``Wide`` below holds one number of each of eight splats.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from attnwarp.render import constants as K
-from attnwarp.render._kernels import lanes as L
-
-# isort: off
-from attnwarp.render._kernels.layout import (
-    ANTIALIASED, CA, CB, CC, CENTER, CUT, CX, CY, F11, FILTER, FLAT, FX, FY, HARMONIC, HEIGHT, IZ0, IZLO, LX, LY, NEAR,
-    NORMAL, OPACITY, RXX, RXY, RYY, SHAPE_EX, SHAPE_EY, SHAPE_FIRST, SHAPE_HALF, SHAPE_HIGH, SHAPE_LAST, SHAPE_LEAN,
-    SHAPE_LEFT, SHAPE_RADIUS, SHAPE_RIGHT, SHAPE_SHRINK, SHAPE_SQUARE, SHAPE_TIP, SHAPE_TOP, SHAPE_WIDE, SHAPE_Y, SIDE, SKEW,
-    TILE, TX, U0, UX, UY, V0, VALUES, VX, VY, W0, WIDE, WIDTH, WLOW, WMAX, WTOP, WX, WY, X0, Y0, Z0, ZHI, ZLO, prefetch,
-    bare, f32, f64, inlined, jit, u64,
-)  # fmt: skip
-# isort: on
-
-C0 = 0.28209479177387814
-C1 = 0.4886025119029199
-C20, C21, C22, C23, C24 = (
-    1.0925484305920792,
-    -1.0925484305920792,
-    0.31539156525252005,
-    -1.0925484305920792,
-    0.5462742152960396,
+from attnwarp.render._kernels.compilation import bare, f32, f64, inlined, prefetch, u64
+from attnwarp.render._kernels.lanes import (
+    absolute,
+    ceil,
+    exponent,
+    floor,
+    fraction,
+    invert,
+    load8,
+    maximum,
+    minimum,
+    reciprocal,
+    reciprocal_sqrt,
+    select,
+    store8,
+    to_bits,
 )
-C30, C31, C32, C33 = -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154
-C34, C35, C36 = -0.4570457994644658, 1.445305721320277, -0.5900435899266435
+from attnwarp.render._kernels.layout import (
+    DISC,
+    ELLIPSOID,
+    NO_ELLIPSE,
+    OUTLINE,
+    OUTLINE_SIZE,
+    SIDE,
+    SINGLE,
+    SPLAT,
+    TILE,
+)
+from attnwarp.render.constants import (
+    ALPHA_MIN,
+    BLUR_3D,
+    COMPENSATION_MIN,
+    EDGE_ON,
+    EXTENT_SIGMAS,
+    JACOBIAN_MARGIN,
+)
+from attnwarp.render.harmonics import C0, C1, C2, C3
+
+
+class BatchRows(NamedTuple):
+    """Rows of eight float64 that a batch of splats is worked on in."""
+
+    mean: int = 0  # (3)
+    quat: int = 3  # (4)
+    scale: int = 7  # (3)
+    opacity: int = 10
+    center: int = 11  # (3) camera axes
+    direction: int = 14  # (3) unit vector to the splat, world axes
+    doubles: int = 17  # (SINGLE) the table's float64 columns
+    factor: int = 28  # (3)
+
+
+BATCH = BatchRows()
+BATCH_DOUBLES = 8 * (BATCH.factor + 3)
+# Rows of eight float32: the table's columns from SINGLE up to the values, then the outline's.
+OUTLINE_ROWS = SPLAT.values - SINGLE
+BATCH_SINGLES = 8 * (OUTLINE_ROWS + OUTLINE_SIZE)
+
+
+class Vector(NamedTuple):
+    """Three numbers, or three Wide."""
+
+    x: Any
+    y: Any
+    z: Any
+
+
+class Matrix(NamedTuple):
+    """A 3 x 3 matrix of numbers, or of Wide."""
+
+    m00: Any
+    m01: Any
+    m02: Any
+    m10: Any
+    m11: Any
+    m12: Any
+    m20: Any
+    m21: Any
+    m22: Any
+
+
+class PixelSteps(NamedTuple):
+    """K^-1 without its last column: what a pixel to the right and one down add to a ray."""
+
+    x: Any
+    y: Any
+    xy: Any
+
+
+class Footprint(NamedTuple):
+    """The quadratic form A x^2 + 2 B x y + C y^2 <= h about the middle, and the filter's disc."""
+
+    A: Any
+    B: Any
+    C: Any
+    middle_x: Any
+    middle_y: Any
+    h: Any
+    scale: Any  # h / (A C - B^2)
+    radius_squared: Any
+    is_ellipse: Any
 
 
 @inlined
-def _root(x):
-    """The square root of eight float64 >= 0, to the last bits; anything where they are negative or
-    infinite.
-    """
-    return x * L.inverse_root(L.most(x, 1e-300))
+def _sqrt(x):
+    """Square root of eight float64 >= 0, to the last bits; anything where negative or infinite."""
+    return x * reciprocal_sqrt(maximum(x, 1e-300))
 
 
 @inlined
 def _log(x):
-    """The natural logarithm of eight float64, to 1e-12, for x > 0 that are not denormal: with x = f
-    2^k and f about 1, 2 artanh((f - 1) / (f + 1)) + k log 2."""
-    f, k = L.fraction(x), L.exponent(x)
+    """Natural logarithm of eight float64, to 1e-12, for x > 0 that are not denormal.
+
+    With x = f 2^k and f about 1: 2 artanh((f - 1) / (f + 1)) + k log 2.
+    """
+    f, k = fraction(x), exponent(x)
     large = f > 1.4142135623730951
-    f, k = L.where(large, f * 0.5, f), L.where(large, k + 1.0, k)
+    f, k = select(large, f * 0.5, f), select(large, k + 1.0, k)
     z = (f - 1.0) / (f + 1.0)
     s = z * z
-    series = (
-        s
-        * (
-            s * (s * (s * (s * (s * (s * (1 / 15) + 1 / 13) + 1 / 11) + 1 / 9) + 1 / 7) + 1 / 5)
-            + 1 / 3
-        )
-        + 1.0
-    )
+    series = s * (s * (s * (1 / 15) + 1 / 13) + 1 / 11) + 1 / 9
+    series = s * (s * (s * (s * series + 1 / 7) + 1 / 5) + 1 / 3) + 1.0
     return k * 0.6931471805599453 + z * series * 2.0
 
 
 @inlined
 def harmonics(degree, x, y, z, out):
+    """Values of the (degree + 1)^2 harmonics to ``out``; see :mod:`attnwarp.render.harmonics`."""
     out[0] = C0
     if degree > 0:
         out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
     if degree > 1:
-        out[4], out[5], out[6] = C20 * x * y, C21 * y * z, C22 * (2 * z * z - x * x - y * y)
-        out[7], out[8] = C23 * x * z, C24 * (x * x - y * y)
+        out[4], out[5], out[6] = (
+            C2[0] * x * y,
+            C2[1] * y * z,
+            C2[2] * (2 * z * z - x * x - y * y),
+        )
+        out[7], out[8] = C2[3] * x * z, C2[4] * (x * x - y * y)
     if degree > 2:
         out[9], out[10], out[11] = (
-            C30 * y * (3 * x * x - y * y),
-            C31 * x * y * z,
-            C32 * y * (4 * z * z - x * x - y * y),
+            C3[0] * y * (3 * x * x - y * y),
+            C3[1] * x * y * z,
+            C3[2] * y * (4 * z * z - x * x - y * y),
         )
-        out[12] = C33 * z * (2 * z * z - 3 * x * x - 3 * y * y)
-        out[13], out[14] = C34 * x * (4 * z * z - x * x - y * y), C35 * z * (x * x - y * y)
-        out[15] = C36 * x * (x * x - 3 * y * y)
+        out[12] = C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y)
+        out[13], out[14] = C3[4] * x * (4 * z * z - x * x - y * y), C3[5] * z * (x * x - y * y)
+        out[15] = C3[6] * x * (x * x - 3 * y * y)
 
 
 @inlined
-def axes(q, i, Q):
-    """Rotation of quaternion i into Q; returns the quaternion's length."""
-    w, x, y, z = f64(q[i, 0]), f64(q[i, 1]), f64(q[i, 2]), f64(q[i, 3])
-    length = math.sqrt(w * w + x * x + y * y + z * z)
-    inverse = 1 / length
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-    Q[0, 0], Q[0, 1], Q[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    Q[1, 0], Q[1, 1], Q[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    Q[2, 0], Q[2, 1], Q[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return length
+def _load3(batch, row):
+    return Vector(load8(batch, 8 * row), load8(batch, 8 * row + 8), load8(batch, 8 * row + 16))
 
 
-@jit
-def depths(first, last, view, m, q, s, o, key, listed):
-    """The depth of each of the splats first..last, to ``key``; NaN where nothing can show.
+@inlined
+def _store3(batch, row, x, y, z):
+    store8(batch, 8 * row, x)
+    store8(batch, 8 * row + 8, y)
+    store8(batch, 8 * row + 16, z)
 
-    ``listed`` (1) gets a guess at how many tiles will list them: rectangles of 5 sigmas, their
-    centres in the picture.
-    """
-    fx, fy = view[FX] / TILE, view[FY] / TILE
-    wide, tall = view[WIDTH] / TILE, view[HEIGHT] / TILE
-    px, py = view[CX] / TILE, view[CY] / TILE
-    guess = 0.0
-    r0, r1, r2, t = view[6], view[7], view[8], view[TX + 2]
-    near, flat = view[NEAR], view[FLAT] > 0
-    for i in range(first, last):
-        c2 = r0 * f64(m[i, 0]) + r1 * f64(m[i, 1]) + r2 * f64(m[i, 2]) + t
-        shows = c2 > near
-        if flat and not shows:
-            w, x, y, z = f64(q[i, 0]), f64(q[i, 1]), f64(q[i, 2]), f64(q[i, 3])
-            square = w * w + x * x + y * y + z * z
-            a0 = (
-                r0 * (square - 2 * (y * y + z * z))
-                + r1 * 2 * (x * y + w * z)
-                + r2 * 2 * (x * z - w * y)
-            )
-            a1 = (
-                r0 * 2 * (x * y - w * z)
-                + r1 * (square - 2 * (x * x + z * z))
-                + r2 * 2 * (y * z + w * x)
-            )
-            spread = math.sqrt((f64(s[i, 0]) * a0) ** 2 + (f64(s[i, 1]) * a1) ** 2) / square
-            shows = c2 + K.EXTENT_SIGMAS * spread > near
-        shows = shows and o[i] >= K.ALPHA_MIN
-        key[i] = c2 if shows else np.nan
-        if shows and c2 > near:
-            c0 = view[0] * f64(m[i, 0]) + view[1] * f64(m[i, 1]) + view[2] * f64(m[i, 2]) + view[TX]
-            c1 = (
-                view[3] * f64(m[i, 0])
-                + view[4] * f64(m[i, 1])
-                + view[5] * f64(m[i, 2])
-                + view[TX + 1]
-            )
-            x, y = fx * c0 / c2 + px, fy * c1 / c2 + py
-            if 0 < x < wide and 0 < y < tall:
-                first_side = min(1 + 5 * fx * f64(s[i, 0]) / c2, wide)
-                second_side = min(1 + 5 * fy * f64(s[i, 1]) / c2, tall)
-                guess += first_side * second_side
-    listed[0] = guess
+
+@inlined
+def _put(batch, column, value):
+    """Store a float64 column of the table."""
+    store8(batch, 8 * (BATCH.doubles + column), value)
+
+
+@inlined
+def _put_single(singles, column, value):
+    """Store a float32 column of the table."""
+    store8(singles, 8 * (column - SINGLE), value)
+
+
+@inlined
+def _put_outline(singles, column, value):
+    store8(singles, 8 * (OUTLINE_ROWS + column), value)
+
+
+@inlined
+def _all_wanted(wanted):
+    return wanted[-1, -1] == (wanted.shape[0] - 1) * (wanted.shape[1] - 1)
 
 
 @inlined
 def _reaches(view, c0, c1, c2, size, wanted):
-    """Whether a splat may show in a wanted tile, by a rectangle that holds it whatever its
-    rotation.
+    """Whether a splat may show in a wanted tile, by a rectangle that holds it at any rotation.
 
-    c: its centre in camera axes. size: its largest sigma.
+    Args:
+        c0, c1, c2: its centre in camera axes.
+        size: its largest sigma.
+        wanted: see :func:`project`.
     """
-    fx, skew, fy, near = view[FX], view[SKEW], view[FY], view[NEAR]
+    fx, skew, fy, near = view.fx, view.skew, view.fy, view.near
+    width, height = f64(view.width), f64(view.height)
     ic = 1 / c2
     x, y = c0 * ic, c1 * ic
-    at_x, at_y = fx * x + skew * y + view[CX], fy * y + view[CY]
-    every = wanted[-1, -1] == (wanted.shape[0] - 1) * (wanted.shape[1] - 1)
-    if every & (at_x > 0) & (at_x < view[WIDTH]) & (at_y > 0) & (at_y < view[HEIGHT]) & (c2 > near):
+    px, py = fx * x + skew * y + view.cx, fy * y + view.cy
+    every = _all_wanted(wanted)
+    if every & (px > 0) & (px < width) & (py > 0) & (py < height) & (c2 > near):
         return True
-    if view[FLAT] > 0:
+    if view.discs:
         # A sphere holds it: (c0 + d0) / (c2 + d2) - c0 / c2 is at most |d| (1 + |c0 / c2|) / (c2 -
         # |d|). And 2.4 pixels hold the disc of the screen filter.
-        reach = K.EXTENT_SIGMAS * size
+        reach = EXTENT_SIGMAS * size
         if c2 - reach <= near:
             return True
         scale, blur = reach / (c2 - reach), 2.4
     else:
         # As the projection is linearised, no wider than |J| sigma; then blurred.
-        x_most, y_most = (
-            1.0 + abs(view[CX] / fx) + 2 * view[WIDTH] / fx,
-            1.0 + abs(view[CY] / fy) + 2 * view[HEIGHT] / fy,
-        )
+        x_most = 1.0 + abs(view.cx / fx) + 2 * width / fx
+        y_most = 1.0 + abs(view.cy / fy) + 2 * height / fy
         x, y = min(max(x, -x_most), x_most), min(max(y, -y_most), y_most)
-        scale, blur = K.EXTENT_SIGMAS * size * ic, K.EXTENT_SIGMAS * math.sqrt(K.BLUR_3D)
+        scale, blur = EXTENT_SIGMAS * size * ic, EXTENT_SIGMAS * math.sqrt(BLUR_3D)
     tall = scale * fy * (1 + abs(y)) + blur
     wide = scale * (fx * (1 + abs(x)) + abs(skew) * (1 + abs(y))) + blur
-    x1, x2, y1, y2 = at_x - wide, at_x + wide, at_y - tall, at_y + tall
-    if not ((x2 > 0) & (y2 > 0) & (x1 < view[WIDTH]) & (y1 < view[HEIGHT])):
+    x1, x2, y1, y2 = px - wide, px + wide, py - tall, py + tall
+    if not ((x2 > 0) & (y2 > 0) & (x1 < width) & (y1 < height)):
         return False
-    t1, t2 = int(max(x1, 0.0)) // TILE, int(min(x2, view[WIDTH] - 1)) // TILE + 1
-    r1, r2 = int(max(y1, 0.0)) // TILE, int(min(y2, view[HEIGHT] - 1)) // TILE + 1
+    t1, t2 = int(max(x1, 0.0)) // TILE, int(min(x2, width - 1)) // TILE + 1
+    r1, r2 = int(max(y1, 0.0)) // TILE, int(min(y2, height - 1)) // TILE + 1
     return wanted[r2, t2] - wanted[r1, t2] - wanted[r2, t1] + wanted[r1, t1] > 0
 
 
-# What eight splats are worked off in, rows of eight: in float64 their parameters, their centres in
-# camera axes, and the first columns of their rows of the table; in float32 the table's other
-# columns, then the outline's.
-IN_Q, IN_S, IN_O, IN_C, OUT = 3, 7, 10, 11, 14
-FACTOR = 8 * (OUT + WIDE)
-SETUP = FACTOR + 24
-SHAPES = VALUES - WIDE
-SETUP_NARROW = 8 * (SHAPES + 16)
+@inlined
+def _gather(batch, splats, order, begin, last, discs):
+    """The parameters of the splats order[begin : begin + 8] to ``batch``; past ``last`` the last
+    one's."""
+    means, quats, scales = splats.means, splats.quats, splats.scales
+    opacities, values = splats.opacities, splats.values
+    for lane in range(8):
+        later = order[min(begin + lane + 16, last - 1)]
+        prefetch(means, later * 3)
+        prefetch(quats, later * 4)
+        prefetch(scales, later * scales.shape[1])
+        prefetch(opacities, later)
+        prefetch(values, later * values.shape[1])
+        i, to = u64(order[min(begin + lane, last - 1)]), u64(lane)
+        for k in range(3):
+            batch[to + u64(8 * (BATCH.mean + k))] = means[i, u64(k)]
+        for k in range(4):
+            batch[to + u64(8 * (BATCH.quat + k))] = quats[i, u64(k)]
+        batch[to + u64(8 * BATCH.scale)] = scales[i, u64(0)]
+        batch[to + u64(8 * BATCH.scale + 8)] = scales[i, u64(1)]
+        third = 0.0 if discs else scales[i, u64(scales.shape[1] - 1)]
+        batch[to + u64(8 * BATCH.scale + 16)] = third
+        batch[to + u64(8 * BATCH.opacity)] = opacities[i]
+
+
+@inlined
+def _cull(batch, view, candidates, begin, first, wanted, table, outlines):
+    """Which of the ``candidates``, one bit each, may show in a wanted tile; the others are marked
+    as not drawn."""
+    shown = candidates
+    for lane in range(8):
+        if not candidates >> lane & 1:
+            continue
+        column = u64(lane)
+        s = column + u64(8 * BATCH.scale)
+        size = max(batch[s], batch[s + u64(8)], batch[s + u64(16)])
+        c = column + u64(8 * BATCH.center)
+        if not _reaches(view, batch[c], batch[c + u64(8)], batch[c + u64(16)], size, wanted):
+            shown &= ~(1 << lane)
+            table.singles[u64(begin + lane), u64(SINGLE + SPLAT.cut)] = f32(-1.0)
+            outlines[u64(begin + lane - first), u64(OUTLINE.first_row)] = f32(1.0)
+            outlines[u64(begin + lane - first), u64(OUTLINE.last_row)] = f32(0.0)
+    return shown
+
+
+@inlined
+def _rotations(batch):
+    """Rotation matrices of eight quaternions."""
+    w, x = load8(batch, 8 * BATCH.quat), load8(batch, 8 * BATCH.quat + 8)
+    y, z = load8(batch, 8 * BATCH.quat + 16), load8(batch, 8 * BATCH.quat + 24)
+    inverse = reciprocal_sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    return Matrix(
+        1.0 - (y * y + z * z) * 2.0, (x * y - w * z) * 2.0, (x * z + w * y) * 2.0,
+        (x * y + w * z) * 2.0, 1.0 - (x * x + z * z) * 2.0, (y * z - w * x) * 2.0,
+        (x * z - w * y) * 2.0, (y * z + w * x) * 2.0, 1.0 - (x * x + y * y) * 2.0,
+    )  # fmt: skip
+
+
+@inlined
+def _axes_in_camera(q, R):
+    """R q, its columns a splat's axes in camera axes."""
+    return Matrix(
+        q.m00 * R.m00 + q.m10 * R.m01 + q.m20 * R.m02,
+        q.m01 * R.m00 + q.m11 * R.m01 + q.m21 * R.m02,
+        q.m02 * R.m00 + q.m12 * R.m01 + q.m22 * R.m02,
+        q.m00 * R.m10 + q.m10 * R.m11 + q.m20 * R.m12,
+        q.m01 * R.m10 + q.m11 * R.m11 + q.m21 * R.m12,
+        q.m02 * R.m10 + q.m12 * R.m11 + q.m22 * R.m12,
+        q.m00 * R.m20 + q.m10 * R.m21 + q.m20 * R.m22,
+        q.m01 * R.m20 + q.m11 * R.m21 + q.m21 * R.m22,
+        q.m02 * R.m20 + q.m12 * R.m21 + q.m22 * R.m22,
+    )
+
+
+@inlined
+def _disc_side(batch, column, t0, t1, t2, n, c, s, depth, inverse_nc, ahead, step):
+    """U or V, at ``column``: the tangent (t0, t1, t2) of length s, less its part along the ray."""
+    tc = (t0 * c.x + t1 * c.y + t2 * c.z) * inverse_nc
+    scale = depth * reciprocal(s)
+    gx = scale * (t0 - tc * n.x)
+    slope_x, slope_y = gx * step.x, scale * (t1 - tc * n.y) * step.y + gx * step.xy
+    _put(batch, column + 2, select(ahead, 0.0, scale * (t2 - tc * n.z)))
+    _put(batch, column, slope_x)
+    _put(batch, column + 1, slope_y)
+    return slope_x, slope_y
+
+
+@inlined
+def _disc(batch, singles, view, a, c, s, ahead, length, spread, cut, step):
+    """The plane of a 2D splat as U, V and W; see :class:`DiscColumns`. Its depth and outline."""
+    n = Vector(a.m02, a.m12, a.m22)
+    nc = n.x * c.x + n.y * c.y + n.z * c.z
+    least = length * EDGE_ON
+    nc = select(absolute(nc) < least, select(nc < 0.0, -least, least), nc)
+    depth = select(ahead, c.z, length)
+    inverse = reciprocal(nc)
+    ux, uy = _disc_side(
+        batch, DISC.u_x, a.m00, a.m10, a.m20, n, c, s.x, depth, inverse, ahead, step
+    )
+    vx, vy = _disc_side(
+        batch, DISC.v_x, a.m01, a.m11, a.m21, n, c, s.y, depth, inverse, ahead, step
+    )
+    scale = depth * inverse
+    wx, wy = scale * n.x * step.x, scale * (n.y * step.y + n.x * step.xy)
+    _put(batch, DISC.w_0, select(ahead, 1.0, scale * n.z))
+    _put(batch, DISC.w_x, wx)
+    _put(batch, DISC.w_y, wy)
+    _put_single(singles, DISC.filtered, select(ahead, 1.0, 0.0))
+    _put_single(singles, DISC.w_most, depth * (1.0 / view.near))
+    _put_single(singles, DISC.inverse_depth, reciprocal(depth))
+    # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not in
+    # front, W must be positive, else it may be anything, see evaluate.
+    reach = spread * EXTENT_SIGMAS
+    low, high = maximum(c.z - reach, view.near), maximum(c.z + reach, view.near)
+    _put_single(singles, DISC.w_high, depth * reciprocal(low))
+    _put_single(singles, DISC.w_low, select(ahead, depth * reciprocal(high), 1e-20))
+    # An ellipse only if the whole disc lies in front of the camera plane.
+    is_ellipse = ahead & (c.z * 1e-3 < c.z - _sqrt(maximum(cut, 0.0)) * spread)
+    A = ux * ux + vx * vx - cut * wx * wx
+    B = ux * uy + vx * vy - cut * wx * wy
+    C = uy * uy + vy * vy - cut * wy * wy
+    det = A * C - B * B
+    is_ellipse = is_ellipse & (A > 0.0) & (C > 0.0) & (det > A * C * 1e-12)
+    inverse = reciprocal(det)
+    ex, ey = (C * wx - B * wy) * inverse * cut, (A * wy - B * wx) * inverse * cut
+    h = cut * (wx * ex + wy * ey + 1.0)
+    return depth, Footprint(A, B, C, ex, ey, h, h * inverse, cut * 0.5, is_ellipse)
+
+
+@inlined
+def _add_side(xx, xy, yy, a0, a1, a2, px, py, scale, view):
+    """Add a side of a 3D splat to its projected covariance."""
+    gx = ((a0 - px * a2) * view.fx + (a1 - py * a2) * view.skew) * scale
+    gy = (a1 - py * a2) * view.fy * scale
+    return xx + gx * gx, xy + gx * gy, yy + gy * gy
+
+
+@inlined
+def _ellipsoid(batch, view, a, c, ic, s):
+    """The projected covariance of a 3D splat (EWA), its conic, and the factor of its opacity."""
+    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
+    width, height = f64(view.width), f64(view.height)
+    limit = JACOBIAN_MARGIN * width / 2 / fx
+    px = minimum(maximum(c.x * ic, -cx / fx - limit), (width - cx) / fx + limit)
+    limit = JACOBIAN_MARGIN * height / 2 / fy
+    py = minimum(maximum(c.y * ic, -cy / fy - limit), (height - cy) / fy + limit)
+    scale = s.x * ic
+    gx = ((a.m00 - px * a.m20) * fx + (a.m10 - py * a.m20) * view.skew) * scale
+    gy = (a.m10 - py * a.m20) * fy * scale
+    xx, xy, yy = gx * gx, gx * gy, gy * gy
+    xx, xy, yy = _add_side(xx, xy, yy, a.m01, a.m11, a.m21, px, py, s.y * ic, view)
+    xx, xy, yy = _add_side(xx, xy, yy, a.m02, a.m12, a.m22, px, py, s.z * ic, view)
+    sharp = xx * yy - xy * xy
+    xx, yy = xx + BLUR_3D, yy + BLUR_3D
+    inverse = reciprocal(xx * yy - xy * xy)
+    A, B, C = yy * inverse, -xy * inverse, xx * inverse
+    _put(batch, ELLIPSOID.conic_xx, A)
+    _put(batch, ELLIPSOID.conic_xy, B)
+    _put(batch, ELLIPSOID.conic_yy, C)
+    edge = reciprocal_sqrt(A)
+    _store3(batch, BATCH.factor, A * edge, B * edge, reciprocal_sqrt(yy))
+    return A, B, C, sharp * inverse
+
+
+@inlined
+def _peak(batch, a, c, s, step):
+    """The depth at which a 3D splat is largest along a ray; see :class:`EllipsoidColumns`."""
+    i0, i1, i2 = reciprocal(s.x * s.x), reciprocal(s.y * s.y), reciprocal(s.z * s.z)
+    S00 = a.m00 * a.m00 * i0 + a.m01 * a.m01 * i1 + a.m02 * a.m02 * i2
+    S01 = a.m00 * a.m10 * i0 + a.m01 * a.m11 * i1 + a.m02 * a.m12 * i2
+    S02 = a.m00 * a.m20 * i0 + a.m01 * a.m21 * i1 + a.m02 * a.m22 * i2
+    S11 = a.m10 * a.m10 * i0 + a.m11 * a.m11 * i1 + a.m12 * a.m12 * i2
+    S12 = a.m10 * a.m20 * i0 + a.m11 * a.m21 * i1 + a.m12 * a.m22 * i2
+    S22 = a.m20 * a.m20 * i0 + a.m21 * a.m21 * i1 + a.m22 * a.m22 * i2
+    f0 = S00 * c.x + S01 * c.y + S02 * c.z
+    f1 = S01 * c.x + S11 * c.y + S12 * c.z
+    f2 = S02 * c.x + S12 * c.y + S22 * c.z
+    scale = c.z * reciprocal(f0 * c.x + f1 * c.y + f2 * c.z)
+    gx, gy = scale * f0, scale * f1
+    # Denominator minus l^2: positive semidefinite, so the difference of large numbers is taken
+    # here in float64.
+    xx = scale * c.z * S00 - gx * gx
+    xy = scale * c.z * S01 - gx * gy
+    yy = scale * c.z * S11 - gy * gy
+    kx, ky, kxy = step.x, step.y, step.xy
+    _put(batch, ELLIPSOID.peak_x, gx * kx)
+    _put(batch, ELLIPSOID.peak_y, gy * ky + gx * kxy)
+    _put(batch, ELLIPSOID.peak_xx, xx * (kx * kx))
+    _put(batch, ELLIPSOID.peak_xy, (xx * kxy + xy * ky) * kx)
+    _put(batch, ELLIPSOID.peak_yy, xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky))
+
+
+@inlined
+def _shortest_axis(s, M):
+    """The column of M, a matrix of axes, whose scale is the smallest."""
+    second = s.y < s.x
+    third = s.z < select(second, s.y, s.x)
+    return Vector(
+        select(third, M.m02, select(second, M.m01, M.m00)),
+        select(third, M.m12, select(second, M.m11, M.m10)),
+        select(third, M.m22, select(second, M.m21, M.m20)),
+    )
+
+
+@inlined
+def _outline(singles, x0, y0, height, drawn, shape):
+    """The outline rho <= cut, for :func:`attnwarp.render._kernels.binning.find_runs`."""
+    A, B, C, ex, ey, h = shape.A, shape.B, shape.C, shape.middle_x, shape.middle_y, shape.h
+    radius = _sqrt(shape.radius_squared)
+    top, half_width = _sqrt(A * shape.scale), _sqrt(C * shape.scale)
+    over = reciprocal(A)
+    begin = y0 - (0.5 + 1e-4) + minimum(ey - top, -radius)
+    end = y0 - (0.5 - 1e-4) + maximum(ey + top, radius)
+    # Float32 from here on: what a far or large splat's numbers are rounded by is added on all
+    # sides.
+    slack = (half_width + absolute(ex) + absolute(x0)) * 1e-6 + 1e-4
+    slack_y = (top + absolute(ey) + absolute(y0)) * 5e-7 + 1e-4
+    shows = drawn & (end >= 0.0) & (begin <= height - 1.0)
+    first = floor(ceil(maximum(begin, 0.0)) * (1 / TILE)) * SIDE
+    last = floor(minimum(end, height - 1.0) * 0.25)
+    first, last = select(shows, first, 1.0), select(shows, last, -2.0)
+    first = select(shape.is_ellipse | invert(drawn), first, f64(NO_ELLIPSE))
+    _put_outline(singles, OUTLINE.row_y, 0.5 - slack_y)
+    _put_outline(singles, OUTLINE.middle_y, ey)
+    _put_outline(singles, OUTLINE.top, top)
+    _put_outline(singles, OUTLINE.inverse_top, reciprocal(top))
+    _put_outline(singles, OUTLINE.half_chord, _sqrt(A * h) * over)
+    _put_outline(singles, OUTLINE.lean, -B * over)
+    _put_outline(singles, OUTLINE.half_width, half_width)
+    _put_outline(singles, OUTLINE.tip_y, -B * half_width * reciprocal(C))
+    _put_outline(singles, OUTLINE.middle_x, ex)
+    _put_outline(singles, OUTLINE.radius_squared, shape.radius_squared)
+    _put_outline(singles, OUTLINE.radius, radius)
+    _put_outline(singles, OUTLINE.left, x0 - 0.5 - slack)
+    _put_outline(singles, OUTLINE.right, x0 - 0.5 + slack)
+    _put_outline(singles, OUTLINE.row_height, slack_y * 2.0 + 3.0)
+    _put_outline(singles, OUTLINE.first_row, first)
+    _put_outline(singles, OUTLINE.last_row, last)
+
+
+@inlined
+def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
+    """Project the eight splats of ``batch``, centres c, to its columns of the table."""
+    discs, by_center, near = view.discs, view.by_center, view.near
+    s = _load3(batch, BATCH.scale)
+    q = _rotations(batch)
+    a = _axes_in_camera(q, R)
+    opacity = load8(batch, 8 * BATCH.opacity)
+    spread = _sqrt(
+        s.x * a.m20 * (s.x * a.m20) + s.y * a.m21 * (s.y * a.m21) + s.z * a.m22 * (s.z * a.m22)
+    )
+    x0, y0 = px, py
+    if discs:
+        x0, y0 = select(ahead, px, view.cx), select(ahead, py, view.cy)
+    _put(batch, SPLAT.center_x, x0)
+    _put(batch, SPLAT.center_y, y0)
+    length = _sqrt(c.x * c.x + c.y * c.y + c.z * c.z)
+    if not discs:
+        A, B, C, ratio = _ellipsoid(batch, view, a, c, ic, s)
+        if view.antialiased:
+            opacity = opacity * _sqrt(maximum(ratio, COMPENSATION_MIN))
+        if not by_center:
+            _peak(batch, a, c, s, step)
+    drawn = opacity >= ALPHA_MIN
+    cut = select(drawn, _log(maximum(opacity, ALPHA_MIN) * (1 / ALPHA_MIN)) * 2.0, -1.0)
+    # The outline takes a little more, for the roundings of what follows.
+    wider = cut * (1 + 1e-6)
+    # One by one, not as a structure: the two kinds' are joined in registers then.
+    if discs:
+        n0, n1, n2, p0, p1, p2 = a.m02, a.m12, a.m22, q.m02, q.m12, q.m22
+        depth, shape = _disc(batch, singles, view, a, c, s, ahead, length, spread, wider, step)
+        A, B, C, ex, ey, h, scale, radius_squared, is_ellipse = shape
+    else:
+        n0, n1, n2 = _shortest_axis(s, a)
+        p0, p1, p2 = _shortest_axis(s, q)
+        depth, h, is_ellipse = c.z, wider, drawn
+        ex = ey = radius_squared = wider * 0.0
+        scale = h * reciprocal(A * C - B * B)
+    reach = spread * EXTENT_SIGMAS
+    low, high = maximum(c.z - reach, near), maximum(c.z + reach, near)
+    if by_center:
+        low = high = maximum(c.z, near)
+    facing = n0 * c.x + n1 * c.y + n2 * c.z
+    flip = select(facing > 0.0, -1.0, 1.0)
+    _put_single(singles, SPLAT.depth, depth)
+    _put_single(singles, SPLAT.depth_low, low)
+    _put_single(singles, SPLAT.depth_high, high)
+    _put_single(singles, SPLAT.opacity, opacity)
+    _put_single(singles, SPLAT.inverse_depth_low, reciprocal(low))
+    _put_single(singles, SPLAT.cut, cut)
+    _put_single(singles, SPLAT.normal, flip * p0)
+    _put_single(singles, SPLAT.normal + 1, flip * p1)
+    _put_single(singles, SPLAT.normal + 2, flip * p2)
+    shape = Footprint(A, B, C, ex, ey, h, scale, radius_squared, is_ellipse)
+    _outline(singles, x0, y0, f64(view.height), drawn, shape)
+    return length
+
+
+@inlined
+def _write_values(table, to, splats, i, view, channels, degree, batch, column, basis):
+    """Colour or features of splat i to row ``to`` of the table."""
+    values, singles, features = splats.values, table.singles, table.features
+    if view.harmonic:
+        if degree > 0:
+            d = column + u64(8 * BATCH.direction)
+            harmonics(degree, batch[d], batch[d + u64(8)], batch[d + u64(16)], basis)
+        for k in range(3):
+            total = 0.5 + C0 * values[i, u64(k)]
+            for b in range(1, (degree + 1) ** 2):
+                total += basis[u64(b)] * values[i, u64(3 * b + k)]
+            singles[to, u64(SINGLE + SPLAT.values + k)] = max(total, 0.0)
+    else:
+        for k in range(3):
+            value = values[i, u64(k)] if k < channels else f32(0.0)
+            singles[to, u64(SINGLE + SPLAT.values + k)] = value
+        if channels > 3:
+            for k in range(channels):
+                features[to, u64(k)] = values[i, u64(k)]
+
+
+@inlined
+def _write_row(table, outlines, to, local, discs, batch, singles, column):
+    """A splat of the batch to row ``to`` of the table, its outline to row ``local``."""
+    for k in range(SINGLE):
+        table.doubles[to, u64(k)] = batch[column + u64(8 * (BATCH.doubles + k))]
+    if not discs:
+        for k in range(3):
+            value = batch[column + u64(8 * (BATCH.factor + k))]
+            table.doubles[to, u64(ELLIPSOID.factor + k)] = value
+    for k in range(SINGLE, SPLAT.values):
+        table.singles[to, u64(SINGLE + k)] = singles[column + u64(8 * (k - SINGLE))]
+    for k in range(OUTLINE_SIZE):
+        outlines[local, u64(k)] = singles[column + u64(8 * (OUTLINE_ROWS + k))]
 
 
 @bare
 def project(
     first,
     last,
-    order,
     view,
-    m,
-    q,
-    s,
-    o,
-    values,
+    splats,
+    order,  # (M,) int32
     channels,
-    wanted,
+    wanted,  # (tiles down + 1, tiles across + 1) int32
     table,
-    thin,
-    features,
-    shapes,
-    work,
-    slim,
-    Y,
+    outlines,  # (last - first, OUTLINE_SIZE) float32
+    batch,  # (BATCH_DOUBLES,) float64, for work
+    singles,  # (BATCH_SINGLES,) float32, for work
+    basis,  # (16,) float64, for work
 ):
-    """The splats order[first:last] to the rows first..last of the table, and of ``features`` (M,
-    channels) if there are more than three; and their outlines to the rows 0..last - first of
-    ``shapes`` (., 16).
+    """Project the splats order[first:last] to the rows first..last of the table, and outline them.
 
-    ``wanted`` (tiles_y + 1, tiles_x + 1) holds how many tiles are wanted above and left of each
-    tile's corner: a splat that cannot show in a wanted one gets a negative CUT and no outline, and
-    the rest of its row is left as it was. ``work`` (SETUP), ``slim`` (SETUP_NARROW) and ``Y`` (16)
-    are for work. Eight splats are done at once, in float64.
+    ``wanted`` holds how many tiles are wanted above and left of each tile's corner. A splat that
+    cannot show in a wanted one gets a negative cut and no outline, and the rest of its row is left
+    as it was.
     """
-    R00, R01, R02, R10, R11, R12 = view[0], view[1], view[2], view[3], view[4], view[5]
-    R20, R21, R22 = view[6], view[7], view[8]
-    fx, skew, fy, cx, cy, near = view[FX], view[SKEW], view[FY], view[CX], view[CY], view[NEAR]
-    width, height = view[WIDTH], view[HEIGHT]
-    flat, center, harmonic = view[FLAT] > 0, view[CENTER] > 0, view[HARMONIC] > 0
-    degree = round(math.sqrt(values.shape[1] / 3)) - 1
-    kx, ky, kxy = 1 / fx, 1 / fy, -skew / (fx * fy)
-    every = wanted[-1, -1] == (wanted.shape[0] - 1) * (wanted.shape[1] - 1)
-    for j in range(first, last, 8):
-        here = min(8, last - j)
+    rotation, translation = view.rotation, view.translation
+    R = Matrix(
+        rotation[0, 0], rotation[0, 1], rotation[0, 2],
+        rotation[1, 0], rotation[1, 1], rotation[1, 2],
+        rotation[2, 0], rotation[2, 1], rotation[2, 2],
+    )  # fmt: skip
+    t0, t1, t2 = translation[0], translation[1], translation[2]
+    fx, skew, fy, cx, cy = view.fx, view.skew, view.fy, view.cx, view.cy
+    width, height = f64(view.width), f64(view.height)
+    degree = round(math.sqrt(splats.values.shape[1] / 3)) - 1
+    step = PixelSteps(1 / fx, 1 / fy, -skew / (fx * fy))
+    every = _all_wanted(wanted)
+    # Columns that the kind or the mode has no use for stay 0.
+    batch[:] = 0.0
+    singles[:] = 0.0
+    for begin in range(first, last, 8):
+        _gather(batch, splats, order, begin, last, view.discs)
+        m = _load3(batch, BATCH.mean)
+        c0 = m.x * R.m00 + m.y * R.m01 + m.z * R.m02 + t0
+        c1 = m.x * R.m10 + m.y * R.m11 + m.z * R.m12 + t1
+        c2 = m.x * R.m20 + m.y * R.m21 + m.z * R.m22 + t2
+        ic = reciprocal(c2)
+        ahead = view.near < c2
+        px, py = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
+        shown = 255 >> (8 - min(8, last - begin))
+        inside = 0
+        if every:
+            inside = to_bits(ahead & (px > 0.0) & (px < width) & (py > 0.0) & (py < height))
+        if shown & ~inside:
+            _store3(batch, BATCH.center, c0, c1, c2)
+            candidates = shown & ~inside
+            shown &= inside | _cull(batch, view, candidates, begin, first, wanted, table, outlines)
+            if shown == 0:
+                continue
+        c = Vector(c0, c1, c2)
+        length = _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step)
+        if view.harmonic and degree > 0:
+            over = reciprocal(length)
+            _store3(
+                batch,
+                BATCH.direction,
+                (c0 * R.m00 + c1 * R.m10 + c2 * R.m20) * over,
+                (c0 * R.m01 + c1 * R.m11 + c2 * R.m21) * over,
+                (c0 * R.m02 + c1 * R.m12 + c2 * R.m22) * over,
+            )
         for lane in range(8):
-            later = order[min(j + lane + 16, last - 1)]
-            prefetch(m, later * 3)
-            prefetch(q, later * 4)
-            prefetch(s, later * s.shape[1])
-            prefetch(o, later)
-            prefetch(values, later * values.shape[1])
-            i, at = u64(order[min(j + lane, last - 1)]), u64(lane)
-            for k in range(3):
-                work[at + u64(8 * k)] = m[i, u64(k)]
-            for k in range(4):
-                work[at + u64(8 * (IN_Q + k))] = q[i, u64(k)]
-            work[at + u64(8 * IN_S)], work[at + u64(8 * IN_S + 8)] = s[i, u64(0)], s[i, u64(1)]
-            work[at + u64(8 * IN_S + 16)] = 0.0 if flat else s[i, u64(s.shape[1] - 1)]
-            work[at + u64(8 * IN_O)] = o[i]
-        m0, m1, m2 = L.load8(work, 0), L.load8(work, 8), L.load8(work, 16)
-        s0, s1, s2 = (
-            L.load8(work, 8 * IN_S),
-            L.load8(work, 8 * IN_S + 8),
-            L.load8(work, 8 * IN_S + 16),
-        )
-        c0 = m0 * R00 + m1 * R01 + m2 * R02 + view[TX]
-        c1 = m0 * R10 + m1 * R11 + m2 * R12 + view[TX + 1]
-        c2 = m0 * R20 + m1 * R21 + m2 * R22 + view[TX + 2]
-        ic = L.inverse(c2)
-        ahead = near < c2
-        at_x, at_y = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
-        kept = 255 >> (8 - here)
-        inside = (
-            L.as_bits(ahead & (at_x > 0.0) & (at_x < width) & (at_y > 0.0) & (at_y < height))
-            if every
-            else 0
-        )
-        if kept & ~inside:
-            L.store8(work, 8 * IN_C, c0)
-            L.store8(work, 8 * IN_C + 8, c1)
-            L.store8(work, 8 * IN_C + 16, c2)
-            for lane in range(here):
-                if inside >> lane & 1:
-                    continue
-                at = u64(lane)
-                size = max(
-                    work[at + u64(8 * IN_S)],
-                    work[at + u64(8 * IN_S + 8)],
-                    work[at + u64(8 * IN_S + 16)],
-                )
-                b = at + u64(8 * IN_C)
-                if not _reaches(view, work[b], work[b + u64(8)], work[b + u64(16)], size, wanted):
-                    kept &= ~(1 << lane)
-                    thin[u64(j + lane), u64(WIDE + CUT)] = f32(-1.0)
-                    shapes[u64(j + lane - first), u64(SHAPE_FIRST)] = f32(1.0)
-                    shapes[u64(j + lane - first), u64(SHAPE_LAST)] = f32(0.0)
-            if kept == 0:
+            if not shown >> lane & 1:
                 continue
-        w, x, y, z = (
-            L.load8(work, 8 * IN_Q), L.load8(work, 8 * IN_Q + 8), L.load8(work, 8 * IN_Q + 16),
-            L.load8(work, 8 * IN_Q + 24),
-        )  # fmt: skip
-        inverse = L.inverse_root(w * w + x * x + y * y + z * z)
-        w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
-        q00, q01, q02 = 1.0 - (y * y + z * z) * 2.0, (x * y - w * z) * 2.0, (x * z + w * y) * 2.0
-        q10, q11, q12 = (x * y + w * z) * 2.0, 1.0 - (x * x + z * z) * 2.0, (y * z - w * x) * 2.0
-        q20, q21, q22 = (x * z - w * y) * 2.0, (y * z + w * x) * 2.0, 1.0 - (x * x + y * y) * 2.0
-        a00 = q00 * R00 + q10 * R01 + q20 * R02
-        a10 = q00 * R10 + q10 * R11 + q20 * R12
-        a20 = q00 * R20 + q10 * R21 + q20 * R22
-        a01 = q01 * R00 + q11 * R01 + q21 * R02
-        a11 = q01 * R10 + q11 * R11 + q21 * R12
-        a21 = q01 * R20 + q11 * R21 + q21 * R22
-        a02 = q02 * R00 + q12 * R01 + q22 * R02
-        a12 = q02 * R10 + q12 * R11 + q22 * R12
-        a22 = q02 * R20 + q12 * R21 + q22 * R22
-        opacity = L.load8(work, 8 * IN_O)
-        spread = _root(s0 * a20 * (s0 * a20) + s1 * a21 * (s1 * a21) + s2 * a22 * (s2 * a22))
-        x0, y0 = at_x, at_y
-        if flat:
-            x0, y0 = L.where(ahead, at_x, cx), L.where(ahead, at_y, cy)
-        L.store8(work, 8 * (OUT + X0), x0)
-        L.store8(work, 8 * (OUT + Y0), y0)
-        length = _root(c0 * c0 + c1 * c1 + c2 * c2)
-        depth = c2
-        if flat:
-            n0, n1, n2, p0, p1, p2 = a02, a12, a22, q02, q12, q22
-            nc = n0 * c0 + n1 * c1 + n2 * c2
-            facing = nc
-            floor = length * K.EDGE_ON
-            nc = L.where(L.magnitude(nc) < floor, L.where(nc < 0.0, -floor, floor), nc)
-            depth = L.where(ahead, c2, length)
-            inverse = L.inverse(nc)
-            tc = (a00 * c0 + a10 * c1 + a20 * c2) * inverse
-            scale = depth * L.inverse(s0)
-            gx = scale * (a00 - tc * n0)
-            ux, uy = gx * kx, scale * (a10 - tc * n1) * ky + gx * kxy
-            L.store8(work, 8 * (OUT + U0), L.where(ahead, 0.0, scale * (a20 - tc * n2)))
-            tc = (a01 * c0 + a11 * c1 + a21 * c2) * inverse
-            scale = depth * L.inverse(s1)
-            gx = scale * (a01 - tc * n0)
-            vx, vy = gx * kx, scale * (a11 - tc * n1) * ky + gx * kxy
-            L.store8(work, 8 * (OUT + V0), L.where(ahead, 0.0, scale * (a21 - tc * n2)))
-            scale = depth * inverse
-            wx, wy = scale * n0 * kx, scale * (n1 * ky + n0 * kxy)
-            L.store8(work, 8 * (OUT + W0), L.where(ahead, 1.0, scale * n2))
-            L.store8(work, 8 * (OUT + UX), ux)
-            L.store8(work, 8 * (OUT + UY), uy)
-            L.store8(work, 8 * (OUT + VX), vx)
-            L.store8(work, 8 * (OUT + VY), vy)
-            L.store8(work, 8 * (OUT + WX), wx)
-            L.store8(work, 8 * (OUT + WY), wy)
-            L.store8(slim, 8 * (FILTER - WIDE), L.where(ahead, 1.0, 0.0))
-            L.store8(slim, 8 * (FILTER + 1 - WIDE), 0.0)
-            L.store8(slim, 8 * (WMAX - WIDE), depth * (1.0 / near))
-        else:
-            limit = K.JACOBIAN_MARGIN * width / 2 / fx
-            px = L.least(L.most(c0 * ic, -cx / fx - limit), (width - cx) / fx + limit)
-            limit = K.JACOBIAN_MARGIN * height / 2 / fy
-            py = L.least(L.most(c1 * ic, -cy / fy - limit), (height - cy) / fy + limit)
-            scale = s0 * ic
-            gx, gy = (
-                ((a00 - px * a20) * fx + (a10 - py * a20) * skew) * scale,
-                (a10 - py * a20) * fy * scale,
-            )
-            sxx, sxy, syy = gx * gx, gx * gy, gy * gy
-            scale = s1 * ic
-            gx, gy = (
-                ((a01 - px * a21) * fx + (a11 - py * a21) * skew) * scale,
-                (a11 - py * a21) * fy * scale,
-            )
-            sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
-            scale = s2 * ic
-            gx, gy = (
-                ((a02 - px * a22) * fx + (a12 - py * a22) * skew) * scale,
-                (a12 - py * a22) * fy * scale,
-            )
-            sxx, sxy, syy = sxx + gx * gx, sxy + gx * gy, syy + gy * gy
-            sharp = sxx * syy - sxy * sxy
-            sxx, syy = sxx + K.BLUR_3D, syy + K.BLUR_3D
-            inverse = L.inverse(sxx * syy - sxy * sxy)
-            A, B, C = syy * inverse, -sxy * inverse, sxx * inverse
-            L.store8(work, 8 * (OUT + CA), A)
-            L.store8(work, 8 * (OUT + CB), B)
-            L.store8(work, 8 * (OUT + CC), C)
-            edge = L.inverse_root(A)
-            L.store8(work, FACTOR, A * edge)
-            L.store8(work, FACTOR + 8, B * edge)
-            L.store8(work, FACTOR + 16, L.inverse_root(syy))
-            if view[ANTIALIASED] > 0:
-                opacity = opacity * _root(L.most(sharp * inverse, K.COMPENSATION_MIN))
-            L.store8(slim, 8 * (WLOW - WIDE), 0.0)
-            for k in range(FILTER, CUT):
-                L.store8(slim, 8 * (k - WIDE), 0.0)
-            for k in range(LX, WIDE):
-                L.store8(work, 8 * (OUT + k), 0.0)
-            if not center:
-                i0, i1, i2 = L.inverse(s0 * s0), L.inverse(s1 * s1), L.inverse(s2 * s2)
-                S00 = a00 * a00 * i0 + a01 * a01 * i1 + a02 * a02 * i2
-                S01 = a00 * a10 * i0 + a01 * a11 * i1 + a02 * a12 * i2
-                S02 = a00 * a20 * i0 + a01 * a21 * i1 + a02 * a22 * i2
-                S11 = a10 * a10 * i0 + a11 * a11 * i1 + a12 * a12 * i2
-                S12 = a10 * a20 * i0 + a11 * a21 * i1 + a12 * a22 * i2
-                S22 = a20 * a20 * i0 + a21 * a21 * i1 + a22 * a22 * i2
-                f0 = S00 * c0 + S01 * c1 + S02 * c2
-                f1 = S01 * c0 + S11 * c1 + S12 * c2
-                f2 = S02 * c0 + S12 * c1 + S22 * c2
-                scale = c2 * L.inverse(f0 * c0 + f1 * c1 + f2 * c2)
-                gx, gy = scale * f0, scale * f1
-                # Denominator minus l^2: positive semidefinite, so the difference of large numbers
-                # is taken here in float64.
-                xx, xy, yy = (
-                    scale * c2 * S00 - gx * gx,
-                    scale * c2 * S01 - gx * gy,
-                    scale * c2 * S11 - gy * gy,
-                )
-                L.store8(work, 8 * (OUT + LX), gx * kx)
-                L.store8(work, 8 * (OUT + LY), gy * ky + gx * kxy)
-                L.store8(work, 8 * (OUT + RXX), xx * (kx * kx))
-                L.store8(work, 8 * (OUT + RXY), (xx * kxy + xy * ky) * kx)
-                L.store8(
-                    work, 8 * (OUT + RYY), xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky)
-                )
-            # The normal is the shortest axis.
-            second = s1 < s0
-            third = s2 < L.where(second, s1, s0)
-            p0 = L.where(third, q02, L.where(second, q01, q00))
-            p1 = L.where(third, q12, L.where(second, q11, q10))
-            p2 = L.where(third, q22, L.where(second, q21, q20))
-            n0 = L.where(third, a02, L.where(second, a01, a00))
-            n1 = L.where(third, a12, L.where(second, a11, a10))
-            n2 = L.where(third, a22, L.where(second, a21, a20))
-            facing = n0 * c0 + n1 * c1 + n2 * c2
-        reach = spread * K.EXTENT_SIGMAS
-        low, high = L.most(c2 - reach, near), L.most(c2 + reach, near)
-        if flat:
-            # Where it shows by its intersection, z lies between these; 1e-20: if its centre is not
-            # in front, W must be positive, else it may be anything, see shade.
-            L.store8(slim, 8 * (WTOP - WIDE), depth * L.inverse(low))
-            L.store8(slim, 8 * (WLOW - WIDE), L.where(ahead, depth * L.inverse(high), 1e-20))
-        if center:
-            low = high = L.most(c2, near)
-        if not flat:
-            L.store8(slim, 8 * (IZLO - WIDE), L.inverse(low))
-        L.store8(slim, 8 * (IZ0 - WIDE), L.inverse(low if center else depth))
-        drawn = opacity >= K.ALPHA_MIN
-        cut = L.where(drawn, _log(L.most(opacity, K.ALPHA_MIN) * (1 / K.ALPHA_MIN)) * 2.0, -1.0)
-        flip = L.where(facing > 0.0, -1.0, 1.0)
-        L.store8(slim, 8 * (Z0 - WIDE), depth)
-        L.store8(slim, 8 * (ZLO - WIDE), low)
-        L.store8(slim, 8 * (ZHI - WIDE), high)
-        L.store8(slim, 8 * (OPACITY - WIDE), opacity)
-        L.store8(slim, 8 * (CUT - WIDE), cut)
-        L.store8(slim, 8 * (NORMAL - WIDE), flip * p0)
-        L.store8(slim, 8 * (NORMAL + 1 - WIDE), flip * p1)
-        L.store8(slim, 8 * (NORMAL + 2 - WIDE), flip * p2)
-        # The outline.
-        cut = cut * (1 + 1e-6)
-        if flat:
-            # An ellipse only if the whole disc lies in front of the camera plane.
-            ellipse = ahead & (c2 * 1e-3 < c2 - _root(L.most(cut, 0.0)) * spread)
-            A = ux * ux + vx * vx - cut * wx * wx
-            B = ux * uy + vx * vy - cut * wx * wy
-            C = uy * uy + vy * vy - cut * wy * wy
-            det = A * C - B * B
-            ellipse = ellipse & (A > 0.0) & (C > 0.0) & (det > A * C * 1e-12)
-            inverse = L.inverse(det)
-            ex, ey = (C * wx - B * wy) * inverse * cut, (A * wy - B * wx) * inverse * cut
-            h = cut * (wx * ex + wy * ey + 1.0)
-            square = cut * 0.5
-            inverse = h * inverse
-        else:
-            ex = ey = square = cut * 0.0
-            h, ellipse = cut, drawn
-            inverse = h * L.inverse(A * C - B * B)
-        radius, top, wide = _root(square), _root(A * inverse), _root(C * inverse)
-        over = L.inverse(A)
-        begin = y0 - (0.5 + 1e-4) + L.least(ey - top, -radius)
-        end = y0 - (0.5 - 1e-4) + L.most(ey + top, radius)
-        # Float32 from here on: what a far or large splat's numbers are rounded by is added on all
-        # sides.
-        slack = (wide + L.magnitude(ex) + L.magnitude(x0)) * 1e-6 + 1e-4
-        slack_y = (top + L.magnitude(ey) + L.magnitude(y0)) * 5e-7 + 1e-4
-        shows = drawn & (end >= 0.0) & (begin <= height - 1.0)
-        row1 = L.down(L.up(L.most(begin, 0.0)) * (1 / TILE)) * SIDE
-        row2 = L.down(L.least(end, height - 1.0) * 0.25)
-        # What is drawn but is no ellipse begins in row -1.
-        row1, row2 = L.where(shows, row1, 1.0), L.where(shows, row2, -2.0)
-        row1 = L.where(ellipse | L.flipped(drawn), row1, -1.0)
-        b = 8 * SHAPES
-        L.store8(slim, b + 8 * SHAPE_Y, 0.5 - slack_y)
-        L.store8(slim, b + 8 * SHAPE_EY, ey)
-        L.store8(slim, b + 8 * SHAPE_TOP, top)
-        L.store8(slim, b + 8 * SHAPE_SHRINK, L.inverse(top))
-        L.store8(slim, b + 8 * SHAPE_HALF, _root(A * h) * over)
-        L.store8(slim, b + 8 * SHAPE_LEAN, -B * over)
-        L.store8(slim, b + 8 * SHAPE_WIDE, wide)
-        L.store8(slim, b + 8 * SHAPE_TIP, -B * wide * L.inverse(C))
-        L.store8(slim, b + 8 * SHAPE_EX, ex)
-        L.store8(slim, b + 8 * SHAPE_SQUARE, square)
-        L.store8(slim, b + 8 * SHAPE_RADIUS, radius)
-        L.store8(slim, b + 8 * SHAPE_LEFT, x0 - 0.5 - slack)
-        L.store8(slim, b + 8 * SHAPE_RIGHT, x0 - 0.5 + slack)
-        L.store8(slim, b + 8 * SHAPE_HIGH, slack_y * 2.0 + 3.0)
-        L.store8(slim, b + 8 * SHAPE_FIRST, row1)
-        L.store8(slim, b + 8 * SHAPE_LAST, row2)
-        if harmonic and degree > 0:
-            over = L.inverse(length)
-            L.store8(work, 0, (c0 * R00 + c1 * R10 + c2 * R20) * over)
-            L.store8(work, 8, (c0 * R01 + c1 * R11 + c2 * R21) * over)
-            L.store8(work, 16, (c0 * R02 + c1 * R12 + c2 * R22) * over)
-        for lane in range(here):
-            if not kept >> lane & 1:
-                continue
-            to, at = u64(j + lane), u64(lane)
-            i = u64(order[to])
-            for k in range(WIDE):
-                table[to, u64(k)] = work[at + u64(8 * (OUT + k))]
-            if not flat:
-                for k in range(3):
-                    table[to, u64(F11 + k)] = work[at + u64(FACTOR + 8 * k)]
-            for k in range(WIDE, VALUES):
-                thin[to, u64(WIDE + k)] = slim[at + u64(8 * (k - WIDE))]
-            for k in range(16):
-                shapes[to - u64(first), u64(k)] = slim[at + u64(8 * (SHAPES + k))]
-            if harmonic:
-                if degree > 0:
-                    # Where the splat's parameters were, which are not needed any more.
-                    harmonics(degree, work[at], work[at + u64(8)], work[at + u64(16)], Y)
-                for k in range(3):
-                    total = 0.5 + C0 * values[i, u64(k)]
-                    for b in range(1, (degree + 1) ** 2):
-                        total += Y[u64(b)] * values[i, u64(3 * b + k)]
-                    thin[to, u64(WIDE + VALUES + k)] = max(total, 0.0)
-            else:
-                for k in range(3):
-                    thin[to, u64(WIDE + VALUES + k)] = (
-                        values[i, u64(k)] if k < channels else f32(0.0)
-                    )
-                if channels > 3:
-                    for k in range(channels):
-                        features[to, u64(k)] = values[i, u64(k)]
-
-
-@jit
-def radix_order(key, index, other, bits, spare):
-    """Indices of the keys that are not NaN, ascending, equal ones in their order of input (LSD
-    radix sort of bits); and the places in them of keys that are equal to one beside them. All
-    arrays are as long as ``key``; the results lie in ``index`` and ``other``."""
-    raw = key.view(np.uint32)
-    n = 0
-    for i in range(key.shape[0]):
-        if key[i] == key[i]:
-            b = raw[i] if key[i] != 0 else np.uint32(0)
-            # Flipping makes the order of the bits that of the numbers: all bits of a negative, the
-            # sign of a positive.
-            bits[n] = ~b if b >> np.uint32(31) else b | np.uint32(0x80000000)
-            index[n] = i
-            n += 1
-    counts = np.empty(2048, np.int64)
-    for shift in (0, 11, 22):
-        counts[:] = 0
-        for i in range(n):
-            counts[(bits[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
-        if n == 0 or counts[(bits[0] >> np.uint32(shift)) & np.uint32(2047)] == n:
-            continue
-        total = 0
-        for i in range(2048):
-            here = counts[i]
-            counts[i] = total
-            total += here
-        for i in range(n):
-            d = (bits[i] >> np.uint32(shift)) & np.uint32(2047)
-            spare[counts[d]] = bits[i]
-            other[counts[d]] = index[i]
-            counts[d] += 1
-        bits, spare = spare, bits
-        index, other = other, index
-    ties = 0
-    for i in range(n):
-        other[ties] = i
-        ties += (i > 0 and bits[i] == bits[i - 1]) or (i + 1 < n and bits[i] == bits[i + 1])
-    return index[:n], other[:ties]
+            to, column = u64(begin + lane), u64(lane)
+            local, i = to - u64(first), u64(order[to])
+            _write_row(table, outlines, to, local, view.discs, batch, singles, column)
+            _write_values(table, to, splats, i, view, channels, degree, batch, column, basis)

@@ -1,489 +1,606 @@
 # mypy: disallow-untyped-defs=False, check-untyped-defs=False
-"""Splats over one another, tile by tile: the pictures, and what the backward pass needs of them.
+"""Rasterization: splats composited front to back, tile by tile.
 
 In vectors of 16 pixels, a square of 4 x 4, with the sums of a square in registers while a block of
-splats goes by. exp is a polynomial, since LLVM has no vector exp here.
+splats goes by.
 """
 
 from __future__ import annotations
 
-import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from attnwarp.render import constants as K
-from attnwarp.render._kernels import lanes as L
-
-# isort: off
-from attnwarp.render._kernels.layout import (
-    AT_U, AT_V, AT_W, AT_X, AT_Y, CA, CB, CC, CENTER, COLUMNS, CUT, EVERY, EXACT, F11, F12, F22, FILTER, FLAT, HEIGHT, HUGE,
-    IZ0, IZLO, LX, LY, NORMAL, OPACITY, PIXELS, PLACE, PLACE_BITS, QUARTER, ROOT2, ROW, RXX, RXY, RYY, SCREEN_X, SCREEN_Y,
-    SIDE, SQUARES, TILE, U0, UX, UY, VALUES, VX, VY, WIDE, WIDTH, WLOW, WMAX, WTOP, WX, WY, X0, Y0, Z0, ZHI, ZLO, prefetch,
-    prefetch_to_write, bare, f32, f64, inlined, u64,
-)  # fmt: skip
-# isort: on
-
-# A block of splats as the forward pass works on them: their rows, with each one's place among the
-# tile's; then its weights at the 16 pixels of all squares, and of the square at hand; then what
-# depends on where pixels are counted from, at the middle of the quarter of the tile at hand.
-BLOCK = 32
-AHEAD = 32
-STEP = 28
-WEIGHTS = BLOCK * ROW
-SHARES = WEIGHTS + BLOCK * 16
-PLACED = SHARES + BLOCK * 16
-WORK = PLACED + BLOCK * 8
-WEIGHT_UNIT = 2.0**-36
-
-# Slots of a tile's buffer, each PIXELS floats.
-(XS, YS, AL, TT, AA, DD, M1, M2, L1, MED, MEDK, LAST, ZREF, IREF, NX, NY, NZ, C_0, C_1,
- C_2) = range(20)  # fmt: skip
-SLOTS = 20  # and one more for each channel from the fourth on
-FAR = 1e15  # its square is HUGE
-LOG2E_HALF = f32(0.5 * math.log2(math.e))
-
-# exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error,
-# 9.1e-8.
-E1, E2, E3, E4, E5 = (
-    f32(c)
-    for c in (
-        0.6931469775373009,
-        0.24022242044016756,
-        0.05550733832514562,
-        0.009671514536030823,
-        0.0013264700286626865,
-    )
+from attnwarp.render._kernels.compilation import (
+    bare,
+    f32,
+    f64,
+    inlined,
+    prefetch,
+    prefetch_to_write,
+    u64,
 )
-ROUND = f32(1.5 * 2**23)
+from attnwarp.render._kernels.evaluation import (
+    depth_from,
+    evaluate,
+    lay_out,
+    move_to_quarter,
+    prepare_moments,
+)
+from attnwarp.render._kernels.lanes import (
+    any_true,
+    broadcast,
+    copy4,
+    count_true,
+    interleave4,
+    load,
+    lowest_bit,
+    maximum,
+    reciprocal,
+    select,
+    store,
+    sum_each,
+    with_any_bit,
+)
+from attnwarp.render._kernels.layout import (
+    EVERY_SQUARE,
+    MOMENTS,
+    PIXELS,
+    PLACE,
+    PLACE_BITS,
+    QUARTER,
+    ROOT2,
+    ROW,
+    ROW_DOUBLES,
+    SIDE,
+    SPLAT,
+    SQUARES,
+    STATE,
+    TILE,
+    TILE_ROW,
+)
+from attnwarp.render.constants import MEDIAN_TRANSMITTANCE, TRANSMITTANCE_STOP
+
+BLOCK = 32
+"""Splats that a tile's squares are composited with in turn."""
+AHEAD = 32
+"""Entries by which rows of the table are prefetched."""
+WEIGHT_UNIT = 2.0**-36
+"""Weights are summed as whole numbers of this: the same bits in any order."""
 
 
-@inlined
-def _gauss(rho):
-    """exp(-rho / 2), relative error 1.5e-7, for rho from 0 to 88; beyond, anything."""
-    # Adding 1.5 2^23 rounds to an integer and leaves it in the lowest bits.
-    shifted = L.fma(rho, -LOG2E_HALF, ROUND)
-    f = L.fma(rho, -LOG2E_HALF, ROUND - shifted)
-    # In pairs rather than in a row: the products wait less for one another.
-    g = f * f
-    return L.times_power(((f * E5 + E4) * g + (f * E3 + E2)) * g + (f * E1 + f32(1.0)), shifted)
+class BlockRegions(NamedTuple):
+    """Where parts of the work on a block of splats begin, in float32."""
+
+    rows: int = 0  # BLOCK rows; see lay_out
+    weights: int = BLOCK * ROW  # of each splat, at the 16 pixels of all squares
+    shares: int = BLOCK * (ROW + 16)  # of each splat, at the 16 pixels of the square at hand
+    linear: int = BLOCK * (ROW + 32)  # 8 of each splat, at the quarter at hand
 
 
-@inlined
-def slopes(exact, at):
-    """What is the same for all splats in ``exact``; see :func:`lay_out`."""
-    for k in range(EXACT):
-        exact[u64(at + k)] = 0.0
-    exact[u64(at + 8 + SCREEN_X)] = exact[u64(at + 16 + SCREEN_Y)] = ROOT2
-    exact[u64(at + 8 + AT_X)] = exact[u64(at + 16 + AT_Y)] = 1.0
+BLOCK_WORK = BlockRegions()
+BLOCK_FLOATS = BLOCK * (ROW + 32 + 8)
 
 
-@inlined
-def lay_out(work, at, exact, begin, table, thin, i, ox, oy, flat):
-    """Row i of the table as float32 to ``work`` from ``at`` on; and to ``exact`` from ``begin`` on
-    what it is at the tile's middle (ox, oy), and its slopes."""
-    i, b, e = u64(i), u64(at), u64(begin)
-    L.narrow(work, at, table, i * u64(COLUMNS))
-    work[b + u64(8)], work[b + u64(9)] = table[i, 8], table[i, 9]
-    L.store(work, at + WIDE, L.load(thin, i * u64(2 * COLUMNS) + u64(2 * WIDE)))
-    work[b + u64(VALUES + 2)] = thin[i, u64(WIDE + VALUES + 2)]
-    sx, sy = ox - table[i, X0], oy - table[i, Y0]
-    exact[e + u64(AT_X)], exact[e + u64(AT_Y)] = sx, sy
-    if flat:
-        for k in range(3):
-            gx, gy = table[i, UX + 3 * k], table[i, UY + 3 * k]
-            exact[e + u64(AT_U + k)] = table[i, U0 + 3 * k] + gx * sx + gy * sy
-            exact[e + u64(8 + AT_U + k)], exact[e + u64(16 + AT_U + k)] = gx, gy
-        # Without a filter, farther away than anything.
-        exact[e + u64(SCREEN_X)] = ROOT2 * sx if thin[i, u64(WIDE + FILTER)] > 0 else FAR
-        exact[e + u64(SCREEN_Y)] = ROOT2 * sy
-    else:
-        f11, f12, f22 = table[i, F11], table[i, F12], table[i, F22]
-        work[b + u64(CA)], work[b + u64(CB)], work[b + u64(CC)] = f11, f12, f22
-        exact[e + u64(AT_U)], exact[e + u64(AT_V)] = f11 * sx + f12 * sy, f22 * sy
-        exact[e + u64(8 + AT_U)], exact[e + u64(16 + AT_U)], exact[e + u64(16 + AT_V)] = (
-            f11,
-            f12,
-            f22,
-        )
+class Slots(NamedTuple):
+    """Slots of a tile's buffer, PIXELS float32 each; square by square, row by row in each.
 
-
-@inlined
-def refer(work, at, exact, begin, dx, dy):
-    """What depends on where pixels are counted from, as float32 to ``work`` from ``at`` on: counted
-    from (dx, dy) off the tile's middle."""
-    slope_x, slope_y = L.load8(exact, begin + 8), L.load8(exact, begin + 16)
-    L.store8(work, at, L.load8(exact, begin) + slope_x * dx + slope_y * dy)
-
-
-@inlined
-def shade(work, at, off, x, y, screen_x, screen_y, flat, peak):
-    """Of a splat at 16 pixels: where it is drawn, and its alpha (anything elsewhere); and p, q,
-    which :func:`depth_less` makes its z and 1 / z of. ``at``: its row. ``off``: what :func:`refer`
-    made. ``screen_x`` and ``screen_y`` are x and y times the root of 2.
-
-    A 2D splat's W is clamped to the z that it may have, between WLOW and WTOP, before anything is
-    divided by it. That bounds the z of what its filter draws, and changes nothing that its
-    intersection draws, nor adds to it. For take its centre in front, and the centre's z as 1: at
-    (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and WLOW = 1 /
-    (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than WLOW, |U| > (1 - WLOW) / |s| = E WLOW:
-    |U| / WLOW is more than E too, where nothing is drawn. Where W is more than WTOP, |U| / WTOP is more than |U| / W, which is more than E, unless WTOP is that of the near plane; this is what WMAX is for.
+    Sums of depths are relative to the first splat's, which keeps the digits of thin layers far
+    away.
     """
-    if flat:
-        w = L.spread(work, off + AT_W) + L.spread(work, at + WX) * x + L.spread(work, at + WY) * y
-        u = L.spread(work, off + AT_U) + L.spread(work, at + UX) * x + L.spread(work, at + UY) * y
-        v = L.spread(work, off + AT_V) + L.spread(work, at + VX) * x + L.spread(work, at + VY) * y
-        q = L.least(L.most(w, L.spread(work, at + WLOW)), L.spread(work, at + WTOP))
-        p = L.inverse(q)
-        ex, ey = (
-            screen_x + L.spread(work, off + SCREEN_X),
-            screen_y + L.spread(work, off + SCREEN_Y),
-        )
-        meets = w <= L.spread(work, at + WMAX)
-        rho = L.least(L.where(meets, (u * u + v * v) * (p * p), f32(HUGE)), ex * ex + ey * ey)
-    else:
-        # The row holds F11, F12 and F22 here.
-        u = L.spread(work, off + AT_U) + L.spread(work, at + CA) * x + L.spread(work, at + CB) * y
-        v = L.spread(work, off + AT_V) + L.spread(work, at + CC) * y
-        rho = u * u + v * v
-        p, q = L.spread(work, at + ZLO), L.spread(work, at + IZLO)
-        if peak:
-            low, high = L.spread(work, at + ZLO), L.spread(work, at + ZHI)
-            ex, ey = x + L.spread(work, off + AT_X), y + L.spread(work, off + AT_Y)
-            along = L.spread(work, at + LX) * ex + L.spread(work, at + LY) * ey + f32(1.0)
-            form = (L.spread(work, at + RXX) * ex + L.spread(work, at + RXY) * ey * f32(2.0)) * ex
-            across = along * along + L.most(form + L.spread(work, at + RYY) * ey * ey, f32(0.0))
-            p = L.spread(work, at + Z0) * along * L.inverse(L.most(across, f32(1e-30)))
-            p = L.least(L.most(p, low), high)
-            q = L.inverse(p)
-    inside = rho <= L.spread(work, at + CUT)
-    alpha = L.least(L.spread(work, at + OPACITY) * _gauss(rho), f32(K.ALPHA_MAX))
-    return inside, alpha, p, q
+
+    x: int = 0  # from the middle of its quarter of the tile
+    y: int = 1
+    transmittance: int = 2
+    depth: int = 3  # from here to l2: made of the sums when the tile is done
+    inverse_depth: int = 4
+    variance: int = 5
+    l2: int = 6
+    alpha: int = 7
+    depth_sum: int = 8  # sum w (z - first_depth)
+    inverse_sum: int = 9  # sum w (1/z - first_inverse)
+    inverse_square_sum: int = 10
+    l1: int = 11
+    median: int = 12
+    median_step: int = 13
+    last_step: int = 14
+    first_depth: int = 15
+    first_inverse: int = 16
+    normal: int = 17  # (3)
+    color: int = 20  # (channels)
+
+
+SLOT = Slots()
+FIRST_SUM = SLOT.alpha
+
+
+def buffer_floats(channels: int) -> int:
+    """Floats of a tile's buffer."""
+    return (SLOT.color + max(3, channels)) * PIXELS
+
+
+class Workspace(NamedTuple):
+    """Memory of one job of :func:`rasterize`."""
+
+    buffer: np.ndarray  # (buffer_floats,) float32, see Slots
+    block: np.ndarray  # (BLOCK_FLOATS,) float32, see BlockRegions
+    moments: np.ndarray  # (BLOCK MOMENTS,) float64; see lay_out
+    picks: np.ndarray  # (BLOCK,) int64, splats of the block that the square at hand took
+    entries: np.ndarray  # (BLOCK,) int64, the block's entries
+    masks: np.ndarray  # (BLOCK,) int32, the squares that each is composited in
+
+
+class Tile(NamedTuple):
+    """A tile of the picture."""
+
+    top: Any  # its first row and column of pixels
+    left: Any
+    rows: Any  # its size: less than TILE at the picture's edge
+    columns: Any
 
 
 @inlined
-def depth_less(work, at, p, q, flat, peak, z, iz):
-    """z and 1 / z of a splat from what :func:`shade` says, less these."""
-    if flat:
-        if peak:
-            return L.fma(L.spread(work, at + Z0), p, -z), L.fma(L.spread(work, at + IZ0), q, -iz)
-        return L.spread(work, at + ZLO) - z, L.spread(work, at + IZ0) - iz
-    return p - z, q - iz
+def tile_at(index, tiles, view):
+    top, left = index // tiles.across * TILE, index % tiles.across * TILE
+    return Tile(top, left, min(TILE, view.height - top), min(TILE, view.width - left))
+
+
+@inlined
+def quarter_offset(corner):
+    """(x, y) of the middle of the quarter whose first square is ``corner``, from the tile's."""
+    return (corner & 2) * 4.0 - 4.0, (corner & 8) - 4.0
+
+
+@inlined
+def prefetch_row(table, k):
+    """Load the three cache lines of a row of the table."""
+    prefetch(table.doubles, k * ROW_DOUBLES)
+    prefetch(table.doubles, k * ROW_DOUBLES + 8)
+    prefetch(table.doubles, k * ROW_DOUBLES + 16)
+
+
+@inlined
+def _prefetch_pictures(pictures, tile, width, channels):
+    """Ask for the pixels of a tile: they are written when it is done, so the memory has time."""
+    plane = pictures.alpha.shape[0] * width
+    for r in range(tile.rows):
+        to = (tile.top + r) * width + tile.left
+        prefetch_to_write(pictures.alpha, to)
+        prefetch_to_write(pictures.depth, to)
+        prefetch_to_write(pictures.median, to)
+        prefetch_to_write(pictures.l1, to)
+        prefetch_to_write(pictures.l2, to)
+        prefetch_to_write(pictures.normal, 3 * to)
+        prefetch_to_write(pictures.normal, 3 * to + 3 * tile.columns - 1)
+        prefetch_to_write(pictures.color, channels * to)
+        prefetch_to_write(pictures.color, channels * (to + tile.columns) - 1)
+        if pictures.state.shape[1] > 0:
+            for k in range(5):
+                prefetch_to_write(pictures.state, k * plane + to)
+
+
+@inlined
+def _clear(buffer, tile, stop):
+    """Begin a tile; returns the squares that have ended already, one bit each."""
+    for p in range(0, PIXELS, 16):
+        store(buffer, SLOT.transmittance * PIXELS + p, f32(1.0))
+    if tile.rows < TILE or tile.columns < TILE:
+        # Pixels outside of the image are opaque from the start: they take no part and never delay
+        # the stop.
+        for p in range(PIXELS):
+            column, row = p // 16 % SIDE * 4 + p % 4, p // (16 * SIDE) * 4 + p // 4 % 4
+            if column >= tile.columns or row >= tile.rows:
+                buffer[SLOT.transmittance * PIXELS + p] = f32(0.0)
+    for p in range(FIRST_SUM * PIXELS, buffer.shape[0], 16):
+        store(buffer, p, f32(0.0))
+    ended = 0
+    for q in range(SQUARES):
+        if not any_true(stop < load(buffer, SLOT.transmittance * PIXELS + q * 16)):
+            ended |= 1 << q
+    return ended
+
+
+@inlined
+def _lay_out_block(space, table, lists, weights, view, tile, begin, e, end, ended):
+    """Lay out the next splats of a list that show in squares that have not ended.
+
+    Returns:
+        The entry after the last one looked at, and the number of splats in the block.
+    """
+    middle_x, middle_y = tile.left + TILE / 2, tile.top + TILE / 2
+    size = 0
+    while e < end and size < BLOCK:
+        # The rows are anywhere in a table larger than the cache.
+        prefetch_row(table, lists.entries[min(e + AHEAD, end - 1)] & PLACE)
+        entry = lists.entries[e]
+        squares = entry >> PLACE_BITS & ~ended
+        if squares == 0:
+            weights[u64(e)] = f32(0.0)
+        else:
+            space.entries[u64(size)], space.masks[u64(size)] = e, squares
+            row = BLOCK_WORK.rows + size * ROW
+            lay_out(
+                space.block, row, space.moments, size * MOMENTS, table, entry & PLACE, middle_x,
+                middle_y, view.discs,
+            )  # fmt: skip
+            space.block[u64(row + TILE_ROW.step)] = f32(e - begin + 1)
+            store(space.block, BLOCK_WORK.weights + size * 16, f32(0.0))
+            size += 1
+        e += 1
+    for k in range(size, BLOCK):
+        space.masks[u64(k)] = 0
+    return e, size
+
+
+@inlined
+def _in_block(masks, squares):
+    """Which splats of the block are composited in any of these squares: a bit for each."""
+    return with_any_bit(masks, 0, squares) | with_any_bit(masks, 16, squares) << 16
+
+
+@inlined
+def _first_and_median(work, row, hit, T, z, inverse_z, discs, by_center, zero, sums):
+    """Take a splat as the first of a pixel, and as its median, where it is that.
+
+    Args:
+        T: transmittance in front of it.
+        sums: first_depth, first_inverse, median, median_step.
+    """
+    first_depth, first_inverse, median, median_step = sums
+    depth, inverse = depth_from(work, row, z, inverse_z, discs, by_center, zero, zero)
+    opens, is_first = hit & (f32(MEDIAN_TRANSMITTANCE) < T), hit & (f32(1.0) <= T)
+    step = broadcast(work, row + TILE_ROW.step)
+    return (
+        select(is_first, depth, first_depth),
+        select(is_first, inverse, first_inverse),
+        select(opens, depth, median),
+        select(opens, step, median_step),
+    )
+
+
+@inlined
+def _composite_square(space, q, left, view, channels, keep):
+    """Composite splats of the block, ``left`` as bits, in square q, its sums in registers.
+
+    The sums are the slots' of the same names.
+
+    Returns:
+        How many splats were evaluated; in how many pairs they are composited, and drawn; and the
+        splat with which every pixel has ended, or -1.
+    """
+    buffer, work, discs, by_center = space.buffer, space.block, view.discs, view.by_center
+    stop = f32(TRANSMITTANCE_STOP)
+    s = q * 16
+    zero = load(buffer, SLOT.x * PIXELS) * f32(0.0)
+    x, y = load(buffer, SLOT.x * PIXELS + s), load(buffer, SLOT.y * PIXELS + s)
+    sx, sy = x * f32(ROOT2), y * f32(ROOT2)
+    T, A = load(buffer, SLOT.transmittance * PIXELS + s), load(buffer, SLOT.alpha * PIXELS + s)
+    depth_sum = load(buffer, SLOT.depth_sum * PIXELS + s)
+    inverse_sum = load(buffer, SLOT.inverse_sum * PIXELS + s)
+    square_sum = load(buffer, SLOT.inverse_square_sum * PIXELS + s)
+    l1, last_step = load(buffer, SLOT.l1 * PIXELS + s), load(buffer, SLOT.last_step * PIXELS + s)
+    n0 = load(buffer, SLOT.normal * PIXELS + s)
+    n1 = load(buffer, (SLOT.normal + 1) * PIXELS + s)
+    n2 = load(buffer, (SLOT.normal + 2) * PIXELS + s)
+    c0 = load(buffer, SLOT.color * PIXELS + s)
+    c1 = load(buffer, (SLOT.color + 1) * PIXELS + s)
+    c2 = load(buffer, (SLOT.color + 2) * PIXELS + s)
+    first_depth = load(buffer, SLOT.first_depth * PIXELS + s)
+    first_inverse = load(buffer, SLOT.first_inverse * PIXELS + s)
+    median = load(buffer, SLOT.median * PIXELS + s)
+    median_step = load(buffer, SLOT.median_step * PIXELS + s)
+    # What only the first splats of a pixel decide: once no pixel is undecided, that is over for a
+    # block at a time, so that it costs no branch that goes both ways.
+    undecided = any_true(f32(MEDIAN_TRANSMITTANCE) < T)
+    alive = stop < T
+    used, composited, contributing, ends_with = 0, 0, 0, -1
+    ahead = lowest_bit(left)
+    inside_ahead, alpha_ahead, z_ahead, inverse_ahead = evaluate(
+        work, ahead * ROW, BLOCK_WORK.linear + ahead * 8, x, y, sx, sy, discs, by_center
+    )
+    while True:
+        k, inside, alpha, z, inverse_z = ahead, inside_ahead, alpha_ahead, z_ahead, inverse_ahead
+        row = k * ROW
+        left &= left - 1
+        if left != 0:
+            # One splat ahead: a long chain of operations that wait for each other, while the sums
+            # of the one at hand wait for nothing.
+            ahead = lowest_bit(left)
+            inside_ahead, alpha_ahead, z_ahead, inverse_ahead = evaluate(
+                work, ahead * ROW, BLOCK_WORK.linear + ahead * 8, x, y, sx, sy, discs, by_center
+            )
+        hit = inside & alive
+        w = select(hit, alpha * T, f32(0.0))
+        if keep:
+            last_step = select(hit, broadcast(work, row + TILE_ROW.step), last_step)
+        if undecided:
+            first_depth, first_inverse, median, median_step = _first_and_median(
+                work, row, hit, T, z, inverse_z, discs, by_center, zero,
+                (first_depth, first_inverse, median, median_step),
+            )  # fmt: skip
+        depth, inverse = depth_from(
+            work, row, z, inverse_z, discs, by_center, first_depth, first_inverse
+        )
+        w_depth, w_inverse = w * depth, w * inverse
+        l1 = l1 + w_depth * A - w * depth_sum
+        A, depth_sum = A + w, depth_sum + w_depth
+        inverse_sum, square_sum = inverse_sum + w_inverse, square_sum + w_inverse * inverse
+        n0 = n0 + w * broadcast(work, row + SPLAT.normal)
+        n1 = n1 + w * broadcast(work, row + SPLAT.normal + 1)
+        n2 = n2 + w * broadcast(work, row + SPLAT.normal + 2)
+        c0 = c0 + w * broadcast(work, row + SPLAT.values)
+        c1 = c1 + w * broadcast(work, row + SPLAT.values + 1)
+        c2 = c2 + w * broadcast(work, row + SPLAT.values + 2)
+        T = T - w
+        weights = BLOCK_WORK.weights + k * 16
+        store(work, weights, load(work, weights) + w)
+        if channels > 3:
+            store(work, BLOCK_WORK.shares + used * 16, w)
+            space.picks[u64(used)] = k
+        drawn = count_true(hit)
+        contributing += drawn
+        # 16 if there are any: no second test of the mask.
+        composited += (drawn + 15) & 16
+        used += 1
+        alive = stop < T
+        if not any_true(alive):
+            ends_with = k
+            break
+        if left == 0:
+            break
+    store(buffer, SLOT.transmittance * PIXELS + s, T)
+    store(buffer, SLOT.alpha * PIXELS + s, A)
+    store(buffer, SLOT.depth_sum * PIXELS + s, depth_sum)
+    store(buffer, SLOT.inverse_sum * PIXELS + s, inverse_sum)
+    store(buffer, SLOT.inverse_square_sum * PIXELS + s, square_sum)
+    store(buffer, SLOT.l1 * PIXELS + s, l1)
+    store(buffer, SLOT.last_step * PIXELS + s, last_step)
+    store(buffer, SLOT.normal * PIXELS + s, n0)
+    store(buffer, (SLOT.normal + 1) * PIXELS + s, n1)
+    store(buffer, (SLOT.normal + 2) * PIXELS + s, n2)
+    store(buffer, SLOT.color * PIXELS + s, c0)
+    store(buffer, (SLOT.color + 1) * PIXELS + s, c1)
+    store(buffer, (SLOT.color + 2) * PIXELS + s, c2)
+    store(buffer, SLOT.first_depth * PIXELS + s, first_depth)
+    store(buffer, SLOT.first_inverse * PIXELS + s, first_inverse)
+    store(buffer, SLOT.median * PIXELS + s, median)
+    store(buffer, SLOT.median_step * PIXELS + s, median_step)
+    return used, composited, contributing, ends_with
+
+
+@inlined
+def _add_channels(space, q, used, entries, features, channels):
+    """Sum the channels from the fourth on in square q, over the splats it took."""
+    for c in range(3, channels):
+        at = (SLOT.color + c) * PIXELS + q * 16
+        sums = load(space.buffer, at)
+        for k in range(used):
+            splat = entries[u64(space.entries[space.picks[u64(k)]])] & PLACE
+            share = load(space.block, BLOCK_WORK.shares + k * 16)
+            sums = sums + share * features[u64(splat), u64(c)]
+        store(space.buffer, at, sums)
+
+
+@inlined
+def _entry_weights(space, size, weights):
+    """The weights of the block's entries: sums over the tile's pixels."""
+    work = space.block
+    for k in range(0, size, 16):
+        b = BLOCK_WORK.weights + k * 16
+        sums = sum_each(
+            load(work, b), load(work, b + 16), load(work, b + 32), load(work, b + 48),
+            load(work, b + 64), load(work, b + 80), load(work, b + 96), load(work, b + 112),
+            load(work, b + 128), load(work, b + 144), load(work, b + 160), load(work, b + 176),
+            load(work, b + 192), load(work, b + 208), load(work, b + 224), load(work, b + 240),
+        )  # fmt: skip
+        store(work, BLOCK_WORK.shares, sums)
+        for j in range(min(16, size - k)):
+            weights[u64(space.entries[u64(k + j)])] = work[u64(BLOCK_WORK.shares + j)]
+
+
+@inlined
+def _finish(buffer, background, ndc_scale):
+    """Make depths, distortions and colours of a tile's sums."""
+    for p in range(0, PIXELS, 16):
+        A = load(buffer, SLOT.alpha * PIXELS + p)
+        covered = f32(0.0) < A
+        inverse = select(covered, reciprocal(A), f32(0.0))
+        first_moment = load(buffer, SLOT.inverse_sum * PIXELS + p)
+        second_moment = load(buffer, SLOT.inverse_square_sum * PIXELS + p)
+        variance = maximum(second_moment - first_moment * first_moment * inverse, f32(0.0))
+        store(buffer, SLOT.variance * PIXELS + p, variance)
+        store(buffer, SLOT.l2 * PIXELS + p, A * variance * ndc_scale)
+        first_inverse = load(buffer, SLOT.first_inverse * PIXELS + p)
+        store(buffer, SLOT.inverse_depth * PIXELS + p, first_inverse + first_moment * inverse)
+        depth = load(buffer, SLOT.first_depth * PIXELS + p)
+        depth = depth + load(buffer, SLOT.depth_sum * PIXELS + p) * inverse
+        store(buffer, SLOT.depth * PIXELS + p, select(covered, depth, f32(np.nan)))
+        median = load(buffer, SLOT.median * PIXELS + p)
+        store(buffer, SLOT.median * PIXELS + p, select(covered, median, f32(np.nan)))
+        # Pairs were counted once.
+        l1 = load(buffer, SLOT.l1 * PIXELS + p)
+        store(buffer, SLOT.l1 * PIXELS + p, l1 * f32(2.0))
+        through = f32(1.0) - A
+        for c in range(background.shape[0]):
+            at = (SLOT.color + c) * PIXELS + p
+            store(buffer, at, load(buffer, at) + through * background[c])
+
+
+@inlined
+def _write_whole_tile(buffer, pictures, tile, width):
+    """Write a whole tile of three channels, four pixels at once."""
+    plane = pictures.alpha.shape[0] * width
+    for k in range(PIXELS // 4):
+        r, q = k // SIDE, k % SIDE
+        p = (r // 4 * SIDE + q) * 16 + r % 4 * 4
+        to = (tile.top + r) * width + tile.left + q * 4
+        copy4(pictures.alpha, to, buffer, SLOT.alpha * PIXELS + p)
+        copy4(pictures.depth, to, buffer, SLOT.depth * PIXELS + p)
+        copy4(pictures.median, to, buffer, SLOT.median * PIXELS + p)
+        copy4(pictures.l1, to, buffer, SLOT.l1 * PIXELS + p)
+        copy4(pictures.l2, to, buffer, SLOT.l2 * PIXELS + p)
+        interleave4(pictures.color, 3 * to, buffer, SLOT.color * PIXELS + p, PIXELS)
+        interleave4(pictures.normal, 3 * to, buffer, SLOT.normal * PIXELS + p, PIXELS)
+        if pictures.state.shape[1] > 0:
+            state = pictures.state
+            copy4(state, to + STATE.transmittance * plane, buffer, SLOT.transmittance * PIXELS + p)
+            copy4(state, to + STATE.last_step * plane, buffer, SLOT.last_step * PIXELS + p)
+            copy4(state, to + STATE.median_step * plane, buffer, SLOT.median_step * PIXELS + p)
+            copy4(state, to + STATE.inverse_depth * plane, buffer, SLOT.inverse_depth * PIXELS + p)
+            copy4(state, to + STATE.variance * plane, buffer, SLOT.variance * PIXELS + p)
+
+
+@inlined
+def _write_tile(buffer, pictures, tile):
+    """Write a tile of any size and any number of channels."""
+    state = pictures.state
+    for r in range(tile.rows):
+        for k in range(tile.columns):
+            p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
+            y, x = u64(tile.top + r), u64(tile.left + k)
+            pictures.alpha[y, x] = buffer[u64(SLOT.alpha * PIXELS) + p]
+            pictures.depth[y, x] = buffer[u64(SLOT.depth * PIXELS) + p]
+            pictures.median[y, x] = buffer[u64(SLOT.median * PIXELS) + p]
+            pictures.l1[y, x] = buffer[u64(SLOT.l1 * PIXELS) + p]
+            pictures.l2[y, x] = buffer[u64(SLOT.l2 * PIXELS) + p]
+            for c in range(pictures.color.shape[2]):
+                pictures.color[y, x, u64(c)] = buffer[u64((SLOT.color + c) * PIXELS) + p]
+            for c in range(3):
+                pictures.normal[y, x, u64(c)] = buffer[u64((SLOT.normal + c) * PIXELS) + p]
+            if state.shape[1] > 0:
+                state[STATE.transmittance, y, x] = buffer[u64(SLOT.transmittance * PIXELS) + p]
+                state[STATE.last_step, y, x] = buffer[u64(SLOT.last_step * PIXELS) + p]
+                state[STATE.median_step, y, x] = buffer[u64(SLOT.median_step * PIXELS) + p]
+                state[STATE.inverse_depth, y, x] = buffer[u64(SLOT.inverse_depth * PIXELS) + p]
+                state[STATE.variance, y, x] = buffer[u64(SLOT.variance * PIXELS) + p]
 
 
 @bare
-def forward(first, last, visit, view, tiles_x, live, starts, entries, table, thin, features, background, ndc_scale,
-            color, alpha, depth, median, normal, l1, l2, state, done, tested_in, shaded_in, drawn_in, full, seen, buf,
-            work, exact, picks, places, masks):  # fmt: skip
-    """Composite those of the tiles visit[first:last] that are live.
+def rasterize(
+    first,
+    last,
+    view,
+    tiles,
+    live,  # (tiles,) bool
+    lists,
+    table,
+    background,  # (C,) float32
+    ndc_scale,
+    pictures,
+    progress,
+    space,
+):
+    """Composite those of the tiles order[first:last] that are live.
 
-    A tile is 16 squares of 16 pixels. Splats come in blocks of those that show in a square that is
-    not opaque yet: their coefficients are laid out once for the tile; each square then picks those
-    that its list says may show in it, and composites them with its sums in registers.
+    Splats come in blocks of those that show in a square that is not opaque yet: their coefficients
+    are laid out once for the tile; each square then picks those that its list says may show in it,
+    and composites them with its sums in registers.
 
-    ``state`` (5, H, W) keeps what the backward pass needs: transmittance, last and median entry,
-    mean and spread of 1 / z; of no height if there will be none. Per tile, ``done`` is the number
-    of entries worked off, ``tested_in`` that of pairs whose intersection was computed,
-    ``shaded_in`` of those in a square that the splat draws to, ``drawn_in`` of contributing pairs,
-    ``full`` whether every pixel has ended; ``seen`` is the sum of weights of each entry.
+    Args:
+        ndc_scale: the factor from variances of 1 / z to ``distortion_l2_ndc``.
+        pictures, progress: written to.
+        space: a ``Workspace``.
     """
-    flat, peak = view[FLAT] > 0, view[CENTER] == 0
-    width, height = int(view[WIDTH]), int(view[HEIGHT])
-    channels = background.shape[0]
-    keep = state.shape[1] > 0
+    buffer, channels = space.buffer, background.shape[0]
+    keep = pictures.state.shape[1] > 0
     for p in range(PIXELS):
         # From the middle of the tile's quarter: offsets are small, and so is what they round.
-        buf[XS * PIXELS + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
-        buf[YS * PIXELS + p] = f32(p // (16 * SIDE) % 2 * 4 + p // 4 % 4) - f32(3.5)
+        buffer[SLOT.x * PIXELS + p] = f32(p // 16 % 2 * 4 + p % 4) - f32(3.5)
+        buffer[SLOT.y * PIXELS + p] = f32(p // (16 * SIDE) % 2 * 4 + p // 4 % 4) - f32(3.5)
     for k in range(BLOCK):
-        slopes(exact, k * EXACT)
-    zero = L.load(buf, XS * PIXELS) * f32(0.0)
-    stop, half = f32(K.TRANSMITTANCE_STOP), f32(K.MEDIAN_TRANSMITTANCE)
+        prepare_moments(space.moments, k * MOMENTS)
     for visited in range(first, last):
-        t = visit[visited]
+        t = tiles.order[visited]
         if not live[t]:
             continue
-        begin, end = starts[t], starts[t + 1]
-        tested, shaded, contributing = 0, 0, 0
-        ty, tx = t // tiles_x, t % tiles_x
-        ox, oy = tx * TILE + TILE / 2, ty * TILE + TILE / 2
-        rows, cols = min(TILE, height - ty * TILE), min(TILE, width - tx * TILE)
-        for r in range(rows):
-            # They will be written when the tile is done: the memory has time until then.
-            to = (ty * TILE + r) * width + tx * TILE
-            prefetch_to_write(alpha, to)
-            prefetch_to_write(depth, to)
-            prefetch_to_write(median, to)
-            prefetch_to_write(l1, to)
-            prefetch_to_write(l2, to)
-            prefetch_to_write(normal, 3 * to)
-            prefetch_to_write(normal, 3 * to + 3 * cols - 1)
-            prefetch_to_write(color, channels * to)
-            prefetch_to_write(color, channels * (to + cols) - 1)
-            if keep:
-                for k in range(5):
-                    prefetch_to_write(state, k * height * width + to)
-        for p in range(0, PIXELS, 16):
-            L.store(buf, TT * PIXELS + p, f32(1.0))
-        if rows < TILE or cols < TILE:
-            # Pixels outside of the image are opaque from the start: they take no part and never
-            # delay the stop.
-            for p in range(PIXELS):
-                column, row = p // 16 % SIDE * 4 + p % 4, p // (16 * SIDE) * 4 + p // 4 % 4
-                if column >= cols or row >= rows:
-                    buf[TT * PIXELS + p] = f32(0.0)
-        for p in range(AA * PIXELS, buf.shape[0], 16):
-            L.store(buf, p, f32(0.0))
-        ended, reached = 0, 0
-        for q in range(SQUARES):
-            if not L.some(stop < L.load(buf, TT * PIXELS + q * 16)):
-                ended |= 1 << q
+        begin = lists.starts[t]
+        end = begin + lists.counts[t]
+        tile = tile_at(t, tiles, view)
+        _prefetch_pictures(pictures, tile, view.width, channels)
+        ended = _clear(buffer, tile, f32(TRANSMITTANCE_STOP))
+        tested, composited, contributing, reached = 0, 0, 0, 0
         e = begin
-        while e < end and ended != EVERY:
-            size = 0
-            while e < end and size < BLOCK:
-                # The rows are anywhere in a table larger than the cache.
-                ahead = entries[min(e + AHEAD, end - 1)] & PLACE
-                prefetch(table, ahead * COLUMNS)
-                prefetch(table, ahead * COLUMNS + 8)
-                prefetch(table, ahead * COLUMNS + 16)
-                entry = entries[e]
-                squares = entry >> PLACE_BITS & ~ended
-                if squares == 0:
-                    seen[u64(e)] = f32(0.0)
-                else:
-                    places[u64(size)], masks[u64(size)] = e, squares
-                    lay_out(
-                        work,
-                        size * ROW,
-                        exact,
-                        size * EXACT,
-                        table,
-                        thin,
-                        entry & PLACE,
-                        ox,
-                        oy,
-                        flat,
-                    )
-                    work[u64(size * ROW + STEP)] = f32(e - begin + 1)
-                    L.store(work, WEIGHTS + size * 16, f32(0.0))
-                    size += 1
-                e += 1
-            for k in range(size, BLOCK):
-                masks[u64(k)] = 0
+        while e < end and ended != EVERY_SQUARE:
+            e, size = _lay_out_block(
+                space, table, lists, progress.weights, view, tile, begin, e, end, ended
+            )
             for turn in range(SQUARES):
                 # The tile's quarters after one another.
                 corner = turn & 8 | turn >> 1 & 2
                 if turn & 3 == 0:
-                    dx, dy = (corner & 2) * 4.0 - 4.0, (corner & 8) - 4.0
-                    left = (
-                        L.having(masks, 0, QUARTER << corner)
-                        | L.having(masks, 16, QUARTER << corner) << 16
-                    )
+                    dx, dy = quarter_offset(corner)
+                    left = _in_block(space.masks, QUARTER << corner)
                     while left != 0:
-                        k = L.lowest(left)
+                        k = lowest_bit(left)
                         left &= left - 1
-                        refer(work, PLACED + k * 8, exact, k * EXACT, dx, dy)
+                        linear = BLOCK_WORK.linear + k * 8
+                        move_to_quarter(space.block, linear, space.moments, k * MOMENTS, dx, dy)
                 q = corner + (turn << 1 & 4) + (turn & 1)
                 if ended >> q & 1:
                     continue
-                left = L.having(masks, 0, 1 << q) | L.having(masks, 16, 1 << q) << 16
+                left = _in_block(space.masks, 1 << q)
                 if left == 0:
                     continue
-                s = q * 16
-                x, y = L.load(buf, XS * PIXELS + s), L.load(buf, YS * PIXELS + s)
-                sx, sy = x * f32(ROOT2), y * f32(ROOT2)
-                T, A, D = (
-                    L.load(buf, TT * PIXELS + s),
-                    L.load(buf, AA * PIXELS + s),
-                    L.load(buf, DD * PIXELS + s),
+                used, pairs, drawn, ends_with = _composite_square(
+                    space, q, left, view, channels, keep
                 )
-                sum1, sum2 = L.load(buf, M1 * PIXELS + s), L.load(buf, M2 * PIXELS + s)
-                pairs, final = L.load(buf, L1 * PIXELS + s), L.load(buf, LAST * PIXELS + s)
-                n0, n1 = L.load(buf, NX * PIXELS + s), L.load(buf, NY * PIXELS + s)
-                n2, c0 = L.load(buf, NZ * PIXELS + s), L.load(buf, C_0 * PIXELS + s)
-                c1, c2 = L.load(buf, C_1 * PIXELS + s), L.load(buf, C_2 * PIXELS + s)
-                zref, iref = L.load(buf, ZREF * PIXELS + s), L.load(buf, IREF * PIXELS + s)
-                med, medk = L.load(buf, MED * PIXELS + s), L.load(buf, MEDK * PIXELS + s)
-                # Once no pixel is, what only the first splats of a pixel decide is over: for a
-                # block at a time, so that it costs no branch that goes both ways.
-                undecided = L.some(half < T)
-                alive = stop < T
-                used = 0
-                following = L.lowest(left)
-                inside_then, a_then, p_then, q_then = shade(
-                    work, following * ROW, PLACED + following * 8, x, y, sx, sy, flat, peak
-                )
-                while True:
-                    k, inside, a, p, iq = following, inside_then, a_then, p_then, q_then
-                    b = k * ROW
-                    left &= left - 1
-                    if left != 0:
-                        # One splat ahead: a long chain of operations that wait for each other,
-                        # while the sums of the one at hand wait for nothing.
-                        following = L.lowest(left)
-                        inside_then, a_then, p_then, q_then = shade(
-                            work, following * ROW, PLACED + following * 8, x, y, sx, sy, flat, peak
-                        )
-                    hit = inside & alive
-                    w = L.where(hit, a * T, f32(0.0))
-                    step = L.spread(work, b + STEP)
-                    if keep:
-                        final = L.where(hit, step, final)
-                    if undecided:
-                        z, iz = depth_less(work, b, p, iq, flat, peak, zero, zero)
-                        opens, first_hit = hit & (half < T), hit & (f32(1.0) <= T)
-                        med, medk = L.where(opens, z, med), L.where(opens, step, medk)
-                        # Depths are summed relative to the pixel's first, which keeps the digits of
-                        # thin layers far away.
-                        zref, iref = L.where(first_hit, z, zref), L.where(first_hit, iz, iref)
-                    z, m = depth_less(work, b, p, iq, flat, peak, zref, iref)
-                    wz, wm = w * z, w * m
-                    pairs = pairs + wz * A - w * D
-                    A, D = A + w, D + wz
-                    sum1, sum2 = sum1 + wm, sum2 + wm * m
-                    n0 = n0 + w * L.spread(work, b + NORMAL)
-                    n1 = n1 + w * L.spread(work, b + NORMAL + 1)
-                    n2 = n2 + w * L.spread(work, b + NORMAL + 2)
-                    c0 = c0 + w * L.spread(work, b + VALUES)
-                    c1 = c1 + w * L.spread(work, b + VALUES + 1)
-                    c2 = c2 + w * L.spread(work, b + VALUES + 2)
-                    T = T - w
-                    L.store(work, WEIGHTS + k * 16, L.load(work, WEIGHTS + k * 16) + w)
-                    if channels > 3:
-                        L.store(work, SHARES + used * 16, w)
-                        picks[u64(used)] = k
-                    drawn = L.count(hit)
-                    contributing += drawn
-                    # 16 if there are any: no second test of the mask.
-                    shaded += (drawn + 15) & 16
-                    used += 1
-                    alive = stop < T
-                    if not L.some(alive):
-                        ended |= 1 << q
-                        reached = max(reached, places[u64(k)] - begin + 1)
-                        break
-                    if left == 0:
-                        break
-                L.store(buf, TT * PIXELS + s, T)
-                L.store(buf, AA * PIXELS + s, A)
-                L.store(buf, DD * PIXELS + s, D)
-                L.store(buf, M1 * PIXELS + s, sum1)
-                L.store(buf, M2 * PIXELS + s, sum2)
-                L.store(buf, L1 * PIXELS + s, pairs)
-                L.store(buf, NX * PIXELS + s, n0)
-                L.store(buf, NY * PIXELS + s, n1)
-                L.store(buf, NZ * PIXELS + s, n2)
-                L.store(buf, C_0 * PIXELS + s, c0)
-                L.store(buf, C_1 * PIXELS + s, c1)
-                L.store(buf, C_2 * PIXELS + s, c2)
-                L.store(buf, ZREF * PIXELS + s, zref)
-                L.store(buf, IREF * PIXELS + s, iref)
-                L.store(buf, MED * PIXELS + s, med)
-                L.store(buf, MEDK * PIXELS + s, medk)
-                L.store(buf, LAST * PIXELS + s, final)
                 tested += 16 * used
-                for c in range(3, channels):
-                    sums = L.load(buf, (C_0 + c) * PIXELS + s)
-                    for k in range(used):
-                        f = features[u64(entries[u64(places[picks[u64(k)]])] & PLACE), u64(c)]
-                        sums = sums + L.load(work, SHARES + k * 16) * f
-                    L.store(buf, (C_0 + c) * PIXELS + s, sums)
-            for k in range(0, size, 16):
-                b = WEIGHTS + k * 16
-                sums = L.totals(
-                    L.load(work, b), L.load(work, b + 16), L.load(work, b + 32), L.load(work, b + 48),
-                    L.load(work, b + 64), L.load(work, b + 80), L.load(work, b + 96), L.load(work, b + 112),
-                    L.load(work, b + 128), L.load(work, b + 144), L.load(work, b + 160), L.load(work, b + 176),
-                    L.load(work, b + 192), L.load(work, b + 208), L.load(work, b + 224), L.load(work, b + 240),
-                )  # fmt: skip
-                L.store(work, SHARES, sums)
-                for j in range(min(16, size - k)):
-                    seen[u64(places[u64(k + j)])] = work[u64(SHARES + j)]
-        full[t] = ended == EVERY
-        done[t] = reached if ended == EVERY else end - begin
-        tested_in[t] = tested
-        shaded_in[t] = shaded
-        drawn_in[t] = contributing
-        for p in range(0, PIXELS, 16):
-            A, a1 = L.load(buf, AA * PIXELS + p), L.load(buf, M1 * PIXELS + p)
-            covered = f32(0.0) < A
-            inverse = L.where(covered, L.inverse(A), f32(0.0))
-            spread = L.most(L.load(buf, M2 * PIXELS + p) - a1 * a1 * inverse, f32(0.0))
-            L.store(buf, AL * PIXELS + p, spread)
-            L.store(buf, M2 * PIXELS + p, A * spread * f32(ndc_scale))
-            L.store(buf, M1 * PIXELS + p, L.load(buf, IREF * PIXELS + p) + a1 * inverse)
-            mean = L.load(buf, ZREF * PIXELS + p) + L.load(buf, DD * PIXELS + p) * inverse
-            L.store(buf, DD * PIXELS + p, L.where(covered, mean, f32(np.nan)))
-            L.store(
-                buf, MED * PIXELS + p, L.where(covered, L.load(buf, MED * PIXELS + p), f32(np.nan))
-            )
-            L.store(buf, L1 * PIXELS + p, L.load(buf, L1 * PIXELS + p) * f32(2.0))
-            through = f32(1.0) - A
-            for c in range(channels):
-                at = (C_0 + c) * PIXELS + p
-                L.store(buf, at, L.load(buf, at) + through * background[c])
-        if rows == TILE and cols == TILE and channels == 3:
-            for k in range(PIXELS // 4):
-                r, q = k // SIDE, k % SIDE
-                p = (r // 4 * SIDE + q) * 16 + r % 4 * 4
-                to = (ty * TILE + r) * width + tx * TILE + q * 4
-                L.copy4(alpha, to, buf, AA * PIXELS + p)
-                L.copy4(depth, to, buf, DD * PIXELS + p)
-                L.copy4(median, to, buf, MED * PIXELS + p)
-                L.copy4(l1, to, buf, L1 * PIXELS + p)
-                L.copy4(l2, to, buf, M2 * PIXELS + p)
-                L.interleave4(color, 3 * to, buf, C_0 * PIXELS + p, PIXELS)
-                L.interleave4(normal, 3 * to, buf, NX * PIXELS + p, PIXELS)
-                if keep:
-                    L.copy4(state, to, buf, TT * PIXELS + p)
-                    L.copy4(state, to + height * width, buf, LAST * PIXELS + p)
-                    L.copy4(state, to + 2 * height * width, buf, MEDK * PIXELS + p)
-                    L.copy4(state, to + 3 * height * width, buf, M1 * PIXELS + p)
-                    L.copy4(state, to + 4 * height * width, buf, AL * PIXELS + p)
-            continue
-        for r in range(rows):
-            for k in range(cols):
-                p = u64((r // 4 * SIDE + k // 4) * 16 + r % 4 * 4 + k % 4)
-                y, x = u64(ty * TILE + r), u64(tx * TILE + k)
-                alpha[y, x], depth[y, x], median[y, x] = (
-                    buf[AA * PIXELS + p],
-                    buf[DD * PIXELS + p],
-                    buf[MED * PIXELS + p],
-                )
-                l1[y, x], l2[y, x] = buf[L1 * PIXELS + p], buf[M2 * PIXELS + p]
-                for c in range(channels):
-                    color[y, x, u64(c)] = buf[u64((C_0 + c) * PIXELS) + p]
-                for c in range(3):
-                    normal[y, x, u64(c)] = buf[u64((NX + c) * PIXELS) + p]
-                if keep:
-                    state[0, y, x], state[1, y, x] = buf[TT * PIXELS + p], buf[LAST * PIXELS + p]
-                    state[2, y, x] = buf[MEDK * PIXELS + p]
-                    state[3, y, x], state[4, y, x] = buf[M1 * PIXELS + p], buf[AL * PIXELS + p]
+                composited += pairs
+                contributing += drawn
+                if ends_with >= 0:
+                    ended |= 1 << q
+                    reached = max(reached, space.entries[u64(ends_with)] - begin + 1)
+                _add_channels(space, q, used, lists.entries, table.features, channels)
+            _entry_weights(space, size, progress.weights)
+        progress.opaque[t] = ended == EVERY_SQUARE
+        progress.processed[t] = reached if ended == EVERY_SQUARE else end - begin
+        progress.tested[t] = tested
+        progress.composited[t] = composited
+        progress.contributing[t] = contributing
+        _finish(buffer, background, f32(ndc_scale))
+        if tile.rows == TILE and tile.columns == TILE and channels == 3:
+            _write_whole_tile(buffer, pictures, tile, view.width)
+        else:
+            _write_tile(buffer, pictures, tile)
 
 
 @bare
-def hand_out(order, sums, weight):
-    """``weight`` of each splat from the sums, in WEIGHT_UNIT, by place in the order of depth."""
+def splat_weights(
+    order,  # (M,) int32
+    sums,  # (M,) int64, in WEIGHT_UNIT, in the order of depth
+    weight,  # (N,) float32
+):
+    """Hand the sums of :func:`settle` out to the splats."""
     for place in range(order.shape[0]):
         weight[u64(order[u64(place)])] = sums[u64(place)] * WEIGHT_UNIT
 
 
 @bare
-def settle(ended, starts, done, entries, seen, weight, offset, places, kept):
-    """Of the tiles that have ``ended``: add the entries' weights to their splats' (by place in the
-    order of depth), and, if there is room in ``kept``, keep what was worked off; tile t's from
-    places[t] - ``offset`` on.
+def settle(
+    ended,  # (tiles,) bool
+    lists,
+    progress,
+    sums,  # (M,) int64, in WEIGHT_UNIT, in the order of depth
+    offset,
+    starts,  # (tiles,) int64
+    cached,  # (.) int64: the entries processed in these tiles, or none
+):
+    """Add the weights of the tiles that have ended to their splats' ``sums``; cache what was
+    processed for the backward pass, tile t's from starts[t] - ``offset`` on.
 
-    Weights are summed as whole numbers of WEIGHT_UNIT: the same bits in whatever order tiles end.
+    Weights are summed as whole numbers: the same bits in whatever order tiles end.
     """
     at = 0
-    keep = kept.shape[0] > 0
-    for t in range(done.shape[0]):
+    keep = cached.shape[0] > 0
+    entries, weights = lists.entries, progress.weights
+    for t in range(ended.shape[0]):
         if ended[t]:
-            places[t] = offset + at
-            for e in range(starts[t], starts[t] + done[t]):
-                weight[entries[u64(e)] & PLACE] += int(f64(seen[u64(e)]) * (1 / WEIGHT_UNIT))
+            starts[t] = offset + at
+            begin = lists.starts[t]
+            for e in range(begin, begin + progress.processed[t]):
+                entry, weight = entries[u64(e)], weights[u64(e)]
+                sums[entry & PLACE] += int(f64(weight) * (1 / WEIGHT_UNIT))
                 if keep:
                     # Of what is nowhere drawn, no square is of interest to the backward pass.
-                    kept[at] = entries[u64(e)] if seen[u64(e)] > 0 else entries[u64(e)] & PLACE
+                    cached[at] = entry if weight > 0 else entry & PLACE
                     at += 1

@@ -9,18 +9,28 @@ import numba
 import numpy as np
 import pytest
 
-from attnwarp.render._kernels import backward, binning, lanes, layout, projection, rasterization
+from attnwarp.render._kernels import (
+    backward,
+    binning,
+    compilation,
+    lanes,
+    layout,
+    ordering,
+    projection,
+    projection_backward,
+    rasterization,
+)
 from benchmarks import peak
 
 
 def test_estimates_made_better_and_sums_in_another_order() -> None:
     @numba.njit
     def work(x, y):
-        lanes.store(y, 0, lanes.inverse(lanes.load(x, 0)))
-        lanes.store(y, 16, lanes.rough_root(lanes.load(x, 0)))
+        lanes.store(y, 0, lanes.reciprocal(lanes.load(x, 0)))
+        lanes.store(y, 16, lanes.approximate_sqrt(lanes.load(x, 0)))
         a, b, c, d = lanes.load(x, 16), lanes.load(x, 32), lanes.load(x, 48), lanes.load(x, 64)
-        lanes.store(y, 32, lanes.totals(a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c))
-        lanes.store(y, 48, lanes.totals8(a, b, c, d, d, c, b, a))
+        lanes.store(y, 32, lanes.sum_each(a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c))
+        lanes.store(y, 48, lanes.sum_each8(a, b, c, d, d, c, b, a))
 
     random = np.random.default_rng(0)
     for scale in (1e-12, 1e-3, 1.0, 1e6):
@@ -39,9 +49,9 @@ def test_eight_float64_to_the_last_bits() -> None:
     @numba.njit
     def work(x, y):
         given = lanes.load8(x, 0)
-        lanes.store8(y, 0, lanes.inverse(given))
-        lanes.store8(y, 8, lanes.inverse_root(given))
-        lanes.store8(y, 16, projection._root(given))
+        lanes.store8(y, 0, lanes.reciprocal(given))
+        lanes.store8(y, 8, lanes.reciprocal_sqrt(given))
+        lanes.store8(y, 16, projection._sqrt(given))
         lanes.store8(y, 24, projection._log(given))
 
     random = np.random.default_rng(0)
@@ -50,10 +60,10 @@ def test_eight_float64_to_the_last_bits() -> None:
         for _ in range(50):
             x = scale * random.uniform(0.5, 2, 8)
             work(x, y)
-            for found, exact in zip(
+            for actual, exact in zip(
                 y.reshape(4, 8)[:3], (1 / x, 1 / np.sqrt(x), np.sqrt(x)), strict=True
             ):
-                assert np.abs(found / exact - 1).max() < 1e-15
+                assert np.abs(actual / exact - 1).max() < 1e-15
             assert np.abs(y[24:] - np.log(x)).max() < 1e-12 * max(1, np.abs(np.log(x)).max())
     work(np.zeros(8), y)
     assert (y[16:24] == 0).all()
@@ -72,12 +82,12 @@ def test_float64_are_rounded_to_float32_when_stored_so() -> None:
 def test_bits_of_sixteen_words() -> None:
     @numba.njit
     def work(words, wanted):
-        left, seen = lanes.having(words, 0, wanted), 0
+        left, seen = lanes.with_any_bit(words, 0, wanted), 0
         while left != 0:
-            k = lanes.lowest(left)
+            k = lanes.lowest_bit(left)
             left &= left - 1
             seen = seen * 16 + k
-        return lanes.having(words, 0, wanted), seen
+        return lanes.with_any_bit(words, 0, wanted), seen
 
     random = np.random.default_rng(0)
     for wanted in (1, 1 << 15, 0x33 << 10, 0xFFFF):
@@ -85,8 +95,8 @@ def test_bits_of_sixteen_words() -> None:
             0, 1 << 16, 16
         ).astype(np.int32)
         places = [k for k in range(16) if int(words[k]) & wanted]
-        found, order = work(words, wanted)
-        assert found == sum(1 << k for k in places)
+        bits, order = work(words, wanted)
+        assert bits == sum(1 << k for k in places)
         assert order == int("0" + "".join(f"{k:x}" for k in places), 16) & ((1 << 64) - 1)
 
 
@@ -94,10 +104,10 @@ def test_ends_and_neighbours() -> None:
     @numba.njit
     def work(x, y, ends, whole):
         first, last = lanes.load(x, 0), lanes.load(x, 16)
-        lanes.store_ends(ends, 0, first, last)
-        lanes.store_whole(whole, 0, last)
-        lanes.store(y, 0, lanes.swapped1(first))
-        lanes.store(y, 16, lanes.swapped2(first))
+        lanes.store_intervals(ends, 0, first, last)
+        lanes.store_integers(whole, 0, last)
+        lanes.store(y, 0, lanes.swap1(first))
+        lanes.store(y, 16, lanes.swap2(first))
 
     x = np.r_[np.arange(16) * 2000 + 0.75, np.arange(16) - 1].astype(np.float32)
     y, ends, whole = np.zeros(32, np.float32), np.zeros(16, np.int32), np.zeros(16, np.int32)
@@ -113,32 +123,37 @@ def test_a_row_of_squares_as_bits(begin, end) -> None:
     """Of a run from column 40 on, in both ways that lists are filled."""
     code = 40 + begin | 40 + end << 16
     row = [begin <= column <= end for column in range(56)]
-    assert binning._bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
+    assert binning._row_bits(code, 40) == sum(1 << k for k, inside in enumerate(row) if inside)
     for column in range(0, 56, layout.SIDE):
         part = row[column : column + layout.SIDE]
-        assert binning._columns(code, 40 + column) == sum(
+        assert binning._tile_bits(code, 40 + column) == sum(
             1 << k for k, inside in enumerate(part) if inside
         )
     nothing = 32767 | -1 << 16
-    assert binning._bits(nothing, 40) == binning._columns(nothing, 40) == 0
+    assert binning._row_bits(nothing, 40) == binning._tile_bits(nothing, 40) == 0
 
 
 def test_a_change_in_any_module_throws_cached_code_away(tmp_path) -> None:
     """numba itself looks at the file of a function only, not at those of what was inlined into
     it."""
     render = tmp_path / "render"
-    shutil.copytree(Path(layout.__file__).parent, render / "_kernels")
-    shutil.copy(Path(layout.__file__).parent.parent / "constants.py", render)
-    assert layout.fingerprint(render / "_kernels") == layout.FINGERPRINT
-    for file in (render / "_kernels" / "lanes.py", render / "constants.py"):
+    here = Path(layout.__file__).parent
+    shutil.copytree(here, render / "_kernels")
+    for name in ("constants.py", "harmonics.py"):
+        shutil.copy(here.parent / name, render)
+    assert compilation.fingerprint(render / "_kernels") == compilation.FINGERPRINT
+    for name in ("_kernels/lanes.py", "constants.py", "harmonics.py"):
+        file = render / name
         file.write_text(file.read_text() + "\n")
-        assert layout.fingerprint(render / "_kernels") != layout.FINGERPRINT
+        assert compilation.fingerprint(render / "_kernels") != compilation.FINGERPRINT
         file.write_text(file.read_text()[:-1])
     for dispatcher in (
-        rasterization.forward,
-        backward.backward,
+        rasterization.rasterize,
+        backward.rasterize_backward,
         projection.project,
-        binning.outline,
+        projection_backward.project_backward,
+        ordering.depths,
+        binning.find_runs,
         peak.multiply_add,
     ):
-        assert dispatcher._cache._cache_file._source_stamp == layout.FINGERPRINT
+        assert dispatcher._cache._cache_file._source_stamp == compilation.FINGERPRINT

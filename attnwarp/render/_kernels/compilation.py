@@ -1,0 +1,79 @@
+"""How the kernels are compiled: decorators, casts, and prefetches."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+# NaN and infinity are left to IEEE rules: selects rely on comparisons with them.
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+
+def fingerprint(folder: Path = Path(__file__).parent) -> str:
+    """SHA-256 of all that is compiled: the modules of ``folder``, and two modules beside it."""
+    beside = [folder.parent / name for name in ("constants.py", "harmonics.py")]
+    files = [*sorted(folder.glob("*.py")), *beside]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+
+
+FINGERPRINT = fingerprint()
+
+
+def _compiled(**options: Any) -> Any:
+    """numba's decorator, with a cache on disk that is discarded when any of the modules changes.
+
+    numba alone looks at the function's own file only, and would reuse what was inlined from others.
+    """
+
+    def decorate(function: Any) -> Any:
+        dispatcher = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options)(
+            function
+        )
+        # There is no cache where numba is told to compile nothing.
+        file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if file is not None:
+            file._source_stamp = FINGERPRINT
+        return dispatcher
+
+    return decorate
+
+
+jit = _compiled()
+# Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,
+# and two threads that count the same array up and down for every splat spend a third of their time
+# on it. Such kernels allocate nothing.
+bare = _compiled(_nrt=False)
+inlined = _compiled(inline="always")
+
+f32 = np.float32
+f64 = np.float64
+# Indices are unsigned in inner loops: numba's test for negative ones stops vectorisation.
+u64 = np.uint64
+
+
+def _prefetcher(write: int) -> Any:
+    @intrinsic
+    def prefetch_item(typing: Any, array: Any, item: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            data = cgutils.create_struct_proxy(signature.args[0])(context, builder, args[0]).data
+            pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.IntType(8).as_pointer())
+            word = ir.IntType(32)
+            kind = ir.FunctionType(ir.VoidType(), [ir.IntType(8).as_pointer(), word, word, word])
+            call = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+            builder.call(call, [pointer, word(write), word(3), word(1)])
+            return word(0)
+
+        return nb.int32(array, nb.int64), codegen
+
+    return prefetch_item
+
+
+# Load the cache line of an array's item (counted flat) ahead of its use, for reading or writing.
+prefetch, prefetch_to_write = _prefetcher(0), _prefetcher(1)

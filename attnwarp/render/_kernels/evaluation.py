@@ -1,0 +1,219 @@
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
+"""One splat at the 16 pixels of a square: where it is drawn, its alpha and its depth.
+
+Shared by the forward and the backward pass. Coefficients are float64 in the table; they are laid
+out once for a tile, in float64 about its middle, and moved to the middle of each quarter of it
+before they are rounded to float32.
+"""
+
+from __future__ import annotations
+
+import math
+
+from attnwarp.render._kernels.compilation import f32, inlined, u64
+from attnwarp.render._kernels.lanes import (
+    broadcast,
+    fma,
+    load,
+    load8,
+    maximum,
+    minimum,
+    narrow,
+    reciprocal,
+    select,
+    store,
+    store8,
+    times_power_of_2,
+)
+from attnwarp.render._kernels.layout import (
+    DISC,
+    ELLIPSOID,
+    LINEAR,
+    MOMENTS,
+    NO_FILTER,
+    NOWHERE,
+    ROOT2,
+    ROW_DOUBLES,
+    SINGLE,
+    SLOPE_X,
+    SLOPE_Y,
+    SPLAT,
+    TILE_ROW,
+)
+from attnwarp.render.constants import ALPHA_MAX
+
+LOG2E_HALF = f32(0.5 * math.log2(math.e))
+# exp2(x) on [-0.5, 0.5], the polynomial of degree 5 that is 1 at 0 with the least relative error,
+# 9.1e-8.
+EXP2 = tuple(
+    f32(c)
+    for c in (
+        1.0,
+        0.6931469775373009,
+        0.24022242044016756,
+        0.05550733832514562,
+        0.009671514536030823,
+        0.0013264700286626865,
+    )
+)
+ROUND = f32(1.5 * 2**23)
+
+
+@inlined
+def _gaussian(rho):
+    """exp(-rho / 2), relative error 1.5e-7, for rho from 0 to 88; beyond, anything."""
+    # Adding 1.5 2^23 rounds to an integer and leaves it in the lowest bits.
+    shifted = fma(rho, -LOG2E_HALF, ROUND)
+    f = fma(rho, -LOG2E_HALF, ROUND - shifted)
+    # In pairs rather than in a row: the products wait less for one another.
+    g = f * f
+    high, low = (f * EXP2[5] + EXP2[4]) * g, f * EXP2[3] + EXP2[2]
+    return times_power_of_2((high + low) * g + (f * EXP2[1] + f32(1.0)), shifted)
+
+
+@inlined
+def prepare_moments(moments, start):
+    """Set the slopes in ``moments`` that all splats have; see :func:`lay_out`."""
+    for k in range(MOMENTS):
+        moments[u64(start + k)] = 0.0
+    moments[u64(start + SLOPE_X + LINEAR.screen_x)] = ROOT2
+    moments[u64(start + SLOPE_Y + LINEAR.screen_y)] = ROOT2
+    moments[u64(start + SLOPE_X + LINEAR.x)] = moments[u64(start + SLOPE_Y + LINEAR.y)] = 1.0
+
+
+@inlined
+def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs):
+    """Lay out splat k of the table for a tile.
+
+    Its row as float32 goes to ``work`` from ``row`` on; what is linear in the pixel's position to
+    ``moments`` from ``start`` on: its values at the tile's middle, and its slopes.
+    """
+    k, b, m = u64(k), u64(row), u64(start)
+    doubles, singles = table.doubles, table.singles
+    narrow(work, row, doubles, k * u64(ROW_DOUBLES))
+    work[b + u64(8)], work[b + u64(9)] = doubles[k, 8], doubles[k, 9]
+    store(work, row + SINGLE, load(singles, k * u64(2 * ROW_DOUBLES) + u64(2 * SINGLE)))
+    work[b + u64(SPLAT.values + 2)] = singles[k, u64(SINGLE + SPLAT.values + 2)]
+    dx, dy = middle_x - doubles[k, SPLAT.center_x], middle_y - doubles[k, SPLAT.center_y]
+    moments[m + u64(LINEAR.x)], moments[m + u64(LINEAR.y)] = dx, dy
+    if discs:
+        for c in range(3):
+            slope_x, slope_y = doubles[k, DISC.u_x + 3 * c], doubles[k, DISC.u_y + 3 * c]
+            value = doubles[k, DISC.u_0 + 3 * c] + slope_x * dx + slope_y * dy
+            moments[m + u64(LINEAR.u + c)] = value
+            moments[m + u64(SLOPE_X + LINEAR.u + c)] = slope_x
+            moments[m + u64(SLOPE_Y + LINEAR.u + c)] = slope_y
+        filtered = singles[k, u64(SINGLE + DISC.filtered)] > 0
+        moments[m + u64(LINEAR.screen_x)] = ROOT2 * dx if filtered else NO_FILTER
+        moments[m + u64(LINEAR.screen_y)] = ROOT2 * dy
+    else:
+        xx, xy = doubles[k, ELLIPSOID.factor], doubles[k, ELLIPSOID.factor + 1]
+        yy = doubles[k, ELLIPSOID.factor + 2]
+        work[b + u64(TILE_ROW.factor)], work[b + u64(TILE_ROW.factor + 1)] = xx, xy
+        work[b + u64(TILE_ROW.factor + 2)] = yy
+        moments[m + u64(LINEAR.u)], moments[m + u64(LINEAR.v)] = xx * dx + xy * dy, yy * dy
+        moments[m + u64(SLOPE_X + LINEAR.u)] = xx
+        moments[m + u64(SLOPE_Y + LINEAR.u)] = xy
+        moments[m + u64(SLOPE_Y + LINEAR.v)] = yy
+
+
+@inlined
+def move_to_quarter(work, linear, moments, start, dx, dy):
+    """Evaluate ``moments`` (dx, dy) off the tile's middle, as float32 to ``work`` from ``linear``
+    on."""
+    slope_x, slope_y = load8(moments, start + SLOPE_X), load8(moments, start + SLOPE_Y)
+    store8(work, linear, load8(moments, start) + slope_x * dx + slope_y * dy)
+
+
+@inlined
+def linear_at(work, term, row, slope, x, y):
+    """A linear term at pixels (x, y): its value at ``term``, its slopes in the row at ``slope``."""
+    return (
+        broadcast(work, term)
+        + broadcast(work, row + slope) * x
+        + broadcast(work, row + slope + 1) * y
+    )
+
+
+@inlined
+def peak_terms(work, row, x, y):
+    """Of a 3D splat at offsets (x, y) from its reference point: l, and l^2 + r; see
+    :class:`EllipsoidColumns`."""
+    along = (
+        broadcast(work, row + ELLIPSOID.peak_x) * x
+        + broadcast(work, row + ELLIPSOID.peak_y) * y
+        + f32(1.0)
+    )
+    xx, xy = broadcast(work, row + ELLIPSOID.peak_xx), broadcast(work, row + ELLIPSOID.peak_xy)
+    form = (xx * x + xy * y * f32(2.0)) * x
+    form = form + broadcast(work, row + ELLIPSOID.peak_yy) * y * y
+    return along, along * along + maximum(form, f32(0.0))
+
+
+@inlined
+def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
+    """A splat at 16 pixels: where it is drawn, its alpha (anything elsewhere), z and 1 / z.
+
+    The depths are scaled: of a 2D splat in units of its column ``depth``, unless they are its
+    centre's, which then are not looked at; see :func:`depth_from`.
+
+    A 2D splat's W is clamped to the z that it may have, between w_low and w_high, before anything
+    is divided by it. That bounds the z of what its filter draws, and changes nothing that its
+    intersection draws, nor adds to it. For take its centre in front, and the centre's z as 1: at
+    (u, v) = U / W the plane has z = 1 / W = 1 + s u for a slope s, so s U = 1 - W, and w_low = 1 /
+    (1 + E |s|) with E = EXTENT_SIGMAS. Where W is less than w_low, |U| > (1 - w_low) / |s| = E
+    w_low: |U| / w_low is more than E too, where nothing is drawn. Where W is more than w_high,
+    |U| / w_high is more than |U| / W, which is more than E, unless w_high is that of the near
+    plane; this is what w_most is for.
+
+    Args:
+        row: of ``work``, where the splat's row begins; see :func:`lay_out`.
+        linear: where its linear terms begin; see :func:`move_to_quarter`.
+        x, y: Lanes, pixels from the middle of the quarter.
+        screen_x, screen_y: the same times the root of 2.
+    """
+    if discs:
+        w = linear_at(work, linear + LINEAR.w, row, DISC.w_x, x, y)
+        u = linear_at(work, linear + LINEAR.u, row, DISC.u_x, x, y)
+        v = linear_at(work, linear + LINEAR.v, row, DISC.v_x, x, y)
+        inverse_z = minimum(
+            maximum(w, broadcast(work, row + DISC.w_low)), broadcast(work, row + DISC.w_high)
+        )
+        z = reciprocal(inverse_z)
+        sx = screen_x + broadcast(work, linear + LINEAR.screen_x)
+        sy = screen_y + broadcast(work, linear + LINEAR.screen_y)
+        meets = w <= broadcast(work, row + DISC.w_most)
+        rho = minimum(select(meets, (u * u + v * v) * (z * z), f32(NOWHERE)), sx * sx + sy * sy)
+    else:
+        u = linear_at(work, linear + LINEAR.u, row, TILE_ROW.factor, x, y)
+        v = broadcast(work, linear + LINEAR.v) + broadcast(work, row + TILE_ROW.factor + 2) * y
+        rho = u * u + v * v
+        z = broadcast(work, row + SPLAT.depth_low)
+        inverse_z = broadcast(work, row + SPLAT.inverse_depth_low)
+        if not by_center:
+            low, high = z, broadcast(work, row + SPLAT.depth_high)
+            ex = x + broadcast(work, linear + LINEAR.x)
+            ey = y + broadcast(work, linear + LINEAR.y)
+            along, across = peak_terms(work, row, ex, ey)
+            z = broadcast(work, row + SPLAT.depth) * along * reciprocal(maximum(across, f32(1e-30)))
+            z = minimum(maximum(z, low), high)
+            inverse_z = reciprocal(z)
+    inside = rho <= broadcast(work, row + SPLAT.cut)
+    alpha = minimum(broadcast(work, row + SPLAT.opacity) * _gaussian(rho), f32(ALPHA_MAX))
+    return inside, alpha, z, inverse_z
+
+
+@inlined
+def depth_from(work, row, z, inverse_z, discs, by_center, z0, inverse_z0):
+    """z - z0 and 1 / z - inverse_z0 of a splat, from the scaled depths of :func:`evaluate`."""
+    if discs:
+        if by_center:
+            return (
+                broadcast(work, row + SPLAT.depth_low) - z0,
+                broadcast(work, row + SPLAT.inverse_depth_low) - inverse_z0,
+            )
+        return (
+            fma(broadcast(work, row + SPLAT.depth), z, -z0),
+            fma(broadcast(work, row + DISC.inverse_depth), inverse_z, -inverse_z0),
+        )
+    return z - z0, inverse_z - inverse_z0

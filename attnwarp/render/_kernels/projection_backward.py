@@ -1,0 +1,449 @@
+# mypy: disallow-untyped-defs=False, check-untyped-defs=False
+"""Backward pass of the projection: from gradients in the table to parameters and the pose.
+
+The vector-Jacobian product of :func:`attnwarp.render._kernels.projection.project`, every step of it
+in reverse, one splat after another in float64. Gradients of the loss are named "d_".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from attnwarp.render._kernels.compilation import f64, inlined, jit, prefetch
+from attnwarp.render._kernels.layout import DISC, ELLIPSOID, GRADIENTS, SPLAT, View
+from attnwarp.render._kernels.projection import harmonics
+from attnwarp.render.constants import (
+    BLUR_3D,
+    COMPENSATION_MIN,
+    EDGE_ON,
+    EXTENT_SIGMAS,
+    JACOBIAN_MARGIN,
+)
+from attnwarp.render.harmonics import C1, C2, C3
+
+
+class ViewColumns(NamedTuple):
+    """A ``View`` as one row of float64, as :func:`view_row` makes it."""
+
+    rotation: int = 0  # (9)
+    translation: int = 9  # (3)
+    fx: int = 12
+    skew: int = 13
+    fy: int = 14
+    cx: int = 15
+    cy: int = 16
+    width: int = 17
+    height: int = 18
+    near: int = 19
+    discs: int = 20  # flags: 0 or 1, as the rest are
+    by_center: int = 21
+    antialiased: int = 22
+    harmonic: int = 23
+
+
+VIEW = ViewColumns()
+
+
+def view_row(view: View) -> np.ndarray:
+    """(24,) the view for :func:`project_backward`.
+
+    One row, and one long function below: with separate values, or split, LLVM adds in another
+    order, and the last bits of the gradients move.
+    """
+    return np.array([*view.rotation.reshape(-1), *view.translation, *view[2:]], np.float64)
+
+
+@inlined
+def _rotation(quats, i, Q):
+    """Rotation of quaternion i into Q; returns the quaternion's length."""
+    w, x, y, z = f64(quats[i, 0]), f64(quats[i, 1]), f64(quats[i, 2]), f64(quats[i, 3])
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    inverse = 1 / length
+    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+    Q[0, 0], Q[0, 1], Q[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    Q[1, 0], Q[1, 1], Q[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    Q[2, 0], Q[2, 1], Q[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return length
+
+
+@jit
+def project_backward(
+    first,
+    last,
+    view,  # (24,) float64, see ViewColumns
+    splats,
+    order,  # (M,) int32
+    channels,
+    projected,
+    total,  # (M, GRADIENTS + 3 + max(3, C)) float64
+    gradients,
+    g_view,  # (12,) float64
+):
+    """Gradients in the parameters of the splats order[first:last] from those in their projection,
+    ``total``.
+
+    The vector-Jacobian product of :func:`project`, in float64, every step of it in reverse.
+    ``g_view`` (12) receives the sums for R and t.
+    """
+    m, q, sizes, o, values = (
+        splats.means,
+        splats.quats,
+        splats.scales,
+        splats.opacities,
+        splats.values,
+    )
+    d_means, d_quats, d_scales = gradients.means, gradients.quats, gradients.scales
+    d_opacities, d_values = gradients.opacities, gradients.values
+    table = projected.doubles
+    R = view[:9].copy().reshape(3, 3)
+    fx, skew, fy = view[VIEW.fx], view[VIEW.skew], view[VIEW.fy]
+    cx, cy, near = view[VIEW.cx], view[VIEW.cy], view[VIEW.near]
+    discs, by_center = view[VIEW.discs] > 0, view[VIEW.by_center] > 0
+    degree = round(math.sqrt(values.shape[1] / 3)) - 1
+    Q = np.empty((3, 3))
+    a = np.empty((3, 3))
+    S = np.empty((3, 3))
+    PC = np.empty(3)
+    Y = np.empty(16)
+    c = np.empty(3)
+    ga = np.empty((3, 3))
+    gQ = np.empty((3, 3))
+    gS = np.empty((3, 3))
+    gPC = np.empty(3)
+    gc = np.empty(3)
+    gY = np.empty(16)
+    s = np.empty(3)
+    g_s = np.empty(3)
+    at = np.empty(3)
+    h = np.empty(3)
+    gh = np.empty(3)
+    gR = np.zeros((3, 3))
+    gt = np.zeros(3)
+    kx, ky, kxy = 1 / fx, 1 / fy, -skew / (fx * fy)
+    for place in range(first, last):
+        later = order[min(place + 12, last - 1)]
+        prefetch(m, later * 3)
+        prefetch(q, later * 4)
+        prefetch(sizes, later * sizes.shape[1])
+        prefetch(values, later * values.shape[1])
+        i = order[place]
+        g = total[place]
+        blamed = False
+        for k in range(g.shape[0]):
+            blamed |= g[k] != 0.0
+        if not blamed:
+            # Never seen, or not even projected: its row of the table may hold anything.
+            continue
+        for k in range(sizes.shape[1]):
+            s[k] = sizes[i, k]
+            g_s[k] = 0.0
+        for r in range(3):
+            at[r] = m[i, r]
+        for r in range(3):
+            c[r] = R[r, 0] * at[0] + R[r, 1] * at[1] + R[r, 2] * at[2] + view[VIEW.translation + r]
+        size = _rotation(q, i, Q)
+        for r in range(3):
+            for k in range(3):
+                a[r, k] = R[r, 0] * Q[0, k] + R[r, 1] * Q[1, k] + R[r, 2] * Q[2, k]
+        ga[:] = 0.0
+        gQ[:] = 0.0
+        gc[:] = 0.0
+        g_length = 0.0
+        length = math.sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2])
+        ahead = c[2] > near
+        if ahead:
+            gc[0] += g[SPLAT.center_x] * fx / c[2]
+            gc[1] += (g[SPLAT.center_x] * skew + g[SPLAT.center_y] * fy) / c[2]
+            gc[2] -= (
+                g[SPLAT.center_x] * (table[place, SPLAT.center_x] - cx)
+                + g[SPLAT.center_y] * (table[place, SPLAT.center_y] - cy)
+            ) / c[2]
+        g_opacity = g[SPLAT.opacity]
+        if discs:
+            depth = c[2] if ahead else length
+            nc = a[0, 2] * c[0] + a[1, 2] * c[1] + a[2, 2] * c[2]
+            floor = EDGE_ON * length
+            tilted = abs(nc) < floor
+            sign = -1.0 if nc < 0 else 1.0
+            if tilted:
+                nc = sign * floor
+            g_depth, g_nc = g[SPLAT.depth], 0.0
+            for k in range(2):
+                tc = (a[0, k] * c[0] + a[1, k] * c[1] + a[2, k] * c[2]) / nc
+                scale = depth / s[k]
+                for r in range(3):
+                    h[r] = a[r, k] - tc * a[r, 2]
+                gh[0] = g[DISC.u_x + 3 * k] * kx + g[DISC.u_y + 3 * k] * kxy
+                gh[1] = g[DISC.u_y + 3 * k] * ky
+                gh[2] = 0.0 if ahead else g[DISC.u_0 + 3 * k]
+                g_scale = gh[0] * h[0] + gh[1] * h[1] + gh[2] * h[2]
+                g_tc = 0.0
+                for r in range(3):
+                    gh[r] *= scale
+                    g_tc -= gh[r] * a[r, 2]
+                for r in range(3):
+                    ga[r, k] += gh[r] + g_tc * c[r] / nc
+                    ga[r, 2] -= tc * gh[r]
+                    gc[r] += g_tc * a[r, k] / nc
+                g_nc -= g_tc * tc / nc
+                g_depth += g_scale / s[k]
+                g_s[k] -= g_scale * scale / s[k]
+            scale = depth / nc
+            gh[0] = g[DISC.w_x] * kx + g[DISC.w_y] * kxy
+            gh[1] = g[DISC.w_y] * ky
+            gh[2] = 0.0 if ahead else g[DISC.w_0]
+            g_scale = 0.0
+            for r in range(3):
+                g_scale += gh[r] * a[r, 2]
+                ga[r, 2] += scale * gh[r]
+            g_depth += g_scale / nc
+            g_nc -= g_scale * scale / nc
+            if tilted:
+                g_length += sign * EDGE_ON * g_nc
+            else:
+                for r in range(3):
+                    ga[r, 2] += g_nc * c[r]
+                    gc[r] += g_nc * a[r, 2]
+            if ahead:
+                gc[2] += g_depth
+            else:
+                g_length += g_depth
+        else:
+            gc[2] += g[SPLAT.depth]
+            limit = JACOBIAN_MARGIN * view[VIEW.width] / 2 / fx
+            low, high = -cx / fx - limit, (view[VIEW.width] - cx) / fx + limit
+            free_x = low <= c[0] / c[2] <= high
+            px = min(max(c[0] / c[2], low), high)
+            limit = JACOBIAN_MARGIN * view[VIEW.height] / 2 / fy
+            low, high = -cy / fy - limit, (view[VIEW.height] - cy) / fy + limit
+            free_y = low <= c[1] / c[2] <= high
+            py = min(max(c[1] / c[2], low), high)
+            sxx, sxy, syy = 0.0, 0.0, 0.0
+            for k in range(3):
+                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * s[k] / c[2]
+                gy = fy * (a[1, k] - py * a[2, k]) * s[k] / c[2]
+                sxx += gx * gx
+                sxy += gx * gy
+                syy += gy * gy
+            sharp = sxx * syy - sxy * sxy
+            bxx, byy = sxx + BLUR_3D, syy + BLUR_3D
+            det = bxx * byy - sxy * sxy
+            # d conic = -conic d Sigma conic
+            A, B, C = byy / det, -sxy / det, bxx / det
+            p11, p12 = (
+                A * g[ELLIPSOID.conic_xx] + B * g[ELLIPSOID.conic_xy] / 2,
+                A * g[ELLIPSOID.conic_xy] / 2 + B * g[ELLIPSOID.conic_yy],
+            )
+            p21, p22 = (
+                B * g[ELLIPSOID.conic_xx] + C * g[ELLIPSOID.conic_xy] / 2,
+                B * g[ELLIPSOID.conic_xy] / 2 + C * g[ELLIPSOID.conic_yy],
+            )
+            g_xx = -(p11 * A + p12 * B)
+            g_xy = -(p11 * B + p12 * C) - (p21 * A + p22 * B)
+            g_yy = -(p21 * B + p22 * C)
+            if view[VIEW.antialiased] > 0:
+                ratio = sharp / det
+                factor = math.sqrt(max(ratio, COMPENSATION_MIN))
+                if ratio >= COMPENSATION_MIN:
+                    g_ratio = g_opacity * o[i] / (2 * factor)
+                    g_sharp, g_det = g_ratio / det, -g_ratio * ratio / det
+                    g_xx += g_sharp * syy + g_det * byy
+                    g_yy += g_sharp * sxx + g_det * bxx
+                    g_xy -= 2 * sxy * (g_sharp + g_det)
+                g_opacity *= factor
+            g_px, g_py = 0.0, 0.0
+            for k in range(3):
+                f = s[k] / c[2]
+                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * f
+                gy = fy * (a[1, k] - py * a[2, k]) * f
+                ux = 2 * g_xx * gx + g_xy * gy
+                uy = 2 * g_yy * gy + g_xy * gx
+                ga[0, k] += ux * fx * f
+                ga[1, k] += (ux * skew + uy * fy) * f
+                ga[2, k] -= (ux * (fx * px + skew * py) + uy * fy * py) * f
+                g_px -= ux * fx * a[2, k] * f
+                g_py -= (ux * skew + uy * fy) * a[2, k] * f
+                g_s[k] += (ux * gx + uy * gy) / s[k]
+                gc[2] -= (ux * gx + uy * gy) / c[2]
+            if free_x:
+                gc[0] += g_px / c[2]
+                gc[2] -= g_px * c[0] / (c[2] * c[2])
+            if free_y:
+                gc[1] += g_py / c[2]
+                gc[2] -= g_py * c[1] / (c[2] * c[2])
+            if not by_center:
+                for r in range(3):
+                    for k in range(3):
+                        S[r, k] = 0.0
+                        for j in range(3):
+                            S[r, k] += a[r, j] * a[k, j] / (s[j] * s[j])
+                for r in range(3):
+                    PC[r] = S[r, 0] * c[0] + S[r, 1] * c[1] + S[r, 2] * c[2]
+                q0 = PC[0] * c[0] + PC[1] * c[1] + PC[2] * c[2]
+                lx, ly = c[2] * PC[0] / q0, c[2] * PC[1] / q0
+                g_lx = g[ELLIPSOID.peak_x] * kx + g[ELLIPSOID.peak_y] * kxy
+                g_ly = g[ELLIPSOID.peak_y] * ky
+                g_rxx = (
+                    g[ELLIPSOID.peak_xx] * kx * kx
+                    + g[ELLIPSOID.peak_xy] * kx * kxy
+                    + g[ELLIPSOID.peak_yy] * kxy * kxy
+                )
+                g_rxy = g[ELLIPSOID.peak_xy] * kx * ky + 2 * g[ELLIPSOID.peak_yy] * kxy * ky
+                g_ryy = g[ELLIPSOID.peak_yy] * ky * ky
+                square = c[2] * c[2] / q0
+                gS[:] = 0.0
+                gS[0, 0], gS[0, 1], gS[1, 1] = g_rxx * square, g_rxy * square, g_ryy * square
+                quadratic = g_rxx * S[0, 0] + g_rxy * S[0, 1] + g_ryy * S[1, 1]
+                g_q0 = -quadratic * square / q0
+                gc[2] += 2 * c[2] / q0 * quadratic
+                g_lx -= 2 * lx * g_rxx + ly * g_rxy
+                g_ly -= 2 * ly * g_ryy + lx * g_rxy
+                g_q0 -= (g_lx * lx + g_ly * ly) / q0
+                gc[2] += (g_lx * PC[0] + g_ly * PC[1]) / q0
+                gPC[0], gPC[1], gPC[2] = g_lx * c[2] / q0, g_ly * c[2] / q0, 0.0
+                for r in range(3):
+                    gPC[r] += g_q0 * c[r]
+                    gc[r] += g_q0 * PC[r]
+                for r in range(3):
+                    for k in range(3):
+                        gS[r, k] += gPC[r] * c[k]
+                        gc[r] += S[r, k] * gPC[k]
+                for k in range(3):
+                    inverse = 1 / (s[k] * s[k])
+                    along = 0.0
+                    for r in range(3):
+                        for j in range(3):
+                            ga[r, k] += (gS[r, j] + gS[j, r]) * a[j, k] * inverse
+                            along += a[r, k] * gS[r, j] * a[j, k]
+                    g_s[k] -= 2 * along * inverse / s[k]
+        spread = (s[0] * a[2, 0]) ** 2 + (s[1] * a[2, 1]) ** 2
+        if not discs:
+            spread += (s[2] * a[2, 2]) ** 2
+        spread = math.sqrt(spread)
+        if by_center:
+            if c[2] > near:
+                gc[2] += g[SPLAT.depth_low] + g[SPLAT.depth_high]
+        else:
+            g_spread = 0.0
+            if c[2] - EXTENT_SIGMAS * spread > near:
+                gc[2] += g[SPLAT.depth_low]
+                g_spread -= EXTENT_SIGMAS * g[SPLAT.depth_low]
+            if c[2] + EXTENT_SIGMAS * spread > near:
+                gc[2] += g[SPLAT.depth_high]
+                g_spread += EXTENT_SIGMAS * g[SPLAT.depth_high]
+            if spread > 0:
+                for k in range(sizes.shape[1]):
+                    g_s[k] += g_spread * s[k] * a[2, k] ** 2 / spread
+                    ga[2, k] += g_spread * s[k] ** 2 * a[2, k] / spread
+        d_opacities[i] = g_opacity
+        axis = 2
+        if not discs:
+            axis = 0
+            if s[1] < s[axis]:
+                axis = 1
+            if s[2] < s[axis]:
+                axis = 2
+        facing = a[0, axis] * c[0] + a[1, axis] * c[1] + a[2, axis] * c[2]
+        flip = -1.0 if facing > 0 else 1.0
+        for k in range(3):
+            gQ[k, axis] += flip * g[GRADIENTS + k]
+        if view[VIEW.harmonic] > 0:
+            x = (R[0, 0] * c[0] + R[1, 0] * c[1] + R[2, 0] * c[2]) / length
+            y = (R[0, 1] * c[0] + R[1, 1] * c[1] + R[2, 1] * c[2]) / length
+            z = (R[0, 2] * c[0] + R[1, 2] * c[1] + R[2, 2] * c[2]) / length
+            harmonics(degree, x, y, z, Y)
+            bases = (degree + 1) ** 2
+            for j in range(bases):
+                gY[j] = 0.0
+            for k in range(3):
+                shade = 0.5
+                for j in range(bases):
+                    shade += Y[j] * values[i, 3 * j + k]
+                if shade >= 0:
+                    for j in range(bases):
+                        d_values[i, 3 * j + k] = g[GRADIENTS + 3 + k] * Y[j]
+                        gY[j] += g[GRADIENTS + 3 + k] * values[i, 3 * j + k]
+            dx, dy, dz = 0.0, 0.0, 0.0
+            if degree > 0:
+                dx -= C1 * gY[3]
+                dy -= C1 * gY[1]
+                dz += C1 * gY[2]
+            if degree > 1:
+                dx += (
+                    C2[0] * y * gY[4]
+                    - 2 * C2[2] * x * gY[6]
+                    + C2[3] * z * gY[7]
+                    + 2 * C2[4] * x * gY[8]
+                )
+                dy += (
+                    C2[0] * x * gY[4]
+                    + C2[1] * z * gY[5]
+                    - 2 * C2[2] * y * gY[6]
+                    - 2 * C2[4] * y * gY[8]
+                )
+                dz += C2[1] * y * gY[5] + 4 * C2[2] * z * gY[6] + C2[3] * x * gY[7]
+            if degree > 2:
+                dx += (
+                    C3[0] * 6 * x * y * gY[9] + C3[1] * y * z * gY[10] - C3[2] * 2 * x * y * gY[11]
+                )
+                dx += -C3[3] * 6 * x * z * gY[12] + C3[4] * (4 * z * z - 3 * x * x - y * y) * gY[13]
+                dx += C3[5] * 2 * x * z * gY[14] + C3[6] * 3 * (x * x - y * y) * gY[15]
+                dy += C3[0] * 3 * (x * x - y * y) * gY[9] + C3[1] * x * z * gY[10]
+                dy += C3[2] * (4 * z * z - x * x - 3 * y * y) * gY[11] - C3[3] * 6 * y * z * gY[12]
+                dy += (
+                    -C3[4] * 2 * x * y * gY[13]
+                    - C3[5] * 2 * y * z * gY[14]
+                    - C3[6] * 6 * x * y * gY[15]
+                )
+                dz += C3[1] * x * y * gY[10] + C3[2] * 8 * y * z * gY[11]
+                dz += C3[3] * 3 * (2 * z * z - x * x - y * y) * gY[12] + C3[4] * 8 * x * z * gY[13]
+                dz += C3[5] * (x * x - y * y) * gY[14]
+            along = x * dx + y * dy + z * dz
+            h[0], h[1], h[2] = (
+                (dx - x * along) / length,
+                (dy - y * along) / length,
+                (dz - z * along) / length,
+            )
+            for r in range(3):
+                for k in range(3):
+                    gc[r] += R[r, k] * h[k]
+                    gR[r, k] += c[r] * h[k]
+        else:
+            for k in range(channels):
+                d_values[i, k] = g[GRADIENTS + 3 + k]
+        for r in range(3):
+            gc[r] += g_length * c[r] / length
+        for r in range(3):
+            for k in range(3):
+                for j in range(3):
+                    gQ[j, k] += R[r, j] * ga[r, k]
+                    gR[r, j] += ga[r, k] * Q[j, k]
+        for k in range(3):
+            d_means[i, k] = R[0, k] * gc[0] + R[1, k] * gc[1] + R[2, k] * gc[2]
+        for k in range(sizes.shape[1]):
+            d_scales[i, k] = g_s[k]
+        for r in range(3):
+            gt[r] += gc[r]
+            for k in range(3):
+                gR[r, k] += gc[r] * at[k]
+        w, x, y, z = (
+            f64(q[i, 0]) / size,
+            f64(q[i, 1]) / size,
+            f64(q[i, 2]) / size,
+            f64(q[i, 3]) / size,
+        )
+        gw = 2 * (x * (gQ[2, 1] - gQ[1, 2]) + y * (gQ[0, 2] - gQ[2, 0]) + z * (gQ[1, 0] - gQ[0, 1]))
+        yx, zx, zy = gQ[0, 1] + gQ[1, 0], gQ[0, 2] + gQ[2, 0], gQ[1, 2] + gQ[2, 1]
+        gx = 2 * (-2 * x * (gQ[1, 1] + gQ[2, 2]) + y * yx + z * zx + w * (gQ[2, 1] - gQ[1, 2]))
+        gy = 2 * (x * yx - 2 * y * (gQ[0, 0] + gQ[2, 2]) + z * zy + w * (gQ[0, 2] - gQ[2, 0]))
+        gz = 2 * (x * zx + y * zy - 2 * z * (gQ[0, 0] + gQ[1, 1]) + w * (gQ[1, 0] - gQ[0, 1]))
+        along = w * gw + x * gx + y * gy + z * gz
+        d_quats[i, 0], d_quats[i, 1] = (gw - w * along) / size, (gx - x * along) / size
+        d_quats[i, 2], d_quats[i, 3] = (gy - y * along) / size, (gz - z * along) / size
+    for r in range(3):
+        g_view[9 + r] = gt[r]
+        for k in range(3):
+            g_view[3 * r + k] = gR[r, k]
