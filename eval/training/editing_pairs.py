@@ -228,7 +228,9 @@ def _one(choices: tuple[str, ...], rng: np.random.Generator) -> str:
     return choices[int(rng.integers(len(choices)))]
 
 
-def instruction(kind: str, thing: int, look: npt.NDArray[np.int64], rng: np.random.Generator) -> str:
+def instruction(
+    kind: str, thing: int, look: npt.NDArray[np.int64], rng: np.random.Generator
+) -> str:
     """A sentence that asks for a look.
 
     Args:
@@ -276,7 +278,9 @@ def _draw_instruction(
             return _one(tuple(choices), rng)
         case "ground":
             place = _one(PLACES[GROUNDS[ground]], rng)
-            name = {"boards": "wooden boards", "earth": "bare earth"}.get(GROUNDS[ground], GROUNDS[ground])
+            name = {"boards": "wooden boards", "earth": "bare earth"}.get(
+                GROUNDS[ground], GROUNDS[ground]
+            )
             return _one(
                 (
                     f"put {it} {place}", f"move {it} {place}", f"place {it} {place}", f"show {it} {place}",
@@ -286,7 +290,14 @@ def _draw_instruction(
     hour = _one(HOURS[TIMES[time]], rng)
     name = {"cloudy": "cloudy", "day": "a sunny day"}.get(TIMES[time], TIMES[time])
     return _one(
-        (f"show {it} {hour}", f"make it look as {hour}", f"make it {name}", f"let it be {name}", f"{it} {hour}"), rng
+        (
+            f"show {it} {hour}",
+            f"make it look as {hour}",
+            f"make it {name}",
+            f"let it be {name}",
+            f"{it} {hour}",
+        ),
+        rng,
     )
 
 

@@ -16,7 +16,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from tokenizers import Tokenizer, decoders, models, normalizers, pre_tokenizers, processors, trainers
+from tokenizers import (
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
 
 from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
 from attnwarp.editing.small_unet import EditUNet
@@ -173,7 +181,9 @@ def make_tokenizer(count: int = 20_000, worlds: int = 200) -> Tokenizer:
         show_progress=False,
     )  # fmt: skip
     tokenizer.train_from_iterator(corpus, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(single="$A <end>", special_tokens=[("<end>", 1)])
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single="$A <end>", special_tokens=[("<end>", 1)]
+    )
     tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=TOKENS)
     tokenizer.enable_truncation(TOKENS)
     return tokenizer
@@ -181,7 +191,9 @@ def make_tokenizer(count: int = 20_000, worlds: int = 200) -> Tokenizer:
 
 def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
     """(N, 24) int64, padded with 0."""
-    return torch.tensor([code.ids for code in tokenizer.encode_batch(list(texts))], dtype=torch.int64)
+    return torch.tensor(
+        [code.ids for code in tokenizer.encode_batch(list(texts))], dtype=torch.int64
+    )
 
 
 def codes() -> Tensor:
@@ -262,7 +274,10 @@ class Pairs:
             return 0, 0, step
         seen = np.argwhere(self.worlds.ids[world, view] == THING)
         y, x = seen[int(rng.integers(len(seen)))] if len(seen) else (SIZE // 2, SIZE // 2)
-        low = [int(np.clip(v - rng.uniform(0.25, 0.75) * self.size, 0, SIZE - self.size)) for v in (y, x)]
+        low = [
+            int(np.clip(v - rng.uniform(0.25, 0.75) * self.size, 0, SIZE - self.size))
+            for v in (y, x)
+        ]
         return low[0], low[1], 1
 
     def cut(self, full: npt.NDArray[Any], row: Row) -> npt.NDArray[np.float32]:
@@ -285,21 +300,39 @@ class Pairs:
         x = torch.from_numpy(np.ascontiguousarray(np.stack(pictures))).permute(0, 3, 1, 2)
         return self.coder.encode(x, return_dict=False)[0]
 
-    def row(self, rng: np.random.Generator, noise: Tensor, kinds: dict[str, float], unclear: float) -> Row:
+    def row(
+        self, rng: np.random.Generator, noise: Tensor, kinds: dict[str, float], unclear: float
+    ) -> Row:
         """Draw a pair; where the instruction is unclear, the noise picks the target."""
         worlds = self.worlds
         while True:
             world, view = int(rng.integers(len(worlds))), int(rng.integers(VIEWS))
-            kind = str(rng.choice(list(kinds), p=np.array(list(kinds.values())) / sum(kinds.values())))
+            kind = str(
+                rng.choice(list(kinds), p=np.array(list(kinds.values())) / sum(kinds.values()))
+            )
             valid = worlds.valid[world]
             targets = [k for k in GROUPS[kind] if valid[k]]
             open_ended = kind in AMBIGUOUS and rng.uniform() < unclear
             source = int(rng.choice(sources(kind, valid)))
-            targets = [k for k in targets if k != source and not np.array_equal(worlds.looks[world, k], worlds.looks[world, source])]
+            targets = [
+                k
+                for k in targets
+                if k != source
+                and not np.array_equal(worlds.looks[world, k], worlds.looks[world, source])
+            ]
             if targets:
                 break
         target = picked(noise, targets) if open_ended else int(rng.choice(targets))
-        return Row(world, view, source, target, kind, open_ended, self.corner(world, view, rng), bool(rng.uniform() < 0.5))
+        return Row(
+            world,
+            view,
+            source,
+            target,
+            kind,
+            open_ended,
+            self.corner(world, view, rng),
+            bool(rng.uniform() < 0.5),
+        )
 
     def text(self, row: Row, rng: np.random.Generator) -> str:
         """The instruction of a row."""
@@ -403,7 +436,9 @@ def train_stage(
     net = EditorNet(tokenizer.get_vocab_size(), stage.size)
     if stage.start is not None:
         stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
-        net.load_state_dict({k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"})
+        net.load_state_dict(
+            {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
+        )
     average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
     optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
     alphas = scheduler().alphas_cumprod
@@ -439,7 +474,9 @@ def _step(
 ) -> Callable[[np.random.Generator, torch.Generator], tuple[Tensor, dict[str, float]]]:
     """One step's loss, and what to print of it."""
 
-    def plain(rng: np.random.Generator, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    def plain(
+        rng: np.random.Generator, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
         batch = pairs.batch(stage.batch, rng, generator)
         before, tokens = dropped(batch, empty, rng)
         a = alphas[batch.t]
