@@ -1,0 +1,108 @@
+"""Oracles: diffusers' inverse scheduler and its LEDITS++ pipeline, and the pictures that were inverted."""
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DDIMInverseScheduler, DDIMScheduler, LEditsPPPipelineStableDiffusion
+from PIL import Image
+from tiny_editors import parts, unet
+
+from attnwarp.editing.inversion import ddim_invert, edit_friendly_invert, replay
+from attnwarp.editing.schedule import Schedule, following
+
+
+def network(net, seed=2, *, strength=1.0):
+    text = torch.randn((1, 5, 32), generator=torch.Generator().manual_seed(seed))
+
+    def predict(x, timestep):
+        with torch.no_grad():
+            return strength * net(x, torch.tensor(timestep), text.expand(len(x), -1, -1)).sample
+
+    return predict
+
+
+def latents(seed=3):
+    return torch.randn((1, 4, 8, 12), generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
+def test_ddim_inversion_is_diffusers_inverse_scheduler(prediction):
+    scheduler = DDIMScheduler.from_config(parts()["scheduler"].config, prediction_type=prediction)
+    inverse = DDIMInverseScheduler.from_config(scheduler.config)
+    predict = network(unet())
+    scheduler.set_timesteps(10)
+    inverse.set_timesteps(10)
+    x = latents()
+    for timestep in inverse.timesteps:
+        x = inverse.step(predict(x, int(timestep)), int(timestep), x).prev_sample
+    ours = ddim_invert(Schedule.of(scheduler), predict, latents(), scheduler.timesteps.tolist())
+    assert torch.allclose(ours, x, rtol=0, atol=1e-5)
+
+
+def test_ddim_inversion_leads_back_to_the_picture():
+    scheduler = parts()["scheduler"]
+    scheduler.set_timesteps(50)
+    schedule, timesteps = Schedule.of(scheduler), scheduler.timesteps.tolist()
+    predict = network(unet())
+    x = ddim_invert(schedule, predict, latents(), timesteps)
+    assert float((x - latents()).abs().mean()) > 0.1
+    for now, then in following(timesteps):
+        x = schedule.step(predict(x, now), x, now, then)
+    span = float(latents().max() - latents().min())
+    error = float((x - latents()).square().mean())
+    assert 10 * np.log10(span**2 / error) > 30
+
+
+def test_ddim_inversion_needs_a_network_that_predicts_noise():
+    schedule = Schedule(parts()["scheduler"].alphas_cumprod, "sample", 1.0)
+    with pytest.raises(ValueError, match="DDIM inversion needs its noise"):
+        ddim_invert(schedule, network(unet()), latents(), [500, 0])
+
+
+@pytest.mark.parametrize("skip", [0.0, 0.25])
+def test_edit_friendly_inversion_is_that_of_diffusers(skip):
+    made = parts()
+    pipe = LEditsPPPipelineStableDiffusion(unet=unet(), **made, safety_checker=None, feature_extractor=None, requires_safety_checker=False)
+    pipe.set_progress_bar_config(disable=True)
+    pixels = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
+    pipe.invert(
+        Image.fromarray(pixels), source_prompt="", num_inversion_steps=8, skip=skip,
+        generator=torch.Generator().manual_seed(6),
+    )  # fmt: skip
+    x0, _ = pipe.encode_image(Image.fromarray(pixels), dtype=torch.float32)
+    timesteps = [int(t) for t in pipe.inversion_steps]
+    generator = torch.Generator().manual_seed(6)
+    # They draw from the last step to the first.
+    noises = torch.stack([torch.randn(x0.shape, generator=generator) for _ in timesteps]).flip(0)
+    words = pipe.tokenizer("", padding="max_length", max_length=24, return_tensors="pt").input_ids
+    with torch.no_grad():
+        text = made["text_encoder"](words)[0]
+
+        def predict(x, timestep):
+            return pipe.unet(x, torch.tensor(timestep), text).sample
+
+        ours = edit_friendly_invert(Schedule.of(pipe.scheduler), predict, x0, timesteps, noises=noises)
+    assert torch.allclose(ours.start, pipe.init_latents, rtol=0, atol=1e-5)
+    # A map is a difference over sigma, which is as small as 0.04 at the last steps.
+    assert torch.allclose(ours.maps, pipe.zs, rtol=0, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"set_alpha_to_one": True},
+        {"prediction_type": "sample", "rescale_betas_zero_snr": True, "timestep_spacing": "trailing", "set_alpha_to_one": True},
+    ],
+    ids=["epsilon", "a last step without noise", "zero SNR, predicts the picture"],
+)  # fmt: skip
+def test_replaying_the_maps_gives_the_picture_back_to_float_error(changes):
+    scheduler = DDIMScheduler.from_config(parts()["scheduler"].config, **changes)
+    scheduler.set_timesteps(20)
+    schedule, predict = Schedule.of(scheduler), network(unet())
+    noise = edit_friendly_invert(schedule, predict, latents(), scheduler.timesteps.tolist(), seed=1)
+    assert torch.allclose(replay(schedule, predict, noise), latents(), rtol=0, atol=1e-5)
+    other = replay(schedule, network(unet(), seed=9), noise)
+    assert float((other - latents()).abs().max()) > 1e-3  # another prompt makes another picture
+    again = edit_friendly_invert(schedule, predict, latents(), scheduler.timesteps.tolist(), seed=1)
+    assert torch.equal(again.maps, noise.maps)
