@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
+from attnwarp.editing.cli import edit_image
+
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
     from attnwarp.io import Dataset
@@ -411,6 +413,9 @@ def _write_image(path: Path, rgb: Any) -> None:
     pixels = np.round(255 * np.clip(rgb[..., ::-1], 0, 1)).astype(np.uint8)
     _, data = cv2.imencode(".png", pixels)
     write_atomically(path, lambda stream: stream.write(data.tobytes()))
+
+
+app.command("edit-image")(clear_errors()(edit_image))
 
 
 def main() -> None:

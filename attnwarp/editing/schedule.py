@@ -83,7 +83,7 @@ def steps_from(start: int, steps: int) -> list[int]:
         >>> steps_from(999, 4)
         [999, 749, 499, 249]
         >>> steps_from(700, 4)
-        [700, 525, 350, 174]
+        [700, 525, 349, 174]
     """
     if steps < 1 or start < steps - 1:
         raise ValueError(
