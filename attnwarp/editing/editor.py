@@ -107,8 +107,8 @@ def edit(
         prompt: instruction or description.
         steps: of DDIM.
         seed: of the noise, which the views share.
-        start: timestep T to start from: the views' own latents are noised to T, then ``steps`` steps
-            follow. Left out, the edit starts from pure noise.
+        start: timestep T to start from: the views' own latents are noised to T, then ``steps``
+            steps follow. Left out, the edit starts from pure noise.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion.

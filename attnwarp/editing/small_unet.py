@@ -8,6 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from diffusers import UNet2DConditionModel
+
+# diffusers' pipelines know a component's kind by the base class of that name in its module.
+from diffusers.models.modeling_utils import ModelMixin  # noqa: F401
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor
 

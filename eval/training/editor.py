@@ -74,6 +74,9 @@ MOST_THING_WEIGHT = 8.0
 """Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
 be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
 
+INJECTED_SHARE = 0.6
+"""Of the steps of a stage with injection; the others are plain."""
+
 CONSTANTS = (
     "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_FROM", "NOISY_SHARE",
     "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS", "EMA", "WARM", "STEPS_AN_EPOCH", "THING_WEIGHT", "MOST_THING_WEIGHT",
@@ -260,10 +263,10 @@ class Pairs:
         worlds: at :data:`training.editing_pairs.SIZE`.
         size: of the pictures in px, 64 or 128. At 64, half of the pictures are a quarter of the full one about
             the thing, so that things come large and small.
-        tokenizer: of the instructions.
+        tokenizer: of the instructions; :meth:`batch` needs it.
     """
 
-    def __init__(self, worlds: Worlds, size: int, tokenizer: Tokenizer) -> None:
+    def __init__(self, worlds: Worlds, size: int, tokenizer: Tokenizer | None) -> None:
         self.worlds, self.size, self.tokenizer = worlds, size, tokenizer
         self.coder = HaarLatents()
 
@@ -356,6 +359,8 @@ class Pairs:
         kinds: dict[str, float] | None = None, unclear: float = UNCLEAR,
     ) -> Batch:  # fmt: skip
         """Draw ``count`` pairs."""
+        if self.tokenizer is None:
+            raise ValueError("tokenizer: got None, which a batch of instructions needs")
         cells = self.size // BLOCK
         noise = torch.randn((count, CHANNELS, cells, cells), generator=generator)
         rows = [self.row(rng, noise[k], kinds or KINDS, unclear) for k in range(count)]
@@ -407,6 +412,12 @@ def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
     constants = {key: globals()[key] for key in CONSTANTS}
+    if stage.inject != "none":
+        from training import editor_injection as injection
+
+        names = ("LEAST_WEIGHT", "MOST_ALPHA", "WAYS", "INJECTED_KINDS")
+        constants |= {key: getattr(injection, key) for key in names}
+        constants["INJECTED_SHARE"] = INJECTED_SHARE
     return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
 
 
@@ -486,4 +497,19 @@ def _step(
         nothing = loss_of(batch.before, batch.after, batch.weight, a)
         return loss, {"loss": float(loss.detach()), "unedited": float(nothing)}
 
-    return plain
+    if stage.inject == "none":
+        return plain
+
+    def injected(
+        rng: np.random.Generator, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
+        from training.editor_injection import injected_loss
+
+        # Some plain steps among them, so that clear instructions are not forgotten.
+        if rng.uniform() >= INJECTED_SHARE:
+            loss, parts = plain(rng, generator)
+            return loss, {f"plain {key}": value for key, value in parts.items()}
+        inject = stage.inject == "features"
+        return injected_loss(pairs, net, alphas, stage.batch // 2, rng, generator, inject=inject)
+
+    return injected

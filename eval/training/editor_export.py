@@ -47,8 +47,33 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
         "scheduler": ["diffusers", "DDIMScheduler"], "safety_checker": [None, None], "feature_extractor": [None, None],
         "image_encoder": [None, None],
     }  # fmt: skip
-    index = {"_class_name": "StableDiffusionInstructPix2PixPipeline", "requires_safety_checker": False, **parts}
+    index = {
+        "_class_name": "StableDiffusionInstructPix2PixPipeline",
+        "requires_safety_checker": False,
+        **parts,
+    }
     (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
     for path in folder.rglob("*"):  # safetensors makes files that only their owner can read
         path.chmod(0o755 if path.is_dir() else 0o644)
     return folder
+
+
+def facts_of(stage: str, out: Path) -> dict[str, object]:
+    """What an editor's card says about its training."""
+    _, _, steps, seconds = averaged(stage, out)
+    plan = STAGES[stage]
+    start = plan.start
+    while start is not None:
+        seconds += averaged(start, out)[3]
+        start = STAGES[start].start
+    done = steps >= plan.steps
+    return {
+        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds,
+        "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
+        "injection": {
+            "none": "none; what its attention features carry, it learned from editing alone.",
+            "features": "trained with injected features, so its features carry the answer by construction; no claim about"
+            " an editor's own working may rest on it alone.",
+            "control": "the same steps as the injection stage without the injection.",
+        }[plan.inject],
+    }  # fmt: skip

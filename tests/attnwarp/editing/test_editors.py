@@ -10,7 +10,14 @@ import torch
 from diffusers import DDIMScheduler
 from tiny_editors import controlnet, pix2pix
 
-from attnwarp.editing.attention import CONTROLNET_BRANCHES, RecordingPlan, choose_layers, constant, inject, record
+from attnwarp.editing.attention import (
+    CONTROLNET_BRANCHES,
+    RecordingPlan,
+    choose_layers,
+    constant,
+    inject,
+    record,
+)
 from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.folder import load_parts
@@ -60,7 +67,11 @@ def test_the_loop_gives_what_diffusers_instruct_pix2pix_gives(schedule, text, im
         latents=noise, output_type="np",
     ).images[0]  # fmt: skip
     ours = edit(
-        editor_of(pipe, text_guidance=text, image_guidance=image), [picture()], "a bear", steps=5, noise=noise
+        editor_of(pipe, text_guidance=text, image_guidance=image),
+        [picture()],
+        "a bear",
+        steps=5,
+        noise=noise,
     )
     assert np.abs(ours.images[0] - theirs).max() < 1e-5
     assert theirs.std() > 0.01
@@ -96,13 +107,21 @@ def test_a_start_at_t_begins_at_the_views_noised_latents():
     editor = editor_of(pix2pix())
     seen = []
     result = edit(
-        editor, [picture()], "a bear", steps=4, start=700, watch=lambda step, steps, x: seen.append((step, steps))
+        editor,
+        [picture()],
+        "a bear",
+        steps=4,
+        start=700,
+        watch=lambda step, steps, x: seen.append((step, steps)),
     )
     assert result.timesteps == [700, 525, 349, 174]
     assert seen == [(k, 4) for k in range(4)]
     # The first step by hand, in diffusers' own words.
     task = editor.task([picture()], "a bear")
-    x0 = editor.vae.encode(2 * tensor(picture()) - 1).latent_dist.mode() * editor.vae.config.scaling_factor
+    x0 = (
+        editor.vae.encode(2 * tensor(picture()) - 1).latent_dist.mode()
+        * editor.vae.config.scaling_factor
+    )
     noise = shared_noise(task.shape, 0)
     scheduler = editor.scheduler
     x = scheduler.add_noise(x0, noise, torch.tensor([700]))
@@ -125,7 +144,9 @@ def test_steps_from_the_last_are_diffusers_trailing_ones():
 
 @pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
 def test_a_step_is_diffusers_step(prediction):
-    scheduler = DDIMScheduler(prediction_type=prediction, clip_sample=False, timestep_spacing="trailing")
+    scheduler = DDIMScheduler(
+        prediction_type=prediction, clip_sample=False, timestep_spacing="trailing"
+    )
     scheduler.set_timesteps(10)
     schedule = Schedule.of(scheduler)
     generator = torch.Generator().manual_seed(0)
@@ -155,7 +176,10 @@ def test_a_recorded_edit_injected_into_itself_changes_no_bit_with_every_editor()
 
 def test_what_does_not_fit_is_refused_by_name():
     editor = editor_of(pix2pix())
-    with pytest.raises(ValueError, match="guides: got 23 x 16 px, expected sides that are multiples of 2; resize or crop to 22 x 16"):
+    with pytest.raises(
+        ValueError,
+        match="guides: got 23 x 16 px, expected sides that are multiples of 2; resize or crop to 22 x 16",
+    ):
         edit(editor, [picture()[:, :-1]], "a bear")
     with pytest.raises(ValueError, match="guides: got none"):
         edit(editor, [], "a bear")
@@ -163,7 +187,9 @@ def test_what_does_not_fit_is_refused_by_name():
         edit(editor, [255 * np.ones((H, W, 3), np.float32)], "a bear")
     with pytest.raises(ValueError, match="expected one size"):
         edit(editor, [picture(), picture()[:8]], "a bear")
-    with pytest.raises(ValueError, match=r"noise: got shape \(1, 4, 2, 2\), expected \(1, 4, 8, 12\)"):
+    with pytest.raises(
+        ValueError, match=r"noise: got shape \(1, 4, 2, 2\), expected \(1, 4, 8, 12\)"
+    ):
         edit(editor, [picture()], "a bear", noise=torch.zeros(1, 4, 2, 2))
     with pytest.raises(ValueError, match="has .* tokens, the text encoder takes 24; shorten it"):
         edit(editor, [picture()], "a bear " * 30)
@@ -182,13 +208,18 @@ def test_editors_are_read_from_folders_in_diffusers_format(tmp_path):
         folder = tmp_path / kind.__name__
         pipe.save_pretrained(folder)
         loaded = edit(kind.from_folder(folder), [guide], "a bear", steps=2)
-        assert np.array_equal(loaded.images[0], edit(editor_of(pipe), [guide], "a bear", steps=2).images[0])
+        assert np.array_equal(
+            loaded.images[0], edit(editor_of(pipe), [guide], "a bear", steps=2).images[0]
+        )
 
 
 @pytest.mark.parametrize(
     ("lost", "message"),
     [
-        ("unet/diffusion_pytorch_model.safetensors", "lacks unet/diffusion_pytorch_model.safetensors"),
+        (
+            "unet/diffusion_pytorch_model.safetensors",
+            "lacks unet/diffusion_pytorch_model.safetensors",
+        ),
         ("vae/config.json", "lacks vae/config.json"),
         ("text_encoder/model.safetensors", "lacks text_encoder/model.safetensors"),
         ("scheduler/scheduler_config.json", "lacks scheduler/scheduler_config.json"),
@@ -214,4 +245,7 @@ def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbe
         load_parts(tmp_path, dtype=torch.float32)
     with pytest.raises(InputError, match="nowhere: no such folder"):
         load_parts(tmp_path / "nowhere", dtype=torch.float32)
-    assert json.loads((Path(tmp_path) / "model_index.json").read_text())["unet"][1] == "UNet2DConditionModel"
+    assert (
+        json.loads((Path(tmp_path) / "model_index.json").read_text())["unet"][1]
+        == "UNet2DConditionModel"
+    )

@@ -82,7 +82,13 @@ class WholeSteps(DDIMScheduler):
 def test_edit_friendly_inversion_is_that_of_diffusers(skip):
     made = parts()
     made["scheduler"] = WholeSteps.from_config(made["scheduler"].config)
-    pipe = LEditsPPPipelineStableDiffusion(unet=unet(), **made, safety_checker=None, feature_extractor=None, requires_safety_checker=False)
+    pipe = LEditsPPPipelineStableDiffusion(
+        unet=unet(),
+        **made,
+        safety_checker=None,
+        feature_extractor=None,
+        requires_safety_checker=False,
+    )
     pipe.set_progress_bar_config(disable=True)
     pixels = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
     pipe.invert(
@@ -101,7 +107,9 @@ def test_edit_friendly_inversion_is_that_of_diffusers(skip):
         def predict(x, timestep):
             return pipe.unet(x, torch.tensor(timestep), text).sample
 
-        ours = edit_friendly_invert(Schedule.of(pipe.scheduler), predict, x0, timesteps, noises=noises)
+        ours = edit_friendly_invert(
+            Schedule.of(pipe.scheduler), predict, x0, timesteps, noises=noises
+        )
     assert torch.allclose(ours.start, pipe.init_latents, rtol=0, atol=1e-5)
     # A map is a difference over sigma, which is as small as 0.04 at the last steps.
     assert torch.allclose(ours.maps, pipe.zs, rtol=0, atol=2e-4)
