@@ -91,12 +91,15 @@ class Moves:
 def view_warp(pairs: Pairs, source: Row, target: Row) -> FeatureWarp:
     """The exact warp between two views of a world on the grid of the whole picture's latents."""
     worlds, cells = pairs.worlds, pairs.size // BLOCK
-    cameras, surfaces = [], []
-    for row in (source, target):
+
+    def camera(row: Row) -> Camera:
         K, pose = worlds.K[row.world, row.view], worlds.world_to_camera[row.world, row.view]
-        cameras.append(Camera(K, pose, SIZE, SIZE))
-        surfaces.append(Surface(worlds.depth[row.world, row.view].astype(np.float64)))
-    view = warp_surfaces(*cameras, surfaces[1], surfaces[0], EXACT)
+        return Camera(K, pose, SIZE, SIZE)
+
+    def surface(row: Row) -> Surface:
+        return Surface(worlds.depth[row.world, row.view].astype(np.float64))
+
+    view = warp_surfaces(camera(source), camera(target), surface(target), surface(source), EXACT)
     return view.at((cells, cells))
 
 

@@ -134,3 +134,38 @@ def test_replaying_the_maps_gives_the_picture_back_to_float_error(changes):
     assert float((other - latents()).abs().max()) > 1e-3  # another prompt makes another picture
     again = edit_friendly_invert(schedule, predict, latents(), scheduler.timesteps.tolist(), seed=1)
     assert torch.equal(again.maps, noise.maps)
+
+
+def test_a_picture_edited_by_hand_can_be_the_source():
+    """Its own noise is replayed while features are recorded; they then go into another view's edit."""
+    from tiny_editors import pix2pix
+
+    from attnwarp.editing.attention import (
+        PIX2PIX_BRANCHES,
+        RecordingPlan,
+        choose_layers,
+        constant,
+        inject,
+        record,
+    )
+    from attnwarp.editing.editor import edit
+    from attnwarp.editing.pix2pix import InstructPix2Pix
+
+    pipe = pix2pix()
+    editor = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
+    rng = np.random.default_rng(0)
+    before, by_hand, other = (rng.uniform(size=(16, 24, 3)).astype(np.float32) for _ in range(3))
+    task, timesteps = editor.task([before], "a bear"), editor.timesteps(4)
+    wanted = editor.encode([by_hand])
+    noise = edit_friendly_invert(editor.schedule, task.predict, wanted, timesteps)
+    plan = RecordingPlan(
+        choose_layers(editor.unet), (8, 12), PIX2PIX_BRANCHES, ("text", "image"), 4
+    )
+    with record(editor.unet, plan) as recording:
+        source = replay(editor.schedule, task.predict, noise)
+    assert torch.allclose(source, wanted, rtol=0, atol=1e-5)
+    alone = edit(editor, [other], "a bear", steps=4).latents
+    with inject(editor.unet, recording, branches=PIX2PIX_BRANCHES, weight=constant(0.9)):
+        assert not torch.allclose(
+            edit(editor, [other], "a bear", steps=4).latents, alone, atol=1e-3
+        )
