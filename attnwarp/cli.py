@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
+from attnwarp.editing.cli import edit_image
 from attnwarp.errors import InputWarning
 
 if TYPE_CHECKING:
@@ -651,6 +652,9 @@ def _write_image(path: Path, rgb: Any) -> None:
 
     data = encode_png(np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8))
     write_atomically(path, lambda stream: stream.write(data))
+
+
+app.command("edit-image")(clear_errors()(edit_image))
 
 
 def main() -> None:

@@ -1,0 +1,498 @@
+"""Record attention features of a diffusers UNet, warp them along a view's geometry, inject them.
+
+The feature map of a layer is the attention's output after its projection and before the residual,
+(B, H W, C), for self- and cross-attention alike. Forward hooks on the attention modules see exactly
+what their processors return, so every processor works, and none has to be replaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, get_args
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.warp import FeatureWarp, resize_mask
+
+Kind = Literal["self", "cross"]
+Block = Literal["down", "mid", "up"]
+Size = tuple[int, int]
+
+PIX2PIX_BRANCHES = ("text", "image", "uncond")
+"""Order of the guidance branches in the batch of diffusers' InstructPix2Pix pipeline."""
+
+CONTROLNET_BRANCHES = ("uncond", "text")
+"""The same of its ControlNet and plain pipelines."""
+
+
+class LayerWarp(Protocol):
+    """What leads from a source view to a target view, such as
+    :class:`attnwarp.warp.WarpedView`."""
+
+    def at(self, size: Size, *, source_size: Size | None = None) -> FeatureWarp:
+        """The warp of an (h, w) grid of the target from a grid of the source."""
+        ...
+
+
+@dataclass(frozen=True)
+class Layer:
+    """An attention layer of a UNet.
+
+    Attributes:
+        name: of the module, such as ``up_blocks.3.attentions.2.transformer_blocks.0.attn2``.
+        kind: "self" or "cross".
+        level: how often the latents are halved before it; its size is that fraction of theirs.
+        channels: of its output.
+    """
+
+    name: str
+    kind: Kind
+    level: int
+    channels: int
+
+    def size(self, latent_size: Size) -> Size:
+        """(h, w) of the layer. Each stride of 2 rounds an odd side up.
+
+        Example:
+            >>> Layer("up_blocks.0.attentions.0", "self", 2, 64).size((50, 64))
+            (13, 16)
+        """
+        h, w = latent_size
+        for _ in range(self.level):
+            h, w = (h + 1) // 2, (w + 1) // 2
+        return h, w
+
+
+def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
+    """Every attention layer of a diffusers UNet, in the order of its processors."""
+    levels = len(list(unet.get_submodule("up_blocks").children()))
+    layers = []
+    for processor in unet.attn_processors:  # type: ignore[union-attr]
+        name = processor.removesuffix(".processor")
+        place, _, rest = name.partition(".")
+        index = int(rest.partition(".")[0]) if place != "mid_block" else 0
+        level = {
+            "down_blocks": index,
+            "mid_block": levels - 1,
+            "up_blocks": levels - 1 - index,
+        }.get(place)
+        if level is None:
+            continue
+        module = unet.get_submodule(name)
+        kind: Kind = "cross" if name.endswith("attn2") else "self"
+        layers.append(Layer(name, kind, level, module.to_out[0].out_features))  # type: ignore
+    return tuple(layers)
+
+
+def choose_layers(
+    unet: torch.nn.Module,
+    *,
+    fractions: Sequence[float] = (1.0, 0.5),
+    kinds: Sequence[Kind] = ("self", "cross"),
+    blocks: Sequence[Block] = ("up",),
+) -> tuple[Layer, ...]:
+    """Layers by their size as a fraction of the latents'; by default those of the paper.
+
+    Args:
+        unet: a diffusers UNet.
+        fractions: of the latents' side: 1, 0.5, 0.25, ...
+        kinds: of attention.
+        blocks: "down", "mid" or "up".
+
+    Raises:
+        ValueError: an unknown kind or block, or a choice that no layer answers to.
+    """
+    for kind in kinds:
+        check.one_of(kind, get_args(Kind), "kinds")
+    for block in blocks:
+        check.one_of(block, get_args(Block), "blocks")
+    layers = all_layers(unet)
+    chosen = tuple(
+        layer
+        for layer in layers
+        if 2.0**-layer.level in tuple(fractions)
+        and layer.kind in kinds
+        and layer.name.partition("_")[0] in blocks
+    )
+    if not chosen:
+        there = sorted({(layer.name.partition("_")[0], 2.0**-layer.level) for layer in layers})
+        listed = ", ".join(f"{block} at {fraction:g}" for block, fraction in there) or "none"
+        raise ValueError(
+            f"fractions: no {' or '.join(kinds)} attention at {tuple(fractions)} in the"
+            f" {' or '.join(blocks)} blocks; this UNet has {listed}"
+        )
+    return chosen
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """What is recorded, and the memory it takes, before anything runs.
+
+    Args:
+        layers: to record, see :func:`choose_layers`.
+        latent_size: (h, w) of the latents.
+        branches: the guidance branches in the order of the batch, such as
+            :data:`PIX2PIX_BRANCHES`; ("text",) without guidance.
+        keep: those of them to record.
+        steps: of denoising.
+        views: pictures in a batch.
+        dtype: of what is stored. Half precision halves the memory and rounds.
+        store: "device" leaves features where they are made, "cpu" moves them to main memory, a
+            folder writes them there.
+
+    Example:
+        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> plan.bytes == 20 * 32 * 32 * 64 * 4
+        True
+        >>> print(plan)
+        recording 1 layer, 1 branch (text), 20 steps in float32: 5.0 MiB on the device
+    """
+
+    layers: tuple[Layer, ...]
+    latent_size: Size
+    branches: tuple[str, ...]
+    keep: tuple[str, ...]
+    steps: int
+    views: int = 1
+    dtype: torch.dtype = torch.float32
+    store: Literal["device", "cpu"] | Path = "device"
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise ValueError("layers: got none, expected at least one")
+        for branch in self.keep:
+            check.one_of(branch, self.branches, "keep")
+        if not self.keep:
+            raise ValueError("keep: got no branch, expected at least one")
+        if min(self.steps, self.views, *self.latent_size) < 1:
+            raise ValueError(
+                f"steps, views, latent_size: got {self.steps}, {self.views}, {self.latent_size},"
+                " expected at least 1"
+            )
+
+    @property
+    def bytes(self) -> int:
+        """Of all features together."""
+        values = 0
+        for layer in self.layers:
+            h, w = layer.size(self.latent_size)
+            values += h * w * layer.channels
+        return values * len(self.keep) * self.views * self.steps * self.dtype.itemsize
+
+    def __str__(self) -> str:
+        def counted(number: int, word: str) -> str:
+            plural = "branches" if word == "branch" else f"{word}s"
+            return f"{number} {word if number == 1 else plural}"
+
+        amount = self.bytes / 2**20
+        size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
+        kind = str(self.dtype).removeprefix("torch.")
+        places = {"device": "on the device", "cpu": "in main memory"}
+        place = places.get(str(self.store), f"in {self.store}")
+        return (
+            f"recording {counted(len(self.layers), 'layer')},"
+            f" {counted(len(self.keep), 'branch')} ({', '.join(self.keep)}),"
+            f" {counted(self.steps, 'step')} in {kind}: {size} {place}"
+        )
+
+
+@dataclass(eq=False)
+class Recording:
+    """Features of one run, by step, layer and branch.
+
+    Attributes:
+        plan: what was recorded.
+        timesteps: of the steps recorded so far, in their order.
+    """
+
+    plan: RecordingPlan
+    timesteps: list[float] = field(default_factory=list)
+    _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict, repr=False)
+
+    @property
+    def bytes(self) -> int:
+        """Memory or disk that the features hold, whole storages counted."""
+        storages = {}
+        for value in self._features.values():
+            if isinstance(value, Tensor):
+                storages[value.untyped_storage().data_ptr()] = value.untyped_storage().nbytes()
+        files = [value for value in self._features.values() if isinstance(value, Path)]
+        return sum(storages.values()) + sum(path.stat().st_size for path in files)
+
+    def features(self, timestep: float, layer: Layer, branch: str) -> Tensor:
+        """(views, H W, C) features of a step, a layer and a branch.
+
+        Raises:
+            ValueError: not recorded; the message names what is.
+        """
+        self.step_of(timestep)
+        if layer not in self.plan.layers:
+            raise ValueError(f"layer: {layer.name} was not recorded")
+        check.one_of(branch, self.plan.keep, "branch")
+        value = self._features[(timestep, layer.name)]
+        if isinstance(value, Path):
+            from safetensors.torch import load_file
+
+            value = load_file(value)["features"]
+        views = len(value) // len(self.plan.keep)
+        row = self.plan.keep.index(branch) * views
+        return value[row : row + views]
+
+    def step_of(self, timestep: float) -> int:
+        """The number of a timestep among the recorded ones, from 0.
+
+        Raises:
+            ValueError: that timestep was not recorded.
+        """
+        if timestep not in self.timesteps:
+            listed = ", ".join(f"{t:g}" for t in self.timesteps) or "none"
+            raise ValueError(
+                f"timestep: got {timestep:g}, recorded are {listed}; run both with one scheduler"
+                " and the same steps"
+            )
+        return self.timesteps.index(timestep)
+
+    def put(self, timestep: float, layer: Layer, features: Tensor) -> None:
+        """Store (branches x views, H W, C) features of the kept branches."""
+        plan = self.plan
+        key = (timestep, layer.name)
+        if key in self._features:
+            raise ValueError(
+                f"timestep: {timestep:g} came twice at {layer.name}; a recording holds one run"
+            )
+        # A copy of its own: a slice would keep the whole batch's memory alive.
+        stored = torch.empty_like(features, dtype=plan.dtype, memory_format=torch.contiguous_format)
+        stored.copy_(features.detach())
+        if plan.store == "device":
+            self._features[key] = stored
+        elif plan.store == "cpu":
+            self._features[key] = stored.cpu()
+        else:
+            from safetensors.torch import save_file
+
+            folder = Path(plan.store)
+            folder.mkdir(parents=True, exist_ok=True)
+            path = folder / f"{timestep:g}-{layer.name}.safetensors"
+            save_file({"features": stored.cpu()}, path)
+            self._features[key] = path
+
+
+Hook = Callable[[Layer, Tensor, "Call"], Tensor | None]
+
+
+@dataclass(frozen=True)
+class Call:
+    """One pass of the UNet.
+
+    Attributes:
+        timestep: of the pass.
+        latent_size: (h, w).
+        batch: rows.
+    """
+
+    timestep: float
+    latent_size: Size
+    batch: int
+
+
+@contextmanager
+def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterator[None]:
+    """Call ``hook(layer, features, call)`` on every output of the layers.
+
+    What the hook returns takes the place of the features; None leaves them. The gradient is not
+    stopped.
+    """
+    now: list[Call] = []
+
+    def begin(_: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        sample = args[0] if args else kwargs["sample"]
+        timestep = args[1] if len(args) > 1 else kwargs["timestep"]
+        value = float(torch.as_tensor(timestep).reshape(-1)[0])
+        now[:] = [Call(value, (sample.shape[-2], sample.shape[-1]), sample.shape[0])]
+
+    def after(layer: Layer) -> Callable[..., Tensor | None]:
+        def call(_: Any, __: Any, output: Tensor) -> Tensor | None:
+            h, w = layer.size(now[0].latent_size)
+            check.shape(output, (now[0].batch, h * w, layer.channels), layer.name)
+            return hook(layer, output, now[0])
+
+        return call
+
+    with ExitStack() as stack:
+        stack.callback(unet.register_forward_pre_hook(begin, with_kwargs=True).remove)
+        for layer in layers:
+            module = unet.get_submodule(layer.name)
+            stack.callback(module.register_forward_hook(after(layer)).remove)
+        yield
+
+
+@contextmanager
+def record(
+    unet: torch.nn.Module, plan: RecordingPlan, *, announce: Callable[[str], None] | None = None
+) -> Iterator[Recording]:
+    """Record what the UNet's attention layers give while the block runs; no bit of it changes.
+
+    Args:
+        unet: a diffusers UNet; any pipeline or loop may call it.
+        plan: what to record.
+        announce: called with the plan in words, the memory included, before anything runs.
+
+    Raises:
+        ValueError: latents of another size, or a batch of another number of rows, than planned.
+    """
+    if announce is not None:
+        announce(str(plan))
+    recording = Recording(plan)
+    rows = len(plan.branches) * plan.views
+
+    def keep(layer: Layer, features: Tensor, call: Call) -> None:
+        _check_call(plan, call, rows)
+        if call.timestep not in recording.timesteps:
+            if len(recording.timesteps) == plan.steps:
+                raise ValueError(
+                    f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned"
+                )
+            recording.timesteps.append(call.timestep)
+        parts = features.chunk(len(plan.branches))
+        kept = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
+        recording.put(call.timestep, layer, kept)
+
+    with hooked(unet, plan.layers, keep):
+        yield recording
+
+
+def decay(a0: float = 0.9) -> Callable[[int, int], float]:
+    """The paper's weight, a_t = a0 (T - t) / T with the step's number t of T.
+
+    Example:
+        >>> [round(decay()(step, 4), 3) for step in range(4)]
+        [0.9, 0.675, 0.45, 0.225]
+    """
+    _check_share(a0, "a0")
+    return lambda step, steps: a0 * (steps - step) / steps
+
+
+def constant(a: float) -> Callable[[int, int], float]:
+    """The same weight at every step."""
+    _check_share(a, "a")
+    return lambda step, steps: a
+
+
+@contextmanager
+def inject(
+    unet: torch.nn.Module,
+    recording: Recording,
+    *,
+    branches: Sequence[str],
+    warps: Sequence[LayerWarp | None] = (None,),
+    weight: Callable[[int, int], float] | None = None,
+    mask: Tensor | None = None,
+    layers: Sequence[Layer] | None = None,
+) -> Iterator[None]:
+    """Blend recorded features into the UNet's attention while the block runs.
+
+    F = a (M warp(F_src) + (1 - M) F_new) + (1 - a) F_new, at each layer's own size.
+
+    Args:
+        unet: the UNet that the features came from, or one of its shape.
+        recording: features of the source view.
+        branches: the guidance branches in the order of the batch; those that were recorded get
+            features.
+        warps: of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None for
+            the identity.
+        weight: a by (step number, number of steps); :func:`decay` if left out.
+        mask: (H, W) bool of the target where features may be injected, at any size with the
+            target's proportions; everywhere if left out.
+        layers: to inject, all recorded ones if left out.
+
+    Raises:
+        ValueError: a timestep, layer, branch or size that does not match the recording; the message
+            names it.
+    """
+    weight = decay() if weight is None else weight
+    plan = recording.plan
+    chosen = plan.layers if layers is None else tuple(layers)
+    for layer in chosen:
+        if layer not in plan.layers:
+            raise ValueError(f"layers: {layer.name} was not recorded")
+    for branch in plan.keep:
+        if branch not in branches:
+            raise ValueError(
+                f"branches: {branch!r} was recorded, the batch has {', '.join(branches)}"
+            )
+    if mask is not None and (mask.ndim != 2 or mask.dtype != torch.bool):
+        raise ValueError(f"mask: got {mask.dtype} {tuple(mask.shape)}, expected bool (H, W)")
+    views = len(warps)
+    if plan.views not in (1, views):
+        raise ValueError(f"warps: got {views}, expected {plan.views}, one for each recorded view")
+
+    def blend(layer: Layer, features: Tensor, call: Call) -> Tensor:
+        rows = len(branches) * views
+        if call.batch != rows:
+            raise ValueError(
+                f"batch: got {call.batch} rows, expected {rows}: {views} views in"
+                f" {len(branches)} branches ({', '.join(branches)})"
+            )
+        alpha = weight(recording.step_of(call.timestep), plan.steps)
+        _check_share(alpha, "weight")
+        if alpha == 0:
+            return features
+        size, source_size = layer.size(call.latent_size), layer.size(plan.latent_size)
+        result = features.clone()
+        for branch in plan.keep:
+            source = recording.features(call.timestep, layer, branch).to(
+                features.device, features.dtype
+            )
+            for view, warp in enumerate(warps):
+                row = list(branches).index(branch) * views + view
+                own = source[view if plan.views > 1 else 0]
+                moved, allowed = _moved(warp, own, source_size, size)
+                if mask is not None:
+                    allowed = allowed & resize_mask(mask.cpu(), size).reshape(-1)
+                mixed = alpha * moved + (1 - alpha) * features[row]
+                keep = allowed.to(features.device)[:, None]
+                result[row] = torch.where(keep, mixed, features[row])
+        return result
+
+    with hooked(unet, chosen, blend):
+        yield
+
+
+def _moved(
+    warp: LayerWarp | None, tokens: Tensor, source_size: Size, size: Size
+) -> tuple[Tensor, Tensor]:
+    """(H W, C) tokens on the target's grid, and (H W,) where they count."""
+    if warp is None:
+        if source_size != size:
+            raise ValueError(
+                f"size: the recording has {source_size} features, the target {size}; give a warp"
+                " between views of different sizes"
+            )
+        return tokens, torch.ones(len(tokens), dtype=torch.bool)
+    step = warp.at(size, source_size=source_size)
+    grid = tokens.T.reshape(1, -1, *source_size)
+    warped = step.warp(grid)[0].reshape(tokens.shape[1], -1).T
+    return warped.to(tokens), step.mask.reshape(-1)
+
+
+def _check_call(plan: RecordingPlan, call: Call, rows: int) -> None:
+    if call.latent_size != plan.latent_size:
+        raise ValueError(
+            f"latent_size: got latents of {call.latent_size}, planned {plan.latent_size}"
+        )
+    if call.batch != rows:
+        raise ValueError(
+            f"batch: got {call.batch} rows, planned {rows}: {plan.views} views in"
+            f" {len(plan.branches)} branches ({', '.join(plan.branches)})"
+        )
+
+
+def _check_share(value: float, name: str) -> None:
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name}: got {value}, expected a number in [0, 1]")

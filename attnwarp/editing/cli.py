@@ -1,0 +1,125 @@
+"""The command attnwarp edit-image. Nothing heavy is imported until it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from attnwarp.editing.editor import Image
+
+TILE_COLUMNS = 5
+
+
+def edit_image(
+    picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
+    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    out: Annotated[Path, typer.Option(help="PNG file for the result.")],
+    editor: Annotated[
+        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
+    ] = "small-plain",
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
+    size: Annotated[
+        int | None,
+        typer.Option(min=16, help="Longest side to work at in px; the editor's own if left out."),
+    ] = None,
+    text_guidance: Annotated[
+        float | None, typer.Option(help="How much the words count; the editor's if left out.")
+    ] = None,
+    image_guidance: Annotated[
+        float | None, typer.Option(help="How much the picture counts; the editor's if left out.")
+    ] = None,
+    sheet: Annotated[
+        Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+) -> None:
+    """Edit a picture by an instruction."""
+    for path in (out, sheet):
+        if path is not None and path.suffix.lower() != ".png":
+            raise ValueError(f"{path}: expected a name that ends in .png")
+        if path is not None and path.is_dir():
+            raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
+    image = _read(picture)
+
+    from attnwarp.editing.editor import edit
+    from attnwarp.editing.small import load_editor
+
+    guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
+    given = {name: value for name, value in guidance.items() if value is not None}
+    model = load_editor(editor, device=device, **given)
+    image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)
+    h, w = image.shape[:2]
+    tiles: list[Image] = [image]
+    with typer.progressbar(length=steps, label=f"{w} x {h} px", file=_stderr()) as bar:
+
+        def watch(step: int, count: int, latents: Any) -> None:
+            bar.update(1)
+            if sheet is not None:
+                tiles.append(model.decode(latents)[0])
+
+        result = edit(model, [image], instruction, steps=steps, seed=seed, watch=watch)
+    _write(out, result.images[0])
+    if sheet is not None:
+        _write(sheet, _sheet(tiles))
+    typer.echo(out)
+
+
+def _stderr() -> Any:
+    import sys
+
+    return sys.stderr
+
+
+def _read(path: Path) -> Image:
+    """(H, W, 3) sRGB in [0, 1]."""
+    import cv2
+    import numpy as np
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; expected a PNG or JPEG picture")
+    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise ValueError(f"{path}: cannot be read as a picture; expected PNG or JPEG")
+    return pixels[..., ::-1].astype(np.float32) / np.float32(255)
+
+
+def _fit(image: Image, longest: int, multiple: int) -> Image:
+    """The picture with that longest side, its sides rounded to multiples."""
+    import cv2
+    import numpy as np
+
+    h, w = image.shape[:2]
+    scale = longest / max(h, w)
+    width, height = (max(multiple, round(n * scale / multiple) * multiple) for n in (w, h))
+    if (height, width) == (h, w):
+        return image
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.clip(cv2.resize(image, (width, height), interpolation=how), 0, 1)
+
+
+def _sheet(tiles: list[Image]) -> Image:
+    """Pictures side by side, white where a row has none left."""
+    import numpy as np
+
+    blank = np.ones_like(tiles[0])
+    rows = []
+    for start in range(0, len(tiles), TILE_COLUMNS):
+        row = tiles[start : start + TILE_COLUMNS]
+        rows.append(np.concatenate([*row, *[blank] * (TILE_COLUMNS - len(row))], axis=1))
+    return np.concatenate(rows)
+
+
+def _write(path: Path, image: Image) -> None:
+    import cv2
+    import numpy as np
+
+    from attnwarp.io.file import write_atomically
+
+    pixels = np.rint(255 * np.clip(image[..., ::-1], 0, 1)).astype(np.uint8)
+    _, data = cv2.imencode(".png", pixels)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda stream: stream.write(data.tobytes()))

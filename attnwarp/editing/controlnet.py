@@ -1,0 +1,153 @@
+"""Depth ControlNet (Zhang et al. 2023): a depth map and a prompt give a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.editing.attention import CONTROLNET_BRANCHES
+from attnwarp.editing.editor import Image, Latent, tensor_of
+
+
+def control_image(depth: npt.NDArray[Any]) -> Image:
+    """(H, W, 3) float32 control picture of a depth map: 1 / (d + 1e-5) over its maximum.
+
+    Args:
+        depth: (H, W) along the optical axis; where it is NaN the picture is 0, as of nothing near.
+
+    Example:
+        >>> control_image(np.array([[1.0, 2.0, np.nan]]))[0, :, 0].round(3).tolist()
+        [1.0, 0.5, 0.0]
+    """
+    check.shape(depth, ("H", "W"), "depth")
+    defined = np.isfinite(depth)
+    if not defined.any():
+        raise ValueError("depth: no pixel is defined")
+    if depth[defined].min() <= 0:
+        raise ValueError(f"depth: got {depth[defined].min():g}, expected positive numbers")
+    near = np.where(defined, 1 / (np.where(defined, depth, 1) + 1e-5), 0)
+    return np.repeat((near / near.max())[..., None], 3, axis=2).astype(np.float32)
+
+
+class DepthControlNet(Latent):
+    """An :class:`~attnwarp.editing.editor.Editor` over diffusers' own models.
+
+    Args:
+        unet, vae, text_encoder, tokenizer: of diffusers and transformers.
+        scheduler: a DDIMScheduler.
+        controlnet: of diffusers, for depth.
+        guidance: s of e = e_un + s (e_txt - e_un); 1 turns it off, and the batch is a half.
+        control_scale: what the ControlNet's residuals are multiplied by.
+        negative_prompt: of the unconditional branch.
+    """
+
+    def __init__(
+        self,
+        unet: Any,
+        vae: Any,
+        text_encoder: Any,
+        tokenizer: Any,
+        scheduler: Any,
+        controlnet: Any,
+        *,
+        guidance: float = 5.0,
+        control_scale: float = 1.0,
+        negative_prompt: str = "",
+    ) -> None:
+        super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        self.controlnet = controlnet.eval().requires_grad_(False)
+        self.guidance, self.control_scale = guidance, control_scale
+        self.negative_prompt = negative_prompt
+
+    @classmethod
+    def from_folder(
+        cls, folder: Path, controlnet: Path | None = None, **settings: Any
+    ) -> DepthControlNet:
+        """An editor from local folders in diffusers' format; nothing is downloaded.
+
+        Args:
+            folder: with unet, vae, text_encoder, tokenizer and scheduler.
+            controlnet: folder of the ControlNet, ``folder``/controlnet if left out.
+            settings: ``device``, ``dtype`` and the settings of this class.
+
+        Raises:
+            InputError: files that are missing or of another kind, by name.
+        """
+        from attnwarp.editing.folder import load_controlnet, load_parts
+
+        device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
+        parts = load_parts(folder, device=device, dtype=dtype)
+        place = folder / "controlnet" if controlnet is None else controlnet
+        return cls(
+            **parts, controlnet=load_controlnet(place, device=device, dtype=dtype), **settings
+        )
+
+    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> ControlTask:
+        """A picture for each (H, W) depth map, by one prompt."""
+        control = tensor_of([control_image(depth) for depth in guides], "guides", self.factor)
+        control = control.to(self.unet.device, self.controlnet.dtype)
+        views, guided = len(control), self.guidance != 1
+        texts = self.embed([self.negative_prompt, prompt] if guided else [prompt])
+        size = (control.shape[2] // self.factor, control.shape[3] // self.factor)
+        return ControlTask(
+            self,
+            texts.repeat_interleave(views, dim=0),
+            torch.cat([control] * len(texts)),
+            (views, self.unet.config.in_channels, *size),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ControlTask:
+    """Embedded prompt and control pictures of some views.
+
+    Attributes:
+        editor: whose networks run.
+        text: (branches x B, L, D).
+        control: (branches x B, 3, H, W).
+        shape: (B, C, h, w) of the latents.
+    """
+
+    editor: DepthControlNet
+    text: Tensor
+    control: Tensor
+    shape: tuple[int, int, int, int]
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """The guidance branches in the order of the UNet's batch."""
+        return CONTROLNET_BRANCHES if len(self.text) > self.shape[0] else ("text",)
+
+    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+        """The guided output for (B, C, h, w) latents at a step."""
+        editor = self.editor
+        noisy = torch.cat([latents] * len(self.branches))
+        step = torch.tensor(timestep, device=latents.device)
+        down, middle = editor.controlnet(
+            noisy,
+            step,
+            encoder_hidden_states=self.text,
+            controlnet_cond=self.control,
+            conditioning_scale=editor.control_scale,
+            return_dict=False,
+        )
+        output = editor.unet(
+            noisy,
+            step,
+            encoder_hidden_states=self.text,
+            down_block_additional_residuals=down,
+            mid_block_additional_residual=middle,
+            return_dict=False,
+        )[0]
+        if len(self.branches) == 1:
+            return output
+        uncond, text = output.chunk(2)
+        return uncond + editor.guidance * (text - uncond)

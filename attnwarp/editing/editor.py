@@ -1,0 +1,230 @@
+"""Editors: what all of them have, and the loop that denoises several views together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.editing.schedule import Schedule, following, steps_from
+
+Image = npt.NDArray[np.float32]
+
+STEPS = 20
+
+
+class Task(Protocol):
+    """An edit of some views, ready to be denoised."""
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """The guidance branches in the order of the UNet's batch."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """(B, C, h, w) of the latents of the views."""
+        ...
+
+    def predict(self, latents: Tensor, timestep: int) -> Tensor:
+        """The network's guided output for (B, C, h, w) latents at a step."""
+        ...
+
+
+class Editor(Protocol):
+    """A diffusion model that edits views: :class:`~attnwarp.editing.pix2pix.InstructPix2Pix`,
+    :class:`~attnwarp.editing.controlnet.DepthControlNet`."""
+
+    unet: Any
+    schedule: Schedule
+
+    def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Task:
+        """An edit of views. What a guide is, the editor says: a picture or a depth map."""
+        ...
+
+    def encode(self, pictures: Sequence[Image]) -> Tensor:
+        """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
+        ...
+
+    def decode(self, latents: Tensor) -> list[Image]:
+        """Pictures of scaled latents."""
+        ...
+
+    def timesteps(self, steps: int) -> list[int]:
+        """Steps from pure noise, as the model's own scheduler spaces them."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """The result of an edit.
+
+    Attributes:
+        images: (H, W, 3) float32 sRGB in [0, 1], one a view.
+        latents: (B, C, h, w) scaled latents.
+        timesteps: that were run.
+    """
+
+    images: list[Image]
+    latents: Tensor
+    timesteps: list[int]
+
+
+def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
+    """(B, C, h, w) white noise, the same for all views.
+
+    It is drawn on the CPU, so that every device starts from the same bits.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn((1, *shape[1:]), generator=generator).expand(shape).clone()
+
+
+def edit(
+    editor: Editor,
+    guides: Sequence[npt.NDArray[Any]],
+    prompt: str,
+    *,
+    steps: int = STEPS,
+    seed: int = 0,
+    start: int | None = None,
+    pictures: Sequence[Image] | None = None,
+    noise: Tensor | None = None,
+    latents: Tensor | None = None,
+    watch: Callable[[int, int, Tensor], None] | None = None,
+) -> Edit:
+    """Edit views together. Record or inject attention by running this inside
+    :func:`attnwarp.editing.attention.record` or :func:`~attnwarp.editing.attention.inject`.
+
+    Args:
+        editor: the model.
+        guides: of the views, all of one size: what ``editor.task`` takes.
+        prompt: instruction or description.
+        steps: of DDIM.
+        seed: of the noise, which the views share.
+        start: timestep T to start from: the views' own latents are noised to T, then ``steps``
+            steps follow. Left out, the edit starts from pure noise.
+        pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
+        noise: (B, C, h, w) in place of the seed's.
+        latents: (B, C, h, w) to begin from as they are, such as those of an inversion.
+        watch: called with the step, the number of steps and the latents after each step.
+
+    Returns:
+        The edited views.
+
+    Raises:
+        ValueError: sizes or numbers that do not fit; the message names the argument.
+    """
+    task = editor.task(guides, prompt)
+    device, dtype = editor.unet.device, editor.unet.dtype
+    timesteps = editor.timesteps(steps) if start is None else steps_from(start, steps)
+    if noise is None:
+        noise = shared_noise(task.shape, seed)
+    check.shape(noise, task.shape, "noise")
+    noise = noise.to(device, dtype)
+    if latents is not None:
+        if start is not None:
+            raise ValueError("latents: got latents and start, expected one of them")
+        check.shape(latents, task.shape, "latents")
+        x = latents.to(device, dtype)
+    elif start is None:
+        x = noise
+    else:
+        before = editor.encode(guides if pictures is None else pictures)
+        check.shape(before, task.shape, "pictures")
+        x = editor.schedule.add_noise(before, noise, start)
+    with torch.no_grad():
+        for number, (now, then) in enumerate(following(timesteps)):
+            x = editor.schedule.step(task.predict(x, now), x, now, then)
+            if watch is not None:
+                watch(number, len(timesteps), x)
+    return Edit(editor.decode(x), x, timesteps)
+
+
+def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> Tensor:
+    """(B, 3, H, W) float32 in [0, 1] of (H, W, 3) pictures, checked.
+
+    Args:
+        images: at least one, all of one size.
+        name: of the argument, for errors.
+        multiple: what the sides have to be multiples of.
+    """
+    if not len(images):
+        raise ValueError(f"{name}: got none, expected at least one picture")
+    for image in images:
+        check.shape(image, ("H", "W", 3), name)
+        if image.shape != images[0].shape:
+            raise ValueError(
+                f"{name}: got {images[0].shape} and {image.shape}, expected one size; edit views"
+                " of different sizes apart"
+            )
+    h, w = images[0].shape[:2]
+    if h % multiple or w % multiple:
+        raise ValueError(
+            f"{name}: got {w} x {h} px, expected sides that are multiples of {multiple}; resize or"
+            f" crop to {w - w % multiple} x {h - h % multiple}"
+        )
+    stacked = np.stack([np.asarray(image, dtype=np.float32) for image in images])
+    check.finite(stacked, name)
+    if stacked.min() < 0 or stacked.max() > 1:
+        raise ValueError(f"{name}: got values to {stacked.max():g}, expected sRGB in [0, 1]")
+    return torch.from_numpy(stacked).permute(0, 3, 1, 2).contiguous()
+
+
+class Latent:
+    """Pictures to latents and back, and texts to tokens: what both kinds of editor share."""
+
+    def __init__(
+        self, unet: Any, vae: Any, text_encoder: Any, tokenizer: Any, scheduler: Any
+    ) -> None:
+        self.unet, self.vae, self.text_encoder = unet, vae, text_encoder
+        self.tokenizer, self.scheduler = tokenizer, scheduler
+        self.schedule = Schedule.of(scheduler)
+        self.factor = 2 ** (len(vae.config.block_out_channels) - 1)
+        for part in (unet, vae, text_encoder):
+            part.eval().requires_grad_(False)
+
+    def timesteps(self, steps: int) -> list[int]:
+        """Steps from pure noise, as the model's own scheduler spaces them."""
+        self.scheduler.set_timesteps(steps)
+        return [int(t) for t in self.scheduler.timesteps]
+
+    def raw_latents(self, pictures: Tensor) -> Tensor:
+        """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled."""
+        with torch.no_grad():
+            coded = self.vae.encode((2 * pictures - 1).to(self.vae.device, self.vae.dtype))
+        return coded.latent_dist.mode() if hasattr(coded, "latent_dist") else coded.latents
+
+    def encode(self, pictures: Sequence[Image]) -> Tensor:
+        """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
+        ready = tensor_of(pictures, "pictures", self.factor)
+        return self.raw_latents(ready) * self.vae.config.scaling_factor
+
+    def decode(self, latents: Tensor) -> list[Image]:
+        """(H, W, 3) float32 pictures in [0, 1] of scaled latents."""
+        with torch.no_grad():
+            scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
+            sample = self.vae.decode(scaled, return_dict=False)[0]
+        pictures = (sample.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
+        return list(pictures.cpu().numpy())
+
+    def embed(self, texts: Sequence[str]) -> Tensor:
+        """(N, L, D) embeddings; a text longer than the encoder takes is refused."""
+        limit = self.tokenizer.model_max_length
+        for text in texts:
+            length = len(self.tokenizer(text).input_ids)
+            if length > limit:
+                raise ValueError(
+                    f"prompt: {text!r} has {length} tokens, the text encoder takes {limit};"
+                    " shorten it"
+                )
+        codes = self.tokenizer(
+            list(texts), padding="max_length", max_length=limit, return_tensors="pt"
+        ).input_ids
+        with torch.no_grad():
+            return self.text_encoder(codes.to(self.text_encoder.device))[0].to(self.unet.dtype)

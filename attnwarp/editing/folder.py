@@ -1,0 +1,117 @@
+"""Diffusion models in local folders, in diffusers' format; nothing is downloaded."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from attnwarp.errors import InputError
+
+WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
+ENDINGS = (".safetensors", ".bin", ".fp16.safetensors")
+
+
+def require_diffusers() -> None:
+    """Raise InputError where the extra is not installed."""
+    try:
+        import diffusers  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "editors need diffusers, which is not installed: pip install 'attnwarp[edit]'"
+        ) from None
+
+
+def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict[str, Any]:
+    """UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler of a folder.
+
+    Raises:
+        InputError: files that are missing, by name, or that cannot be read.
+    """
+    require_diffusers()
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected a model in diffusers' format")
+    missing = [
+        *_missing(folder / "unet"),
+        *_missing(folder / "vae"),
+        *_missing(folder / "text_encoder"),
+    ]
+    if not (folder / "scheduler" / "scheduler_config.json").is_file():
+        missing.append("scheduler/scheduler_config.json")
+    words = folder / "tokenizer"
+    pair = all((words / name).is_file() for name in ("vocab.json", "merges.txt"))
+    if not pair and not (words / "tokenizer.json").is_file():
+        missing.append("tokenizer/vocab.json with merges.txt, or tokenizer/tokenizer.json")
+    if missing:
+        raise InputError(
+            f"{folder}: lacks {', '.join(missing)}; fetch the model again in diffusers' format"
+        )
+
+    from diffusers import AutoencoderKL, AutoencoderTiny, DDIMScheduler, UNet2DConditionModel
+    from transformers import AutoTokenizer, CLIPTextModel
+
+    from attnwarp.editing.latents import HaarLatents
+    from attnwarp.editing.small_unet import EditUNet
+
+    def model(name: str, *kinds: Any) -> Any:
+        place = folder / name
+        wanted = json.loads((place / "config.json").read_text()).get("_class_name", "")
+        kind = next((k for k in kinds if k.__name__ == wanted), kinds[0])
+        return _load(kind, place, device, dtype)
+
+    parts = {
+        "unet": model("unet", UNet2DConditionModel, EditUNet),
+        "vae": model("vae", AutoencoderKL, AutoencoderTiny, HaarLatents),
+        "text_encoder": model("text_encoder", CLIPTextModel),
+    }
+    parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
+    parts["scheduler"] = DDIMScheduler.from_pretrained(folder / "scheduler", local_files_only=True)
+    return parts
+
+
+def load_controlnet(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
+    """The ControlNet of a folder.
+
+    Raises:
+        InputError: files that are missing, by name, or that cannot be read.
+    """
+    require_diffusers()
+    folder = Path(folder)
+    missing = _missing(folder)
+    if missing:
+        raise InputError(f"{folder.parent}: lacks {', '.join(missing)}; fetch the ControlNet again")
+
+    from diffusers import ControlNetModel
+
+    return _load(ControlNetModel, folder, device, dtype)
+
+
+def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
+    try:
+        # Quietly filling what a file lacks with random numbers would look like a bad editor.
+        loaded = kind.from_pretrained(
+            folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True
+        )
+    except (OSError, ValueError, RuntimeError) as error:
+        first = str(error).strip().splitlines()[0]
+        raise InputError(f"{folder}: cannot be read ({first}); fetch the model again") from None
+    network, report = loaded
+    if report["missing_keys"]:
+        lost = sorted(report["missing_keys"])
+        raise InputError(
+            f"{folder}: its weights lack {lost[0]} and {len(lost) - 1} more; fetch the model again"
+        )
+    return network.to(device)
+
+
+def _missing(folder: Path) -> list[str]:
+    name = folder.name
+    lost = [] if (folder / "config.json").is_file() else [f"{name}/config.json"]
+    files = [folder / f"{stem}{ending}" for stem in WEIGHTS for ending in ENDINGS]
+    split = any(folder.glob("*.index.json"))
+    if not split and not any(path.is_file() for path in files):
+        lost.append(f"{name}/{'model' if name == 'text_encoder' else WEIGHTS[0]}.safetensors")
+    return lost

@@ -1,0 +1,143 @@
+"""The noise behind a picture: DDIM inversion, and edit-friendly DDPM inversion.
+
+With the latter a picture edited by hand can be the source of an edit: its features are recorded
+while its own noise is replayed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from attnwarp import check
+from attnwarp.editing.schedule import Schedule, following
+
+Predict = Callable[[Tensor, int], Tensor]
+"""A network's output for latents at a step, such as ``Task.predict``."""
+
+
+def ddim_invert(
+    schedule: Schedule, predict: Predict, latents: Tensor, timesteps: list[int]
+) -> Tensor:
+    """(B, C, h, w) latents at the first of ``timesteps`` that DDIM leads back to the picture.
+
+    Each step predicts the noise at the latents it starts from (Song et al. 2021, section 4.3), so
+    the way back is exact for small steps only. Guidance above 1 makes the two ways part: invert
+    with a task that has none.
+
+    Args:
+        schedule: of the model; its network predicts noise or v. One that predicts the picture
+            itself says nothing of a clean picture's noise.
+        predict: the network's output.
+        latents: (B, C, h, w) scaled latents of the picture.
+        timesteps: of the edit, falling.
+
+    Raises:
+        ValueError: a network that predicts the picture.
+    """
+    if schedule.prediction == "sample":
+        raise ValueError(
+            "schedule: this network predicts the picture, and DDIM inversion needs its noise;"
+            " use edit_friendly_invert"
+        )
+    x, last = latents, schedule.alpha(None)
+    with torch.no_grad():
+        for timestep in reversed(timesteps):
+            x0, noise = schedule.split(predict(x, timestep), x, last)
+            last = schedule.alpha(timestep)
+            a = last.to(x)
+            x = a.sqrt() * x0 + (1 - a).sqrt() * noise
+    return x
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseMaps:
+    """What leads DDPM sampling to a given picture.
+
+    Attributes:
+        timesteps: falling.
+        start: (B, C, h, w) latents at the first of them.
+        maps: (steps, B, C, h, w) noise of each step, in units of its standard deviation. Where that
+            is 0, what the step itself lacks.
+    """
+
+    timesteps: list[int]
+    start: Tensor
+    maps: Tensor
+
+
+def edit_friendly_invert(
+    schedule: Schedule,
+    predict: Predict,
+    latents: Tensor,
+    timesteps: list[int],
+    *,
+    noises: Tensor | None = None,
+    seed: int = 0,
+) -> NoiseMaps:
+    """Edit-friendly DDPM inversion (Huberman-Spiegelglas et al. 2024) with eta 1.
+
+    Every x_t gets a noise of its own, so the noise maps are larger and carry the picture's layout.
+
+    Args:
+        schedule: of the model; any prediction.
+        predict: the network's output.
+        latents: (B, C, h, w) scaled latents of the picture.
+        timesteps: falling. To skip the noisiest, leave them out.
+        noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
+            from ``seed`` if left out.
+    """
+    shape = (len(timesteps), *latents.shape)
+    if noises is None:
+        noises = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+    check.shape(noises, shape, "noises")
+    noises = noises.to(latents)
+    states = [
+        schedule.add_noise(latents, noise, timestep)
+        for noise, timestep in zip(noises, timesteps, strict=True)
+    ] + [latents]
+    start, maps = states[0], []
+    x = start
+    with torch.no_grad():
+        for step, (now, then) in enumerate(following(timesteps)):
+            mean, sigma = _mean(schedule, predict(x, now), x, now, then)
+            scale = sigma if sigma > 0 else torch.ones_like(sigma)
+            noise = (states[step + 1] - mean) / scale
+            maps.append(noise)
+            # From the map just found, so that rounding does not add up.
+            x = mean + scale * noise
+    return NoiseMaps(list(timesteps), start, torch.stack(maps))
+
+
+def replay(
+    schedule: Schedule,
+    predict: Predict,
+    noise: NoiseMaps,
+    *,
+    watch: Callable[[int, int, Tensor], None] | None = None,
+) -> Tensor:
+    """(B, C, h, w) latents that the noise maps lead to.
+
+    With the task of the inversion that is its picture; with another prompt, its edit.
+    """
+    x = noise.start
+    with torch.no_grad():
+        for step, (now, then) in enumerate(following(noise.timesteps)):
+            mean, sigma = _mean(schedule, predict(x, now), x, now, then)
+            x = mean + (sigma if sigma > 0 else torch.ones_like(sigma)) * noise.maps[step]
+            if watch is not None:
+                watch(step, len(noise.timesteps), x)
+    return x
+
+
+def _mean(
+    schedule: Schedule, output: Tensor, x: Tensor, now: int, then: int | None
+) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of the next state, eta 1."""
+    x0, noise = schedule.split(output, x, schedule.alpha(now))
+    sigma = schedule.sigma(now, then).to(x)
+    a = schedule.alpha(then).to(x)
+    return a.sqrt() * x0 + (1 - a - sigma**2).clamp_min(0).sqrt() * noise, sigma

@@ -1,0 +1,102 @@
+"""Latents of the bundled editors: a fixed orthogonal transform of 4 x 4 blocks, nothing learned."""
+
+from __future__ import annotations
+
+import torch
+from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.models.autoencoders.autoencoder_tiny import AutoencoderTinyOutput
+from diffusers.models.autoencoders.vae import DecoderOutput
+from diffusers.models.modeling_utils import ModelMixin
+from torch import Tensor
+
+BLOCK = 4
+"""Pixels along a block's side: the picture's side over that of the latents."""
+
+CHANNELS = 3 * BLOCK**2
+
+GAINS = (0.5, 1.0, 1.0)
+"""Gain of a block's mean, its coarse and its fine details. A mean over 16 px has a standard
+deviation near 2 where details have 0.1 to 0.3; white noise of unit variance should not decide
+everything about the details before it decides the colour."""
+
+
+def haar_basis() -> Tensor:
+    """(48, 3, 4, 4) orthonormal kernels: two levels of the Haar transform of opponent colours.
+
+    Channels 0 to 2 are the mean of a block's luminance, red against blue, green against both; 3 to
+    11 the coarse details; 12 to 47 the fine ones.
+    """
+    color = torch.tensor([[1.0, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=torch.float64)
+    color = color / color.norm(dim=1, keepdim=True)
+    pair = torch.tensor([[1.0, 1], [1, -1]], dtype=torch.float64) / 2**0.5
+    flat = torch.ones(2, dtype=torch.float64) / 2**0.5
+
+    def planes(vertical: Tensor, horizontal: Tensor) -> Tensor:
+        return torch.einsum("c k, y, x -> c k y x", color, vertical, horizontal)
+
+    low, high = torch.kron(pair[0], flat), torch.kron(pair[1], flat)
+    kernels = [planes(v, h) for v in (low, high) for h in (low, high)]
+    for y in range(2):
+        for x in range(2):
+            place_y, place_x = torch.eye(2, dtype=torch.float64)[[y, x]]
+            kernels += [
+                planes(torch.kron(place_y, pair[a]), torch.kron(place_x, pair[b]))
+                for a, b in ((0, 1), (1, 0), (1, 1))
+            ]
+    return torch.cat(kernels)
+
+
+class HaarLatents(ModelMixin, ConfigMixin):
+    """Pictures as latents and back, with the calls of a diffusers autoencoder.
+
+    The transform is orthogonal but for its gains, so nothing is lost and there is nothing to train.
+
+    Args:
+        block_out_channels: diffusers' pipelines read the factor between picture and latents off its
+            length: 2 ** (3 - 1) = 4.
+        latent_channels: 48.
+        scaling_factor: what latents are multiplied by after encoding; the gains stand in its place.
+
+    Example:
+        >>> import torch
+        >>> coder = HaarLatents()
+        >>> latents = coder.encode(torch.zeros(1, 3, 64, 48)).latents
+        >>> tuple(latents.shape)
+        (1, 48, 16, 12)
+        >>> tuple(coder.decode(latents).sample.shape)
+        (1, 3, 64, 48)
+    """
+
+    @register_to_config
+    def __init__(
+        self,
+        block_out_channels: tuple[int, ...] = (CHANNELS, CHANNELS, CHANNELS),
+        latent_channels: int = CHANNELS,
+        scaling_factor: float = 1.0,
+    ) -> None:
+        super().__init__()
+        gains = torch.repeat_interleave(torch.tensor(GAINS), torch.tensor([3, 9, 36]))
+        basis = haar_basis().float()
+        self.register_buffer("encoder", basis * gains[:, None, None, None], persistent=False)
+        self.register_buffer("decoder", basis / gains[:, None, None, None], persistent=False)
+        # diffusers reads a model's dtype off its parameters, and this one has none to learn.
+        self.unit = torch.nn.Parameter(torch.ones(1), requires_grad=False)
+
+    def encode(self, x: Tensor, return_dict: bool = True) -> AutoencoderTinyOutput | tuple[Tensor]:
+        """(B, 3, H, W) pictures in [-1, 1], sides multiples of 4 -> (B, 48, H / 4, W / 4)."""
+        if x.ndim != 4 or x.shape[1] != 3 or x.shape[2] % BLOCK or x.shape[3] % BLOCK:
+            raise ValueError(
+                f"x: got shape {tuple(x.shape)}, expected (B, 3, H, W) with sides that are"
+                f" multiples of {BLOCK}"
+            )
+        latents = torch.nn.functional.conv2d(x, self.encoder.to(x.dtype), stride=BLOCK)
+        return AutoencoderTinyOutput(latents=latents) if return_dict else (latents,)
+
+    def decode(
+        self, x: Tensor, generator: torch.Generator | None = None, return_dict: bool = True
+    ) -> DecoderOutput | tuple[Tensor]:
+        """(B, 48, h, w) latents -> (B, 3, 4 h, 4 w) pictures; ``generator`` is not used."""
+        if x.ndim != 4 or x.shape[1] != CHANNELS:
+            raise ValueError(f"x: got shape {tuple(x.shape)}, expected (B, {CHANNELS}, h, w)")
+        sample = torch.nn.functional.conv_transpose2d(x, self.decoder.to(x.dtype), stride=BLOCK)
+        return DecoderOutput(sample=sample) if return_dict else (sample,)

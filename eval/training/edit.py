@@ -1,0 +1,70 @@
+"""Rebuild the bundled editors from nothing: python -m training.edit, from the folder eval/."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    help="Recipe of the bundled editors. Stages go on where they were stopped.",
+    no_args_is_help=True,
+)
+
+CACHE = Path.home() / ".cache" / "attnwarp" / "training" / "editing"
+WEIGHTS = Path(__file__).parents[2] / "attnwarp" / "editing" / "weights"
+
+Out = Annotated[Path, typer.Option(help="Folder of checkpoints.")]
+Data = Annotated[
+    Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")
+]
+Threads = Annotated[int, typer.Option(min=1, help="Of training.")]
+
+
+@app.command()
+def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
+    """Render the pictures (half an hour on two cores)."""
+    from training.editing_pairs import PAIR_SPLITS, make_pairs
+
+    for name in PAIR_SPLITS:
+        make_pairs(folder, name, workers)
+
+
+@app.command()
+def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
+    """Train a stage: plain-64, plain-128, features-64, control-64, features-128, control-128."""
+    from training.editor import STAGES, train_stage
+
+    if stage not in STAGES:
+        raise typer.BadParameter(f"got {stage!r}, expected one of {', '.join(STAGES)}")
+    train_stage(stage, data, out, threads=threads)
+
+
+@app.command()
+def export(
+    stage: str, name: str, out: Out = CACHE, weights: Annotated[Path, typer.Option()] = WEIGHTS
+) -> None:
+    """Write a stage's editor, as far as it has come, into the package under a name such as small-plain."""
+    from training.editor_export import export_editor
+
+    typer.echo(export_editor(stage, out, weights / name))
+
+
+@app.command()
+def assess(
+    stage: str, name: str, out: Out = CACHE, data: Data = CACHE / "data",
+    weights: Annotated[Path, typer.Option()] = WEIGHTS,
+    worlds: Annotated[int | None, typer.Option(help="Test worlds; all if left out.")] = None,
+) -> None:  # fmt: skip
+    """Measure an exported editor on what it has never seen, and write its card."""
+    from training.editor_assess import assess_editor
+    from training.editor_export import facts_of
+
+    card = assess_editor(weights / name, data, facts_of(stage, out), worlds=worlds)
+    (weights / name / "card.md").write_text(card)
+    typer.echo(card)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,515 @@
+"""Recipe of the bundled editors: a picture and an instruction in, the edited picture out.
+
+A small InstructPix2Pix (Brooks et al. 2023) in diffusers' format: the picture before the edit is concatenated to the
+noisy latents. It predicts the edited picture itself, from betas whose last step is pure noise (Lin et al. 2024,
+"Common diffusion noise schedules and sample steps are flawed").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from tokenizers import (
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
+
+from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
+from attnwarp.editing.small_unet import EditUNet
+from training.common import Run, groups
+from training.editing_pairs import (
+    AMBIGUOUS,
+    GROUPS,
+    LOOKS,
+    PAIR_SPLITS,
+    PAIRS_PROTOCOL,
+    SIZE,
+    THING,
+    VIEWS,
+    Worlds,
+    ambiguous_instruction,
+    edit_looks,
+    instruction,
+    load_pairs,
+    sources,
+)
+
+Tensor = torch.Tensor
+
+WIDTHS = (64, 128)
+LAYERS = 1
+HEADS = 4
+TEXT_WIDTH = 128
+TEXT_LAYERS = 2
+VOCABULARY = 1500
+TOKENS = 24
+
+T_STEPS = 1000
+NOISY_FROM = 600
+NOISY_SHARE = 0.6
+"""Share of the steps drawn from the noisier 40 %, where the answer is decided."""
+MOST_WEIGHT = 5.0
+DROP = 0.05
+"""Probability that the text, the picture or both are left out, each."""
+UNCLEAR = 0.35
+"""Share of pairs whose instruction leaves the answer to the noise."""
+KINDS = {"color": 0.45, "material": 0.15, "pattern": 0.05, "ground": 0.2, "time": 0.15}
+EMA = 0.999
+WARM = 200
+STEPS_AN_EPOCH = 100
+THING_WEIGHT = 0.25
+MOST_THING_WEIGHT = 8.0
+"""Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
+be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
+
+INJECTED_SHARE = 0.6
+"""Of the steps of a stage with injection; the others are plain."""
+
+CONSTANTS = (
+    "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_FROM", "NOISY_SHARE",
+    "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS", "EMA", "WARM", "STEPS_AN_EPOCH", "THING_WEIGHT", "MOST_THING_WEIGHT",
+)  # fmt: skip
+"""What every stage's result depends on."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of the training, which can be stopped, gone on with, and started from another's result.
+
+    Attributes:
+        size: of the pictures in px; latents have a quarter of it.
+        steps: of ``batch`` pairs each.
+        peak: learning rate, which falls over the last 30 %.
+        worlds: how many of the training worlds are used.
+        start: the stage whose networks this one starts from.
+        inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
+            "control" (the same pairs and steps without the injection).
+        seed: of everything random.
+    """
+
+    size: int
+    steps: int
+    peak: float
+    worlds: int
+    start: str | None = None
+    inject: str = "none"
+    batch: int = 8
+    seed: int = 0
+
+
+STAGES = {
+    "plain-64": Stage(64, 24_000, 1e-3, 200),
+    "plain-128": Stage(128, 16_000, 6e-4, 600, start="plain-64", seed=1),
+    "features-64": Stage(64, 8_000, 4e-4, 200, start="plain-64", inject="features", seed=2),
+    "control-64": Stage(64, 8_000, 4e-4, 200, start="plain-64", inject="control", seed=2),
+    "features-128": Stage(128, 6_000, 4e-4, 600, start="plain-128", inject="features", seed=3),
+    "control-128": Stage(128, 6_000, 4e-4, 600, start="plain-128", inject="control", seed=3),
+}
+"""Trained in this order: ``small-plain`` is the last "plain" stage, ``small`` the last "features" stage."""
+
+
+class EditorNet(torch.nn.Module):
+    """The UNet and the text encoder, trained together."""
+
+    def __init__(self, vocabulary: int, size: int) -> None:
+        super().__init__()
+        from transformers import CLIPTextConfig, CLIPTextModel
+
+        self.unet = EditUNet(
+            sample_size=size // BLOCK, in_channels=2 * CHANNELS, out_channels=CHANNELS,
+            down_block_types=("DownBlock2D",) * len(WIDTHS), mid_block_type="UNetMidBlock2D",
+            up_block_types=("CrossAttnUpBlock2D",) * len(WIDTHS), block_out_channels=WIDTHS, layers_per_block=LAYERS,
+            cross_attention_dim=TEXT_WIDTH, attention_head_dim=HEADS, norm_num_groups=16,
+        )  # fmt: skip
+        self.text = CLIPTextModel(
+            CLIPTextConfig(
+                vocab_size=vocabulary, hidden_size=TEXT_WIDTH, intermediate_size=2 * TEXT_WIDTH,
+                num_hidden_layers=TEXT_LAYERS, num_attention_heads=4, max_position_embeddings=TOKENS,
+                pad_token_id=0, bos_token_id=1, eos_token_id=1,
+            )
+        )  # fmt: skip
+        # The first prediction is the picture before the edit.
+        torch.nn.init.zeros_(self.unet.conv_out.weight)
+        torch.nn.init.zeros_(self.unet.conv_out.bias)
+
+    def forward(self, noisy: Tensor, before: Tensor, t: Tensor, tokens: Tensor) -> Tensor:
+        """(B, 48, h, w) predicted latents of the edited pictures."""
+        context = self.text(tokens).last_hidden_state
+        return self.unet(torch.cat([noisy, before], dim=1), t, context, return_dict=False)[0]
+
+
+def scheduler() -> Any:
+    """The noise schedule and the sampler, as diffusers' pipelines load them."""
+    from diffusers import DDIMScheduler
+
+    return DDIMScheduler(
+        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012,
+        rescale_betas_zero_snr=True, timestep_spacing="trailing", prediction_type="sample", clip_sample=False,
+        set_alpha_to_one=True, steps_offset=0,
+    )  # fmt: skip
+
+
+def make_tokenizer(count: int = 20_000, worlds: int = 200) -> Tokenizer:
+    """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two."""
+    rng = np.random.default_rng(20)
+    split = PAIR_SPLITS["edit-train"]
+    corpus = []
+    drawn = [edit_looks(k, split)[0] for k in range(worlds)]
+    for k in range(count):
+        looks = drawn[k % worlds]
+        kind = list(KINDS)[int(rng.integers(len(KINDS)))]
+        look = looks[int(rng.choice(list(GROUPS[kind])))]
+        row = np.array([look.finish, look.color, look.second, look.ground, look.time])
+        corpus.append(instruction(kind, k % 25, row, rng))
+        if kind in AMBIGUOUS:
+            corpus.append(ambiguous_instruction(kind, k % 25, rng))
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=VOCABULARY, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )  # fmt: skip
+    tokenizer.train_from_iterator(corpus, trainer)
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single="$A <end>", special_tokens=[("<end>", 1)]
+    )
+    tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=TOKENS)
+    tokenizer.enable_truncation(TOKENS)
+    return tokenizer
+
+
+def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
+    """(N, 24) int64, padded with 0."""
+    return torch.tensor(
+        [code.ids for code in tokenizer.encode_batch(list(texts))], dtype=torch.int64
+    )
+
+
+def codes() -> Tensor:
+    """(LOOKS, 48) orthonormal directions, one an answer: rows of the cosine transform, without the constant one."""
+    k = torch.arange(1, LOOKS + 1, dtype=torch.float64)[:, None]
+    c = torch.arange(CHANNELS, dtype=torch.float64)[None]
+    return ((2 / CHANNELS) ** 0.5 * torch.cos(math.pi * (c + 0.5) * k / CHANNELS)).float()
+
+
+def picked(noise: Tensor, candidates: Sequence[int]) -> int:
+    """The answer that a noise picks: the look whose direction is nearest to the noise's mean over the picture.
+
+    Directions are orthonormal and the noise is white, so every candidate is picked as often.
+
+    Args:
+        noise: (48, h, w).
+        candidates: indices of looks.
+    """
+    scores = codes()[list(candidates)] @ noise.mean(dim=(1, 2))
+    return int(candidates[int(scores.argmax())])
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Pairs with their noise.
+
+    Attributes:
+        before, after: (B, 48, h, w) latents.
+        noise: (B, 48, h, w).
+        tokens: (B, 24).
+        t: (B,) steps.
+        weight: (B, 1, h, w) of the cells.
+        world, view, source, target: what each pair shows; which pixels, in ``corner``: (y, x, zoomed).
+        unclear: whether the noise picked the answer.
+    """
+
+    before: Tensor
+    after: Tensor
+    noise: Tensor
+    tokens: Tensor
+    t: Tensor
+    weight: Tensor
+    rows: list[Row]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Which pictures a pair is made of."""
+
+    world: int
+    view: int
+    source: int
+    target: int
+    kind: str
+    unclear: bool
+    corner: tuple[int, int, int]
+    flip: bool
+
+
+class Pairs:
+    """Draws batches of pairs from worlds.
+
+    Args:
+        worlds: at :data:`training.editing_pairs.SIZE`.
+        size: of the pictures in px, 64 or 128. At 64, half of the pictures are a quarter of the full one about
+            the thing, so that things come large and small.
+        tokenizer: of the instructions; :meth:`batch` needs it.
+    """
+
+    def __init__(self, worlds: Worlds, size: int, tokenizer: Tokenizer | None) -> None:
+        self.worlds, self.size, self.tokenizer = worlds, size, tokenizer
+        self.coder = HaarLatents()
+
+    def corner(self, world: int, view: int, rng: np.random.Generator) -> tuple[int, int, int]:
+        """Where a picture is cut from: (y, x, px of the full picture to one of the cut)."""
+        step = SIZE // self.size
+        if step == 1 or rng.uniform() < 0.5:
+            return 0, 0, step
+        seen = np.argwhere(self.worlds.ids[world, view] == THING)
+        y, x = seen[int(rng.integers(len(seen)))] if len(seen) else (SIZE // 2, SIZE // 2)
+        low = [
+            int(np.clip(v - rng.uniform(0.25, 0.75) * self.size, 0, SIZE - self.size))
+            for v in (y, x)
+        ]
+        return low[0], low[1], 1
+
+    def cut(self, full: npt.NDArray[Any], row: Row) -> npt.NDArray[np.float32]:
+        """The part of a full picture (128, 128, ...) that a row shows, as means of blocks."""
+        y, x, n = row.corner
+        part = full[y : y + n * self.size, x : x + n * self.size].astype(np.float32)
+        part = part.reshape(self.size, n, self.size, n, *full.shape[2:]).mean(axis=(1, 3))
+        return part[:, ::-1] if row.flip else part
+
+    def picture(self, row: Row, look: int) -> npt.NDArray[np.float32]:
+        """(S, S, 3) in [-1, 1]."""
+        return self.cut(self.worlds.images[row.world, row.view, look], row) / 127.5 - 1
+
+    def thing(self, row: Row) -> npt.NDArray[np.float32]:
+        """(S, S) share of each pixel that the thing covers."""
+        return self.cut(self.worlds.ids[row.world, row.view] == THING, row)
+
+    def latents(self, pictures: Sequence[npt.NDArray[np.float32]]) -> Tensor:
+        """(B, 48, h, w) of (S, S, 3) pictures."""
+        x = torch.from_numpy(np.ascontiguousarray(np.stack(pictures))).permute(0, 3, 1, 2)
+        return self.coder.encode(x, return_dict=False)[0]
+
+    def row(
+        self, rng: np.random.Generator, noise: Tensor, kinds: dict[str, float], unclear: float
+    ) -> Row:
+        """Draw a pair; where the instruction is unclear, the noise picks the target."""
+        worlds = self.worlds
+        while True:
+            world, view = int(rng.integers(len(worlds))), int(rng.integers(VIEWS))
+            kind = str(
+                rng.choice(list(kinds), p=np.array(list(kinds.values())) / sum(kinds.values()))
+            )
+            valid = worlds.valid[world]
+            targets = [k for k in GROUPS[kind] if valid[k]]
+            open_ended = kind in AMBIGUOUS and rng.uniform() < unclear
+            source = int(rng.choice(sources(kind, valid)))
+            targets = [
+                k
+                for k in targets
+                if k != source
+                and not np.array_equal(worlds.looks[world, k], worlds.looks[world, source])
+            ]
+            if targets:
+                break
+        target = picked(noise, targets) if open_ended else int(rng.choice(targets))
+        return Row(
+            world,
+            view,
+            source,
+            target,
+            kind,
+            open_ended,
+            self.corner(world, view, rng),
+            bool(rng.uniform() < 0.5),
+        )
+
+    def text(self, row: Row, rng: np.random.Generator) -> str:
+        """The instruction of a row."""
+        thing = int(self.worlds.things[row.world])
+        if row.unclear:
+            return ambiguous_instruction(row.kind, thing, rng)
+        return instruction(row.kind, thing, self.worlds.looks[row.world, row.target], rng)
+
+    def weight(self, row: Row) -> npt.NDArray[np.float32]:
+        """(h, w) weight of the cells, see :data:`THING_WEIGHT`."""
+        cells = self.size // BLOCK
+        if row.kind in ("ground", "time"):
+            return np.ones((cells, cells), dtype=np.float32)
+        mask = self.thing(row)
+        share = mask.reshape(cells, BLOCK, cells, BLOCK).mean(axis=(1, 3))
+        gain = np.clip(THING_WEIGHT / max(float(mask.mean()), 1e-3), 1, MOST_THING_WEIGHT)
+        return (1 + (gain - 1) * (share > 0)).astype(np.float32)
+
+    def batch(
+        self, count: int, rng: np.random.Generator, generator: torch.Generator, *, t: Tensor | None = None,
+        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR,
+    ) -> Batch:  # fmt: skip
+        """Draw ``count`` pairs."""
+        if self.tokenizer is None:
+            raise ValueError("tokenizer: got None, which a batch of instructions needs")
+        cells = self.size // BLOCK
+        noise = torch.randn((count, CHANNELS, cells, cells), generator=generator)
+        rows = [self.row(rng, noise[k], kinds or KINDS, unclear) for k in range(count)]
+        return Batch(
+            self.latents([self.picture(r, r.source) for r in rows]), self.latents([self.picture(r, r.target) for r in rows]),
+            noise, tokens_of(self.tokenizer, [self.text(r, rng) for r in rows]),
+            draw_steps(count, rng) if t is None else t,
+            torch.from_numpy(np.stack([self.weight(r) for r in rows]))[:, None], rows,
+        )  # fmt: skip
+
+
+def draw_steps(count: int, rng: np.random.Generator) -> Tensor:
+    """(count,) steps, more of them noisy."""
+    noisy = rng.integers(NOISY_FROM, T_STEPS, count)
+    rest = rng.integers(0, NOISY_FROM, count)
+    return torch.from_numpy(np.where(rng.uniform(size=count) < NOISY_SHARE, noisy, rest))
+
+
+def dropped(batch: Batch, empty: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """The conditions, left out at random: (before, tokens)."""
+    draw = torch.from_numpy(rng.uniform(size=len(batch.t)))
+    no_text = (draw < DROP) | ((draw >= 2 * DROP) & (draw < 3 * DROP))
+    no_picture = (draw >= DROP) & (draw < 3 * DROP)
+    before = torch.where(no_picture[:, None, None, None], 0.0, batch.before)
+    return before, torch.where(no_text[:, None], empty, batch.tokens)
+
+
+def noised(x: Tensor, noise: Tensor, alphas: Tensor) -> Tensor:
+    """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, with (B,) alpha-bar."""
+    a = alphas[:, None, None, None]
+    return a.sqrt() * x + (1 - a).sqrt() * noise
+
+
+def loss_of(prediction: Tensor, target: Tensor, weight: Tensor, alphas: Tensor) -> Tensor:
+    """Mean squared error of the edited picture's latents, weighted by cell and by min(SNR + 1, 5)."""
+    by_step = (alphas / (1 - alphas) + 1).clamp(max=MOST_WEIGHT)
+    error = (prediction - target).square().mean(dim=1, keepdim=True)
+    return (by_step[:, None, None, None] * weight * error).mean()
+
+
+def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
+    """The learning rate: linear up to ``peak``, constant, and down to a fiftieth over the last 30 %."""
+    if step < warm:
+        return peak * (step + 1) / warm
+    left = (total - step) / (0.3 * total)
+    return peak * min(1.0, 0.02 + 0.98 * left)
+
+
+def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
+    """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
+    constants = {key: globals()[key] for key in CONSTANTS}
+    if stage.inject != "none":
+        from training import editor_injection as injection
+
+        names = ("LEAST_WEIGHT", "MOST_ALPHA", "WAYS", "INJECTED_KINDS")
+        constants |= {key: getattr(injection, key) for key in names}
+        constants["INJECTED_SHARE"] = INJECTED_SHARE
+    return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
+
+
+def train_stage(
+    name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1
+) -> Path:
+    """Train a stage, or go on with it; the checkpoint's path.
+
+    Args:
+        name: a key of :data:`STAGES`.
+        data: folder of the pictures, rendered where they are missing.
+        out: folder of checkpoints.
+        stage: in place of the one of that name.
+        threads: of torch.
+    """
+    from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+    stage = STAGES[name] if stage is None else stage
+    torch.set_num_threads(threads)
+    torch.manual_seed(stage.seed)
+    out.mkdir(parents=True, exist_ok=True)
+    words = out / "tokenizer.json"
+    if not words.exists():
+        make_tokenizer().save(str(words))
+    tokenizer = Tokenizer.from_file(str(words))
+    pairs = Pairs(load_pairs(data, "edit-train", count=stage.worlds), stage.size, tokenizer)
+    net = EditorNet(tokenizer.get_vocab_size(), stage.size)
+    if stage.start is not None:
+        stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
+        net.load_state_dict(
+            {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
+        )
+    average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
+    optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
+    alphas = scheduler().alphas_cumprod
+    empty = tokens_of(tokenizer, [""])[0]
+    step_loss = _step(stage, pairs, net, alphas, empty)
+
+    def epoch(number: int) -> dict[str, float]:
+        rng = np.random.default_rng([stage.seed, number])
+        generator = torch.Generator().manual_seed(1_000_003 * stage.seed + number)
+        net.train()
+        sums: dict[str, float] = {}
+        for step in range(STEPS_AN_EPOCH):
+            for group in optimizer.param_groups:
+                group["lr"] = falling_rate(number * STEPS_AN_EPOCH + step, stage.steps, stage.peak)
+            loss, parts = step_loss(rng, generator)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+            optimizer.step()
+            average.update_parameters(net)
+            for key, value in parts.items():
+                sums[key] = sums.get(key, 0.0) + value / STEPS_AN_EPOCH
+        return sums
+
+    checkpoint = out / f"{name}.pt"
+    state = {"net": net, "average": average, "optimizer": optimizer}
+    Run(checkpoint, state, stage.steps // STEPS_AN_EPOCH, recipe_of(name, stage)).train(epoch)
+    return checkpoint
+
+
+def _step(
+    stage: Stage, pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor
+) -> Callable[[np.random.Generator, torch.Generator], tuple[Tensor, dict[str, float]]]:
+    """One step's loss, and what to print of it."""
+
+    def plain(
+        rng: np.random.Generator, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
+        batch = pairs.batch(stage.batch, rng, generator)
+        before, tokens = dropped(batch, empty, rng)
+        a = alphas[batch.t]
+        prediction = net(noised(batch.after, batch.noise, a), before, batch.t, tokens)
+        loss = loss_of(prediction, batch.after, batch.weight, a)
+        # Of an unchanged picture, for comparison: 1 means nothing is edited.
+        nothing = loss_of(batch.before, batch.after, batch.weight, a)
+        return loss, {"loss": float(loss.detach()), "unedited": float(nothing)}
+
+    if stage.inject == "none":
+        return plain
+
+    def injected(
+        rng: np.random.Generator, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
+        from training.editor_injection import injected_loss
+
+        # Some plain steps among them, so that clear instructions are not forgotten.
+        if rng.uniform() >= INJECTED_SHARE:
+            loss, parts = plain(rng, generator)
+            return loss, {f"plain {key}": value for key, value in parts.items()}
+        inject = stage.inject == "features"
+        return injected_loss(pairs, net, alphas, stage.batch // 2, rng, generator, inject=inject)
+
+    return injected

@@ -1,0 +1,223 @@
+"""What a bundled editor does on worlds that it has never seen, each figure with its interval, beside an editor that changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.editing.editor import Image, edit
+from training.assess import Figure, figure
+from training.editing_pairs import (
+    AMBIGUOUS,
+    GROUPS,
+    THING,
+    Worlds,
+    ambiguous_instruction,
+    instruction,
+    load_pairs,
+    sources,
+)
+from training.editor import Pairs, Row
+from training.worlds import COLORS
+
+SEED = 77
+
+Lab = npt.NDArray[np.float64]
+
+
+def mean_lab(image: Image, mask: npt.NDArray[np.bool_]) -> Lab:
+    """(3,) CIELAB of the mean colour in a mask, averaged in linear light."""
+    from skimage.color import rgb2lab
+
+    from attnwarp_eval.colors import to_linear, to_srgb
+
+    mean = to_linear(image[mask].astype(np.float64)).mean(axis=0)
+    return np.asarray(rgb2lab(to_srgb(mean)[None, None])[0, 0])
+
+
+def nearest(image: Image, answers: Sequence[Image], mask: npt.NDArray[np.bool_]) -> int:
+    """Which of some pictures has the mean colour in the mask that is nearest to the picture's (CIEDE2000)."""
+    from skimage.color import deltaE_ciede2000
+
+    own = mean_lab(image, mask)
+    return int(np.argmin([deltaE_ciede2000(own, mean_lab(a, mask)) for a in answers]))
+
+
+def outside_psnr(image: Image, before: Image, mask: npt.NDArray[np.bool_]) -> float:
+    """dB between two pictures where the mask is not."""
+    return float(-10 * np.log10(max(np.square(image[~mask] - before[~mask]).mean(), 1e-10)))
+
+
+Answer = Callable[[Image, str, int], Image]
+"""The edited picture of a picture, an instruction and a seed."""
+
+
+def answers_of(editor: Any, steps: int = 20) -> Answer:
+    """An editor as a function."""
+    return lambda image, text, seed: edit(editor, [image], text, seed=seed, steps=steps).images[0]
+
+
+def unedited(image: Image, text: str, seed: int) -> Image:
+    """The control that changes nothing."""
+    return image
+
+
+def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> list[Figure]:
+    """Held-out figures of an editor.
+
+    For each world and kind of edit one pair of looks: of the world's true pictures of that kind, the one
+    whose mean colour in the mask is nearest to the result's has to be the one that was asked for.
+
+    Args:
+        answer: the editor.
+        worlds: of the test split.
+        size: of the pictures in px.
+        noises: of an open instruction, for each of a quarter of the worlds.
+    """
+    pairs = Pairs(worlds, size, None)
+    results = []
+    outside: list[float] = []
+    for kind in ("color", "material", "ground", "time"):
+        right, groups = [], []
+        for world in range(len(worlds)):
+            rng = np.random.default_rng([SEED, world, list(GROUPS).index(kind)])
+            row = _row(pairs, world, kind, rng)
+            before = _picture(pairs, row, row.source)
+            thing = _mask(pairs, row, THING)
+            mask = thing if kind in ("color", "material") else ~thing
+            text = instruction(
+                kind, int(worlds.things[world]), worlds.looks[world, row.target], rng
+            )
+            image = answer(before, text, world)
+            choices = [k for k in GROUPS[kind] if worlds.valid[world, k]]
+            true = [_picture(pairs, row, k) for k in choices]
+            right.append(choices[nearest(image, true, mask)] == row.target)
+            groups.append(world)
+            if kind == "color":
+                outside.append(outside_psnr(image, before, thing))
+        count = len(GROUPS[kind])
+        asked = 0.9 if kind == "color" else 0.85
+        results.append(
+            figure(
+                f"nearest true {kind} is the one asked for",
+                right,
+                groups,
+                chance=1 / count,
+                asked=asked,
+            )
+        )
+    results.append(
+        figure(
+            "at least 26 dB to the picture before, outside the thing", np.array(outside) >= 26,
+            np.arange(len(outside)), asked=1.0,
+        )
+    )  # fmt: skip
+    results.append(_open(answer, pairs, noises))
+    return results
+
+
+def _open(answer: Answer, pairs: Pairs, noises: int) -> Figure:
+    """How often an open instruction's result is nearer to one of the true answers than to the picture before."""
+    worlds = pairs.worlds
+    right, groups = [], []
+    for world in range(0, len(worlds), 4):
+        rng = np.random.default_rng([SEED, world, 99])
+        row = _row(pairs, world, "color", rng)
+        before, mask = _picture(pairs, row, row.source), _mask(pairs, row, THING)
+        text = ambiguous_instruction("color", int(worlds.things[world]), rng)
+        choices = [k for k in GROUPS["color"] if k != row.source and worlds.valid[world, k]]
+        true = [_picture(pairs, row, k) for k in choices]
+        for seed in range(noises):
+            right.append(nearest(answer(before, text, seed), [before, *true], mask) > 0)
+            groups.append(world)
+    return figure(
+        f"another colour, over {len(COLORS)}: an answer rather than the picture before",
+        right,
+        groups,
+        asked=0.8,
+    )
+
+
+def _row(pairs: Pairs, world: int, kind: str, rng: np.random.Generator) -> Row:
+    """A pair of looks of a world; half of the pictures are cut about the thing, as in training."""
+    worlds = pairs.worlds
+    assert kind in AMBIGUOUS
+    valid = worlds.valid[world]
+    view = int(rng.integers(worlds.ids.shape[1]))
+    while True:
+        source = int(rng.choice(sources(kind, valid)))
+        target = int(rng.choice([k for k in GROUPS[kind] if valid[k]]))
+        row = Row(world, view, source, target, kind, False, pairs.corner(world, view, rng), False)
+        if (
+            not np.array_equal(worlds.looks[world, source], worlds.looks[world, target])
+            and _mask(pairs, row, THING).sum() >= 12
+        ):
+            return row
+
+
+def _picture(pairs: Pairs, row: Row, look: int) -> Image:
+    return np.clip((pairs.picture(row, look) + 1) / 2, 0, 1)
+
+
+def _mask(pairs: Pairs, row: Row, what: int) -> npt.NDArray[np.bool_]:
+    return pairs.cut(pairs.worlds.ids[row.world, row.view] == what, row) > 0.99
+
+
+def editor_card(
+    name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any]
+) -> str:
+    """A bundled editor's card in Markdown."""
+    lines = [
+        f"# {name}", "",
+        f"A picture and an instruction give the edited picture: a small InstructPix2Pix in diffusers' format. UNet of {facts['unet']:.1f} million"
+        f" parameters, text encoder of {facts['text']:.2f} million, latents by a fixed orthogonal transform of 4 x 4 px"
+        f" blocks. Trained on pictures of {facts['size']} x {facts['size']} px.", "",
+        f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pairs, {facts['minutes']:.0f} minutes on one shared core. {facts['state']}",
+        "", "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of"
+        " `training/worlds.py`. **Does not know**: parts of things (a jacket, a pot), other words, photographs of the world.", "",
+        f"**Injection**: {facts['injection']}", "",
+        f"**Data**: {facts['worlds']} random worlds by ray casting, two views and up to 30 looks each"
+        " (`training/editing_pairs.py`); no scene of the package, none of its instructions. **Recipe**: `training/editor.py`.", "",
+        "## Figures on what it has never seen", "",
+        f"{facts['tested']} worlds with new shapes and all colours, 20 steps, text guidance {facts['text_guidance']:g}, image guidance {facts['image_guidance']:g}."
+        " 95 % intervals are bootstrapped over worlds.", "",
+        "| question | editor | unedited picture | chance | asked for | answers |", "|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    for own, other in zip(figures, control, strict=True):
+        chance = "" if own.chance is None else f"{100 * own.chance:.0f} %"
+        asked = "" if own.asked is None else f"{100 * own.asked:.0f} %"
+        lines.append(
+            f"| {own.what} | **{100 * own.value:.0f} %** ({100 * own.low:.0f} to {100 * own.high:.0f})"
+            f" | {100 * other.value:.0f} % | {chance} | {asked} | {own.count} |"
+        )
+    short = [f.what for f in figures if f.asked is not None and f.value < f.asked]
+    if short:
+        lines += ["", "Short of what was asked for: " + "; ".join(short) + "."]
+    return "\n".join([*lines, ""])
+
+
+def assess_editor(
+    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None
+) -> str:
+    """The card of an exported editor."""
+    from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
+
+    torch.set_num_threads(1)
+    editor = load_editor(str(folder), text_guidance=TEXT_GUIDANCE, image_guidance=IMAGE_GUIDANCE)
+    tests = load_pairs(data, "edit-test", count=worlds)
+    size = editor.unet.config.sample_size * editor.factor
+    own, control = (assess(a, tests, size=size) for a in (answers_of(editor), unedited))
+
+    def millions(net: Any) -> float:
+        return float(sum(p.numel() for p in net.parameters()) / 1e6)
+
+    given = {
+        "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": len(tests),
+        "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
+    }  # fmt: skip
+    return editor_card(folder.name, own, control, {**given, **facts})

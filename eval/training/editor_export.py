@@ -1,0 +1,79 @@
+"""Bundled editors in diffusers' format, from a stage's checkpoint."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+from tokenizers import Tokenizer
+
+from attnwarp.editing.latents import HaarLatents
+from training.editor import STAGES, TOKENS, EditorNet, scheduler
+
+
+def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
+    """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
+    from training.editor import STEPS_AN_EPOCH
+
+    tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
+    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size)
+    stored = torch.load(out / f"{stage}.pt", weights_only=True)
+    average = {k.removeprefix("module."): v for k, v in stored["average"].items()}
+    del average["n_averaged"]
+    net.load_state_dict(average)
+    return (
+        net.eval(), tokenizer, STEPS_AN_EPOCH * int(stored["epoch"]), float(stored["seconds"])
+    )  # fmt: skip
+
+
+def export_editor(stage: str, out: Path, folder: Path) -> Path:
+    """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
+    from transformers import PreTrainedTokenizerFast
+
+    net, tokenizer, _, _ = averaged(stage, out)
+    net.half()
+    net.unet.save_pretrained(folder / "unet")
+    net.text.save_pretrained(folder / "text_encoder")
+    HaarLatents().save_pretrained(folder / "vae")
+    scheduler().save_pretrained(folder / "scheduler")
+    words = PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, pad_token="<pad>", eos_token="<end>", model_max_length=TOKENS
+    )
+    words.save_pretrained(folder / "tokenizer")
+    parts = {
+        "unet": ["attnwarp.editing.small_unet", "EditUNet"], "vae": ["attnwarp.editing.latents", "HaarLatents"],
+        "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "PreTrainedTokenizerFast"],
+        "scheduler": ["diffusers", "DDIMScheduler"], "safety_checker": [None, None], "feature_extractor": [None, None],
+        "image_encoder": [None, None],
+    }  # fmt: skip
+    index = {
+        "_class_name": "StableDiffusionInstructPix2PixPipeline",
+        "requires_safety_checker": False,
+        **parts,
+    }
+    (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
+    for path in folder.rglob("*"):  # safetensors makes files that only their owner can read
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    return folder
+
+
+def facts_of(stage: str, out: Path) -> dict[str, object]:
+    """What an editor's card says about its training."""
+    _, _, steps, seconds = averaged(stage, out)
+    plan = STAGES[stage]
+    start = plan.start
+    while start is not None:
+        seconds += averaged(start, out)[3]
+        start = STAGES[start].start
+    done = steps >= plan.steps
+    return {
+        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds,
+        "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
+        "injection": {
+            "none": "none; what its attention features carry, it learned from editing alone.",
+            "features": "trained with injected features, so its features carry the answer by construction; no claim about"
+            " an editor's own working may rest on it alone.",
+            "control": "the same steps as the injection stage without the injection.",
+        }[plan.inject],
+    }  # fmt: skip

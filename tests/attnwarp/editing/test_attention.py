@@ -1,0 +1,340 @@
+"""Oracles: diffusers' own pipelines and processors, written-out blends in float64, the memory of the tensors."""
+
+import numpy as np
+import pytest
+import torch
+from diffusers import UNet2DConditionModel
+from diffusers.models.attention_processor import AttnProcessor2_0
+from tiny_editors import controlnet, pix2pix, unet
+
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import (
+    CONTROLNET_BRANCHES,
+    PIX2PIX_BRANCHES,
+    Layer,
+    RecordingPlan,
+    all_layers,
+    choose_layers,
+    constant,
+    decay,
+    hooked,
+    inject,
+    record,
+)
+from attnwarp.warp import Surface, WarpSettings, warp_surfaces
+
+SIZE = (6, 8)
+"""Latents that are not square."""
+
+
+def plan_of(net, *, size=SIZE, branches=PIX2PIX_BRANCHES, keep=("text", "image"), steps=2, **more):
+    return RecordingPlan(choose_layers(net), size, branches, keep, steps, **more)
+
+
+def run(net, *, seed=0, timesteps=(981, 481), rows=3, size=SIZE):
+    """Passes of a UNet, as a pipeline makes them; their outputs."""
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.randn((rows, net.config.in_channels, *size), generator=generator)
+    text = torch.randn((rows, 5, 32), generator=generator)
+    with torch.no_grad():
+        return torch.stack(
+            [net(x, torch.tensor(t), encoder_hidden_states=text).sample for t in timesteps]
+        )
+
+
+class Kept(AttnProcessor2_0):
+    """diffusers' own processor, which keeps what it returns."""
+
+    def __init__(self):
+        super().__init__()
+        self.outputs = []
+
+    def __call__(self, *args, **kwargs):
+        self.outputs.append(super().__call__(*args, **kwargs))
+        return self.outputs[-1]
+
+
+def test_layers_of_stable_diffusion_are_the_papers_twelve_and_take_the_memory_that_it_takes():
+    with torch.device("meta"):
+        net = UNet2DConditionModel(
+            cross_attention_dim=768, attention_head_dim=8
+        )  # the defaults are SD 1.5's
+    layers = choose_layers(net)
+    assert len(layers) == 12
+    assert {layer.name.split(".")[1] for layer in layers} == {"2", "3"}
+    assert {layer.size((64, 64)) for layer in layers} == {(64, 64), (32, 32)}
+    # 6 layers of 320 channels at 64 x 64 and 6 of 640 at 32 x 32; two branches in half precision for 20 steps.
+    plan = RecordingPlan(
+        layers, (64, 64), PIX2PIX_BRANCHES, ("text", "image"), 20, dtype=torch.float16
+    )
+    assert plan.bytes == 6 * (64 * 64 * 320 + 32 * 32 * 640) * 2 * 2 * 20
+    assert "12 layers, 2 branches (text, image), 20 steps in float16: 900.0 MiB" in str(plan)
+
+
+def test_layers_are_found_by_fraction_kind_and_block():
+    net = unet()
+    assert {layer.kind for layer in choose_layers(net, kinds=("cross",))} == {"cross"}
+    assert {layer.level for layer in choose_layers(net, fractions=(0.5,))} == {1}
+    everything = choose_layers(net, fractions=(1, 0.5), blocks=("down", "mid", "up"))
+    assert everything == all_layers(net)
+    assert len(everything) == len(net.attn_processors)
+    with pytest.raises(
+        ValueError, match=r"fractions: no self or cross attention at \(0.25,\).*up at 0.5"
+    ):
+        choose_layers(net, fractions=(0.25,))
+    with pytest.raises(ValueError, match="did you mean 'cross'"):
+        choose_layers(net, kinds=("crss",))
+
+
+@pytest.mark.parametrize("size", [(6, 8), (5, 7), (8, 8)])
+def test_a_recording_holds_what_the_processors_return(size):
+    net = unet(8)
+    plan = plan_of(net, size=size)
+    with record(net, plan) as recording:
+        run(net, size=size)
+    processors = {name: Kept() for name in net.attn_processors}
+    net.set_attn_processor(dict(processors))
+    run(net, size=size)
+    for layer in plan.layers:
+        outputs = processors[f"{layer.name}.processor"].outputs
+        h, w = layer.size(size)
+        assert outputs[0].shape == (3, h * w, layer.channels)
+        for step, timestep in enumerate((981.0, 481.0)):
+            for branch, row in (("text", 0), ("image", 1)):
+                assert torch.equal(
+                    recording.features(timestep, layer, branch), outputs[step][row : row + 1]
+                )
+    assert recording.timesteps == [981.0, 481.0]
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_recording_changes_no_bit_and_leaves_no_hook(rows):
+    net = unet(8)
+    branches = PIX2PIX_BRANCHES[:rows]
+    before = run(net, rows=rows)
+    with record(net, plan_of(net, branches=branches, keep=("text",))) as recording:
+        during = run(net, rows=rows)
+    assert torch.equal(before, during)
+    assert recording.bytes > 0
+    bytes_then = recording.bytes
+    assert torch.equal(before, run(net, rows=rows))
+    assert recording.bytes == bytes_then
+
+
+@pytest.mark.parametrize("pipeline", ["pix2pix", "controlnet"])
+def test_recording_changes_no_bit_of_diffusers_own_pipelines(pipeline):
+    pipe = pix2pix() if pipeline == "pix2pix" else controlnet()
+    branches, keep = (
+        (PIX2PIX_BRANCHES, ("text", "image"))
+        if pipeline == "pix2pix"
+        else (CONTROLNET_BRANCHES, CONTROLNET_BRANCHES)
+    )
+    picture = torch.rand((1, 3, 16, 24), generator=torch.Generator().manual_seed(4))
+    more = {} if pipeline == "pix2pix" else {"height": 16, "width": 24}
+
+    def images():
+        return pipe(
+            "bear", image=picture, num_inference_steps=3, output_type="np", generator=torch.Generator().manual_seed(5), **more
+        ).images  # fmt: skip
+
+    before = images()
+    plan = plan_of(pipe.unet, size=(8, 12), branches=branches, keep=keep, steps=3)
+    with record(pipe.unet, plan) as recording:
+        assert np.array_equal(before, images())
+    assert len(recording.timesteps) == 3
+    with inject(pipe.unet, recording, branches=branches, weight=constant(1.0)):
+        assert np.array_equal(before, images())
+
+
+def camera(width=48, height=36, x=0.0):
+    K = np.array([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    return Camera(K, pose, width, height)
+
+
+def between(source, target, depth=2.0):
+    """Two views of a wall; with one camera, the identity."""
+    surface = Surface(torch.full((target.height, target.width), depth, dtype=torch.float64))
+    return warp_surfaces(
+        source,
+        target,
+        surface,
+        surface,
+        WarpSettings(opaque=None, normal_test="none", depth_agreement=False),
+    )
+
+
+def test_a_views_own_features_at_full_weight_with_the_identity_change_no_bit():
+    net = unet(8)
+    plain = run(net)
+    with record(net, plan_of(net)) as recording:
+        run(net)
+    identity = between(camera(), camera())
+    for warp in (None, identity):
+        with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=(warp,), weight=constant(1.0)):
+            assert torch.equal(plain, run(net))
+        # Another run's features do change it, or the test above would show nothing.
+        with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=(warp,), weight=constant(1.0)):
+            assert not torch.equal(run(net, seed=1), plain)
+
+
+def test_weight_zero_changes_no_bit():
+    net = unet(8)
+    with record(net, plan_of(net)) as recording:
+        run(net)
+    other = run(net, seed=1)
+    with inject(net, recording, branches=PIX2PIX_BRANCHES, weight=constant(0.0)):
+        assert torch.equal(other, run(net, seed=1))
+
+
+def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
+    net = unet(8)
+    plan = plan_of(net, steps=1)
+    with record(net, plan) as recording:
+        run(net, timesteps=(500,))
+    source, target = camera(), camera(x=0.3)
+    view = between(source, target)
+    region = torch.zeros((36, 48), dtype=torch.bool)
+    region[:, :30] = True
+    first = plan.layers[0]  # its own features hold nothing injected before it
+    own, blended = {}, {}
+
+    def keep(into):
+        return lambda layer, features, call: into.__setitem__(layer.name, features.clone())
+
+    with hooked(net, [first], keep(own)):
+        run(net, seed=1, timesteps=(500,))
+    with inject(
+        net, recording, branches=PIX2PIX_BRANCHES, warps=(view,), weight=constant(0.7), mask=region, layers=[first]
+    ), hooked(net, [first], keep(blended)):  # fmt: skip
+        run(net, seed=1, timesteps=(500,))
+    h, w = first.size(SIZE)
+    new, got = own[first.name].double(), blended[first.name].double()
+    shift = (
+        40 / 2 * 0.3 * w / 48
+    )  # f / z * baseline, in cells: where the target's point lies in the source
+    for row, branch in ((0, "text"), (1, "image")):
+        recorded = recording.features(500.0, first, branch)[0].double().reshape(h, w, -1)
+        for y in range(h):
+            for x in range(w):
+                u = x + 0.5 + shift
+                inside = u < w and (x + 0.5) * 48 / w < 30
+                u = min(u, w - 0.5)
+                low = int(np.floor(u - 0.5))
+                part = u - 0.5 - low
+                high = min(low + 1, w - 1)
+                warped = (1 - part) * recorded[y, low] + part * recorded[y, high]
+                mine = new[row, y * w + x]
+                expected = 0.7 * warped + 0.3 * mine if inside else mine
+                assert torch.allclose(got[row, y * w + x], expected, rtol=0, atol=1e-5), (
+                    branch,
+                    y,
+                    x,
+                )
+    assert torch.equal(own[first.name][2], blended[first.name][2])  # the unconditional branch
+
+
+def test_one_source_serves_several_views_each_with_its_own_warp():
+    net = unet(8)
+    with record(net, plan_of(net)) as recording:
+        run(net)
+    views = (between(camera(), camera(x=0.3)), None)
+    with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=views, weight=constant(0.5)):
+        together = run(net, rows=6, seed=2)
+    # Rows of a batch do not mix, so each view alone gives the same up to the order of sums.
+    x = torch.Generator().manual_seed(2)
+    sample = torch.randn((6, 8, *SIZE), generator=x)
+    text = torch.randn((6, 5, 32), generator=x)
+    for k, view in enumerate(views):
+        rows = [k, 2 + k, 4 + k]
+        with (
+            torch.no_grad(),
+            inject(net, recording, branches=PIX2PIX_BRANCHES, warps=(view,), weight=constant(0.5)),
+        ):
+            alone = torch.stack(
+                [net(sample[rows], torch.tensor(t), text[rows]).sample for t in (981, 481)]
+            )
+        assert torch.allclose(together[:, rows], alone, rtol=0, atol=1e-5)
+
+
+def test_the_weight_falls_as_the_paper_says():
+    weights = [decay(0.9)(step, 20) for step in range(20)]
+    assert weights == pytest.approx(np.linspace(0.9, 0, 20, endpoint=False))
+    with pytest.raises(ValueError, match="a0: got 1.5"):
+        decay(1.5)
+
+
+@pytest.mark.parametrize(
+    ("store", "dtype"), [("device", torch.float32), ("cpu", torch.float16), ("disk", torch.float16)]
+)
+def test_the_memory_is_what_was_announced_and_features_come_back_from_where_they_lie(
+    store, dtype, tmp_path
+):
+    net = unet(8)
+    plan = plan_of(
+        net, size=(16, 24), dtype=dtype, store=tmp_path / "features" if store == "disk" else store
+    )
+    said = []
+    with record(net, plan, announce=said.append) as recording:
+        assert len(said) == 1  # before anything ran
+        run(net, size=(16, 24))
+    assert said == [str(plan)]
+    assert recording.bytes == pytest.approx(plan.bytes, rel=0.1)  # files have headers
+    with record(net, plan_of(net, size=(16, 24))) as full:
+        run(net, size=(16, 24))
+    for layer in plan.layers:
+        stored = recording.features(981.0, layer, "image")
+        assert stored.dtype == dtype
+        assert torch.equal(stored, full.features(981.0, layer, "image").to(dtype))
+    if store == "disk":
+        assert len(list((tmp_path / "features").iterdir())) == 2 * len(plan.layers)
+
+
+def test_what_does_not_match_the_recording_is_refused_by_name():
+    net = unet(8)
+    with record(net, plan_of(net)) as recording:
+        run(net)
+
+    def again(**how):
+        told = {"branches": PIX2PIX_BRANCHES, **how}
+        passes = told.pop("passes", {})
+        with inject(net, recording, **told):
+            run(net, **passes)
+
+    with pytest.raises(ValueError, match="timestep: got 980, recorded are 981, 481"):
+        again(passes={"timesteps": (980,)})
+    with pytest.raises(
+        ValueError, match="branches: 'image' was recorded, the batch has uncond, text"
+    ):
+        again(branches=CONTROLNET_BRANCHES)
+    with pytest.raises(ValueError, match=r"batch: got 2 rows, expected 3: 1 views in 3 branches"):
+        again(passes={"rows": 2})
+    with pytest.raises(
+        ValueError, match=r"size: the recording has \(3, 4\) features, the target \(4, 4\)"
+    ):
+        again(passes={"size": (8, 8)})
+    with pytest.raises(ValueError, match="layers: elsewhere was not recorded"):
+        again(layers=[Layer("elsewhere", "self", 0, 16)])
+    with pytest.raises(ValueError, match=r"mask: got torch.float32 \(2, 2\)"):
+        again(mask=torch.ones(2, 2))
+    with pytest.raises(ValueError, match=r"weight: got 1.2"):
+        again(weight=lambda step, steps: 1.2)
+    with (
+        pytest.raises(ValueError, match=r"latent_size: got latents of \(8, 8\), planned \(6, 8\)"),
+        record(net, plan_of(net)),
+    ):
+        run(net, size=(8, 8))
+    with pytest.raises(ValueError, match="batch: got 2 rows, planned 3"), record(net, plan_of(net)):
+        run(net, rows=2)
+    with (
+        pytest.raises(ValueError, match="steps: timestep 481 is one more than the 1 planned"),
+        record(net, plan_of(net, steps=1)),
+    ):
+        run(net)
+    with pytest.raises(ValueError, match="timestep: 981 came twice"), record(net, plan_of(net)):
+        run(net, timesteps=(981, 981))
+    with pytest.raises(ValueError, match="keep: got 'control'"):
+        plan_of(net, keep=("control",))
+    with pytest.raises(ValueError, match="branch: got 'uncond'"):
+        recording.features(981.0, recording.plan.layers[0], "uncond")

@@ -1,0 +1,116 @@
+"""The command as a person runs it, on a small random editor in a folder."""
+
+import cv2
+import numpy as np
+import pytest
+from tiny_editors import pix2pix
+from typer.testing import CliRunner
+
+from attnwarp.cli import app
+from attnwarp.editing.editor import edit
+from attnwarp.editing.small import load_editor
+
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("editor")
+    pix2pix().save_pretrained(place)
+    return place
+
+
+@pytest.fixture
+def photo(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 64, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), pixels[..., ::-1])
+    return tmp_path / "photo.png", pixels
+
+
+def run(*args):
+    return runner.invoke(app, ["edit-image", *map(str, args)])
+
+
+def test_it_writes_what_the_library_gives_and_a_sheet_of_the_steps(folder, photo, tmp_path):
+    path, pixels = photo
+    out, sheet = tmp_path / "new" / "red.png", tmp_path / "sheet.png"
+    result = run(
+        path, "--instruction", "a bear", "--editor", folder, "--out", out, "--sheet", sheet, "--steps", 3, "--size", 64, "--seed", 4,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    expected = edit(
+        load_editor(str(folder)), [pixels.astype(np.float32) / 255], "a bear", steps=3, seed=4
+    ).images[0]
+    written = cv2.imread(str(out))[..., ::-1]
+    assert np.array_equal(written, np.rint(255 * expected).astype(np.uint8))
+    tiles = cv2.imread(str(sheet))[..., ::-1]
+    assert tiles.shape == (40, 5 * 64, 3)  # before, 3 steps, and a blank
+    assert np.array_equal(tiles[:, :64], pixels)
+    assert np.array_equal(tiles[:, 3 * 64 : 4 * 64], written)
+    assert (tiles[:, 4 * 64 :] == 255).all()
+
+
+def test_the_picture_is_worked_on_at_the_size_asked_for(folder, photo, tmp_path):
+    out = tmp_path / "small.png"
+    result = run(
+        photo[0],
+        "--instruction",
+        "a bear",
+        "--editor",
+        folder,
+        "--out",
+        out,
+        "--steps",
+        1,
+        "--size",
+        48,
+    )
+    assert result.exit_code == 0, result.output
+    assert cv2.imread(str(out)).shape == (32, 48, 3)  # 30 px rounded to a multiple of 8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"picture": "nowhere.png"}, "nowhere.png: no such file; expected a PNG or JPEG picture"),
+        ({"picture": "text.png"}, "text.png: cannot be read as a picture"),
+        ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
+        ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_line(change, message, folder, photo, tmp_path):
+    (tmp_path / "text.png").write_text("no picture")
+    picture = tmp_path / change["picture"] if "picture" in change else photo[0]
+    result = run(
+        picture, "--instruction", "a bear", "--editor", change.get("editor", folder), "--out", tmp_path / change.get("out", "a.png"),
+    )  # fmt: skip
+    assert result.exit_code == 2
+    assert message in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_missing_extra_is_one_clear_line(folder, photo, tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "diffusers", None)
+    result = run(
+        photo[0], "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "a.png"
+    )
+    assert result.exit_code == 2
+    assert (
+        "editors need diffusers, which is not installed: pip install 'attnwarp[edit]'"
+        in result.output
+    )
+
+
+def test_help_imports_nothing_heavy():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; from typer.testing import CliRunner; from attnwarp.cli import app;"
+        "assert CliRunner().invoke(app, ['edit-image', '--help']).exit_code == 0;"
+        "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

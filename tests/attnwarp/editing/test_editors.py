@@ -1,0 +1,251 @@
+"""Oracle: diffusers' own pipelines on the same small random models, latents and noise."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from diffusers import DDIMScheduler
+from tiny_editors import controlnet, pix2pix
+
+from attnwarp.editing.attention import (
+    CONTROLNET_BRANCHES,
+    RecordingPlan,
+    choose_layers,
+    constant,
+    inject,
+    record,
+)
+from attnwarp.editing.controlnet import DepthControlNet, control_image
+from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.folder import load_parts
+from attnwarp.editing.pix2pix import InstructPix2Pix
+from attnwarp.editing.schedule import Schedule, following, steps_from
+from attnwarp.errors import InputError
+
+H, W = 16, 24
+
+
+def picture(seed=3):
+    return np.random.default_rng(seed).uniform(size=(H, W, 3)).astype(np.float32)
+
+
+def depth_map():
+    return 1 + np.random.default_rng(4).uniform(size=(H, W))
+
+
+def editor_of(pipe, **settings):
+    parts = {k: getattr(pipe, k) for k in ("unet", "vae", "text_encoder", "tokenizer", "scheduler")}
+    if hasattr(pipe, "controlnet"):
+        return DepthControlNet(**parts, controlnet=pipe.controlnet, **settings)
+    return InstructPix2Pix(**parts, **settings)
+
+
+def tensor(image):
+    return torch.from_numpy(image).permute(2, 0, 1)[None]
+
+
+SCHEDULES = {
+    "leading": {},
+    "trailing, zero SNR, predicts the picture": {
+        "timestep_spacing": "trailing", "rescale_betas_zero_snr": True, "prediction_type": "sample", "set_alpha_to_one": True,
+    },
+    "trailing, v": {"timestep_spacing": "trailing", "prediction_type": "v_prediction", "set_alpha_to_one": True},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize(("text", "image"), [(7.5, 1.5), (1.5, 1.0)])
+def test_the_loop_gives_what_diffusers_instruct_pix2pix_gives(schedule, text, image):
+    pipe = pix2pix()
+    pipe.scheduler = DDIMScheduler.from_config(pipe.scheduler.config, **SCHEDULES[schedule])
+    noise = torch.randn((1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8))
+    theirs = pipe(
+        "a bear", image=tensor(picture()), num_inference_steps=5, guidance_scale=text, image_guidance_scale=image,
+        latents=noise, output_type="np",
+    ).images[0]  # fmt: skip
+    ours = edit(
+        editor_of(pipe, text_guidance=text, image_guidance=image),
+        [picture()],
+        "a bear",
+        steps=5,
+        noise=noise,
+    )
+    assert np.abs(ours.images[0] - theirs).max() < 1e-5
+    assert theirs.std() > 0.01
+
+
+@pytest.mark.parametrize(("guidance", "scale"), [(5.0, 1.0), (1.0, 0.7)])
+def test_the_loop_gives_what_diffusers_controlnet_gives(guidance, scale):
+    pipe = controlnet()
+    noise = torch.randn((1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8))
+    theirs = pipe(
+        "a bear", image=tensor(control_image(depth_map())), num_inference_steps=5, guidance_scale=guidance,
+        controlnet_conditioning_scale=scale, negative_prompt="blurred", latents=noise, output_type="np", height=H, width=W,
+    ).images[0]  # fmt: skip
+    editor = editor_of(pipe, guidance=guidance, control_scale=scale, negative_prompt="blurred")
+    ours = edit(editor, [depth_map()], "a bear", steps=5, noise=noise)
+    assert np.abs(ours.images[0] - theirs).max() < 1e-5
+    blind = edit(editor, [depth_map().T.reshape(H, W)], "a bear", steps=5, noise=noise)
+    assert np.abs(blind.images[0] - theirs).max() > 1e-4  # the depth map counts
+
+
+def test_views_edited_together_start_from_one_noise_and_come_out_as_each_alone():
+    editor = editor_of(pix2pix())
+    views = [picture(1), picture(2)]
+    together = edit(editor, views, "a bear", steps=3, seed=5)
+    noise = shared_noise((2, 4, H // 2, W // 2), 5)
+    assert torch.equal(noise[0], noise[1])
+    for view, image in zip(views, together.images, strict=True):
+        alone = edit(editor, [view], "a bear", steps=3, seed=5).images[0]
+        assert np.abs(alone - image).max() < 1e-5
+
+
+def test_a_start_at_t_begins_at_the_views_noised_latents():
+    editor = editor_of(pix2pix())
+    seen = []
+    result = edit(
+        editor,
+        [picture()],
+        "a bear",
+        steps=4,
+        start=700,
+        watch=lambda step, steps, x: seen.append((step, steps)),
+    )
+    assert result.timesteps == [700, 525, 349, 174]
+    assert seen == [(k, 4) for k in range(4)]
+    # The first step by hand, in diffusers' own words.
+    task = editor.task([picture()], "a bear")
+    x0 = (
+        editor.vae.encode(2 * tensor(picture()) - 1).latent_dist.mode()
+        * editor.vae.config.scaling_factor
+    )
+    noise = shared_noise(task.shape, 0)
+    scheduler = editor.scheduler
+    x = scheduler.add_noise(x0, noise, torch.tensor([700]))
+    for now, then in following(result.timesteps):
+        a = scheduler.alphas_cumprod[now]
+        after = scheduler.final_alpha_cumprod if then is None else scheduler.alphas_cumprod[then]
+        e = task.predict(x, now)
+        x = after.sqrt() * (x - (1 - a).sqrt() * e) / a.sqrt() + (1 - after).sqrt() * e
+    assert torch.allclose(x, result.latents, rtol=0, atol=1e-5)
+
+
+def test_steps_from_the_last_are_diffusers_trailing_ones():
+    scheduler = DDIMScheduler(timestep_spacing="trailing")
+    for steps in (1, 4, 7, 20, 50):
+        scheduler.set_timesteps(steps)
+        assert steps_from(999, steps) == scheduler.timesteps.tolist()
+    with pytest.raises(ValueError, match="start, steps: got 3, 20"):
+        steps_from(3, 20)
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
+def test_a_step_is_diffusers_step(prediction):
+    scheduler = DDIMScheduler(
+        prediction_type=prediction, clip_sample=False, timestep_spacing="trailing"
+    )
+    scheduler.set_timesteps(10)
+    schedule = Schedule.of(scheduler)
+    generator = torch.Generator().manual_seed(0)
+    x, output = (torch.randn((2, 4, 3, 3), generator=generator) for _ in range(2))
+    for now, then in following(scheduler.timesteps.tolist()):
+        theirs = scheduler.step(output, now, x).prev_sample
+        assert torch.allclose(schedule.step(output, x, now, then), theirs, rtol=0, atol=1e-5)
+
+
+def test_a_recorded_edit_injected_into_itself_changes_no_bit_with_every_editor():
+    for pipe, guide in ((pix2pix(), picture()), (controlnet(), depth_map())):
+        editor = editor_of(pipe)
+        branches = editor.task([guide], "a bear").branches
+        keep = CONTROLNET_BRANCHES if branches == CONTROLNET_BRANCHES else ("text", "image")
+        plan = RecordingPlan(choose_layers(pipe.unet), (H // 2, W // 2), branches, keep, 3)
+        plain = edit(editor, [guide], "a bear", steps=3).latents
+        with record(pipe.unet, plan) as recording:
+            assert torch.equal(edit(editor, [guide], "a bear", steps=3).latents, plain)
+        with inject(pipe.unet, recording, branches=branches, weight=constant(1.0)):
+            assert torch.equal(edit(editor, [guide], "a bear", steps=3).latents, plain)
+        with (
+            pytest.raises(ValueError, match="timestep: got"),
+            inject(pipe.unet, recording, branches=branches),
+        ):
+            edit(editor, [guide], "a bear", steps=4)
+
+
+def test_what_does_not_fit_is_refused_by_name():
+    editor = editor_of(pix2pix())
+    with pytest.raises(
+        ValueError,
+        match="guides: got 23 x 16 px, expected sides that are multiples of 2; resize or crop to 22 x 16",
+    ):
+        edit(editor, [picture()[:, :-1]], "a bear")
+    with pytest.raises(ValueError, match="guides: got none"):
+        edit(editor, [], "a bear")
+    with pytest.raises(ValueError, match="guides: got values to 255"):
+        edit(editor, [255 * np.ones((H, W, 3), np.float32)], "a bear")
+    with pytest.raises(ValueError, match="expected one size"):
+        edit(editor, [picture(), picture()[:8]], "a bear")
+    with pytest.raises(
+        ValueError, match=r"noise: got shape \(1, 4, 2, 2\), expected \(1, 4, 8, 12\)"
+    ):
+        edit(editor, [picture()], "a bear", noise=torch.zeros(1, 4, 2, 2))
+    with pytest.raises(ValueError, match="has .* tokens, the text encoder takes 24; shorten it"):
+        edit(editor, [picture()], "a bear " * 30)
+    with pytest.raises(ValueError, match="depth: got -1"):
+        control_image(np.array([[1.0, -1.0]]))
+    pipe = controlnet()
+    plain = InstructPix2Pix(pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler)
+    with pytest.raises(ValueError, match="unet: takes 4 channels, expected 8"):
+        plain.task([picture()], "a bear")
+
+
+def test_editors_are_read_from_folders_in_diffusers_format(tmp_path):
+    for pipe, kind, guide in (
+        (pix2pix(), InstructPix2Pix, picture()), (controlnet(), DepthControlNet, depth_map()),
+    ):  # fmt: skip
+        folder = tmp_path / kind.__name__
+        pipe.save_pretrained(folder)
+        loaded = edit(kind.from_folder(folder), [guide], "a bear", steps=2)
+        assert np.array_equal(
+            loaded.images[0], edit(editor_of(pipe), [guide], "a bear", steps=2).images[0]
+        )
+
+
+@pytest.mark.parametrize(
+    ("lost", "message"),
+    [
+        (
+            "unet/diffusion_pytorch_model.safetensors",
+            "lacks unet/diffusion_pytorch_model.safetensors",
+        ),
+        ("vae/config.json", "lacks vae/config.json"),
+        ("text_encoder/model.safetensors", "lacks text_encoder/model.safetensors"),
+        ("scheduler/scheduler_config.json", "lacks scheduler/scheduler_config.json"),
+        ("controlnet/config.json", "lacks controlnet/config.json"),
+    ],
+)
+def test_a_missing_file_is_named(lost, message, tmp_path):
+    controlnet().save_pretrained(tmp_path)
+    (tmp_path / lost).unlink()
+    with pytest.raises(InputError, match=re.escape(message)):
+        DepthControlNet.from_folder(tmp_path)
+
+
+def test_weights_that_lack_a_tensor_are_refused_and_not_filled_with_random_numbers(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    pix2pix().save_pretrained(tmp_path)
+    path = tmp_path / "unet" / "diffusion_pytorch_model.safetensors"
+    weights = load_file(path)
+    del weights["conv_out.weight"]
+    save_file(weights, path, metadata={"format": "pt"})
+    with pytest.raises(InputError, match="its weights lack conv_out.weight"):
+        load_parts(tmp_path, dtype=torch.float32)
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        load_parts(tmp_path / "nowhere", dtype=torch.float32)
+    assert (
+        json.loads((Path(tmp_path) / "model_index.json").read_text())["unet"][1]
+        == "UNet2DConditionModel"
+    )
