@@ -87,7 +87,8 @@ def _splats(inputs: Inputs) -> layout.Splats:
     # Kernels are compiled for both types, but not for all mixtures.
     dtype = np.float32 if all(part.dtype == torch.float32 for part in parts) else np.float64
     values = as_array(inputs.values.flatten(1), np.float32)
-    return layout.Splats(*(as_array(part, dtype) for part in parts), values)
+    means, quats, scales, opacities = (as_array(part, dtype) for part in parts)
+    return layout.Splats(means, quats, scales, opacities, values)
 
 
 class BinnedSplats:
