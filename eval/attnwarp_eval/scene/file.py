@@ -131,7 +131,7 @@ def _explain(problem: Any) -> str:
             f" {', '.join(allowed)}"
         )
     if kind == "union_tag_not_found":
-        return f"{place}: says no type; add 'type: ...' (docs/scenes.md lists the types)"
+        return f"{place}: says no type; add 'type: ...' (docs/shapes.md lists the types)"
     message = problem["msg"].removeprefix("Value error, ")
     if not message.startswith("got "):
         message = f"got {reprlib.repr(came)}, but {message[0].lower() + message[1:]}"
