@@ -90,14 +90,25 @@ def load_controlnet(folder: Path, *, device: str = "cpu", dtype: torch.dtype) ->
 
 
 def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
+    from transformers import PreTrainedModel
+    from transformers.utils import logging
+
+    # Its bar of a second's loading would stand among a command's own lines.
+    bars = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
+    how = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     try:
         # Quietly filling what a file lacks with random numbers would look like a bad editor.
         loaded = kind.from_pretrained(
-            folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True
+            folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
         )
     except (OSError, ValueError, RuntimeError) as error:
         first = str(error).strip().splitlines()[0]
         raise InputError(f"{folder}: cannot be read ({first}); fetch the model again") from None
+    finally:
+        if bars:
+            logging.enable_progress_bar()
     network, report = loaded
     if report["missing_keys"]:
         lost = sorted(report["missing_keys"])
