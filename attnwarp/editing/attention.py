@@ -452,33 +452,36 @@ def inject(
             for view, warp in enumerate(warps):
                 row = list(branches).index(branch) * views + view
                 own = source[view if plan.views > 1 else 0]
-                moved, allowed = _moved(warp, own, source_size, size)
+                new = features[row]
+                blended = _blended(warp, own, new, alpha, source_size, size)
                 if mask is not None:
-                    allowed = allowed & resize_mask(mask.cpu(), size).reshape(-1)
-                mixed = alpha * moved + (1 - alpha) * features[row]
-                keep = allowed.to(features.device)[:, None]
-                result[row] = torch.where(keep, mixed, features[row])
+                    inside = resize_mask(mask.cpu(), size).reshape(-1, 1).to(features.device)
+                    blended = torch.where(inside, blended, new)
+                result[row] = blended
         return result
 
     with hooked(unet, chosen, blend):
         yield
 
 
-def _moved(
-    warp: LayerWarp | None, tokens: Tensor, source_size: Size, size: Size
-) -> tuple[Tensor, Tensor]:
-    """(H W, C) tokens on the target's grid, and (H W,) where they count."""
+def _blended(
+    warp: LayerWarp | None,
+    source: Tensor,  # (h w, C)
+    new: Tensor,  # (H W, C)
+    alpha: float,
+    source_size: Size,
+    size: Size,
+) -> Tensor:
+    """(H W, C) source tokens, warped and blended into the target's own; None is the identity."""
     if warp is None:
         if source_size != size:
             raise ValueError(
                 f"size: the recording has {source_size} features, the target {size}; give a warp"
                 " between views of different sizes"
             )
-        return tokens, torch.ones(len(tokens), dtype=torch.bool)
-    step = warp.at(size, source_size=source_size)
-    grid = tokens.T.reshape(1, -1, *source_size)
-    warped = step.warp(grid)[0].reshape(tokens.shape[1], -1).T
-    return warped.to(tokens), step.mask.reshape(-1)
+        return alpha * source + (1 - alpha) * new
+    layer = warp.at(size, source_size=source_size)
+    return layer.blend_tokens(source[None], new[None], alpha)[0]
 
 
 def _check_call(plan: RecordingPlan, call: Call, rows: int) -> None:

@@ -36,7 +36,7 @@ def triangulate(vertices: Array, corners: Indices, sizes: Indices) -> tuple[Indi
         >>> arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0.0]])  # concave at the last
         >>> faces, _ = triangulate(arrow, np.arange(4), np.array([4]))
         >>> faces.tolist()
-        [[3, 0, 1], [1, 2, 3]]
+        [[3, 0, 1], [3, 1, 2]]
     """
     first = np.concatenate([[0], np.cumsum(sizes)])
     row = np.concatenate([[0], np.cumsum(sizes - 2)])
