@@ -90,6 +90,26 @@ def test_a_truncated_record_is_refused(tmp_path):
         store.read(record()["id"])
 
 
+@pytest.mark.parametrize("text", ["[]", "null", "NaN", '{"x": NaN}', '{"x": 1e999}', "[" * 10**5])
+def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_path, text):
+    store = Store(tmp_path)
+    store.write(record())
+    whole = store.path(record()["id"]).read_bytes()
+    store.path(record()["id"]).write_text(text)
+    with pytest.raises(StoreError, match="run again, which computes it anew") as caught:
+        store.read(record()["id"])
+    assert "\n" not in str(caught.value)
+    assert store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})["summary"] == {"x": 1.5}
+    assert store.path(record()["id"]).read_bytes() == whole
+
+
+def test_a_sealed_record_that_its_probe_cannot_read_is_refused_in_one_line(tmp_path):
+    store = Store(tmp_path)
+    store.write(record())
+    with pytest.raises(StoreError, match=r"not a record of its probe \(KeyError: 'views'\)"):
+        store.read_as(record()["id"], lambda data: data["views"])
+
+
 def test_verify_names_missing_failed_damaged_and_unexpected_cells(tmp_path):
     store = Store(tmp_path)
     picture = tmp_path / "pictures" / "a.png"
