@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+
 import typer
 
 from attnwarp_eval.cli import cache, inspect, metrics, run, scenes
-from attnwarp_eval.cli.shell import CRASH, USAGE
+from attnwarp_eval.cli.shell import (
+    CLOSED_PIPE,
+    CRASH,
+    REGRESSION,
+    USAGE,
+    closed_pipe,
+    fail,
+    file_error,
+)
 
 app = typer.Typer(
     name="attnwarp-eval",
@@ -15,7 +25,7 @@ app = typer.Typer(
     ),
     epilog=(
         "Exit codes: 0 pass, 1 regression, 2 wrong usage or input, 3 nothing or too little was"
-        " measured; 130 interrupted."
+        " measured; 130 interrupted by Ctrl-C or kill, 141 output pipe closed."
     ),
     no_args_is_help=True,
     add_completion=False,
@@ -42,7 +52,18 @@ def main() -> None:
     from attnwarp.errors import missing_extra
 
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        sys.exit(closed_pipe().exit_code)
+    except OSError as error:  # output that cannot be written
+        closed_pipe()
+        sys.exit(fail(file_error(error)).exit_code)
+    except SystemExit as done:
+        # Typer's own code for a closed pipe is that of a regression, which no command gives yet.
+        sys.exit(CLOSED_PIPE if done.code == REGRESSION else done.code)
     except Exception as error:
         explained = missing_extra(error) if isinstance(error, ImportError) else None
         if explained is not None:

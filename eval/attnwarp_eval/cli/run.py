@@ -148,6 +148,11 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
             " them",
             TOO_LITTLE,
         )
+    if not problems.sealed:
+        typer.echo(
+            f"not sealed: {run / 'study.json'} has no checksum, as former code wrote it; run the"
+            " study again to seal it"
+        )
     typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -13,10 +16,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
 
-PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH, INTERRUPTED = 0, 1, 2, 3, 70, 130
+PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 3, 70, 130, 141
 """Exit codes. 1 is reserved for a regression; an unusable input is 2. A run that measured too
 little, or with an instrument that is not calibrated, is 3. A fault of this program is 70, as in
-sysexits; an interrupt is 130, as in shells."""
+sysexits; Ctrl-C or a polite kill is 130, output that nobody reads 141, as in shells."""
 
 
 def fail(message: str, code: int = USAGE) -> typer.Exit:
@@ -34,26 +37,51 @@ def clear_errors() -> Iterator[None]:
         yield
     except InputError as error:
         raise fail(str(error)) from None
+    except KeyboardInterrupt:
+        raise fail("interrupted", INTERRUPTED) from None
+    except BrokenPipeError:
+        raise closed_pipe() from None
     except OSError as error:
-        path = f"{error.filename}: " if error.filename else ""
-        raise fail(
-            f"{path}{error.strerror or error}; check the path, the space on its disk and its"
-            " permissions"
-        ) from None
+        raise fail(file_error(error)) from None
+
+
+def file_error(error: OSError) -> str:
+    """An error of the file system, with the remedy."""
+    path = f"{error.filename}: " if error.filename else ""
+    return (
+        f"{path}{error.strerror or error}; check the path, the space on its disk and its"
+        " permissions"
+    )
+
+
+def closed_pipe() -> typer.Exit:
+    """Let what is still to be flushed go nowhere, as it cannot be written; raise what this
+    returns.
+    """
+    with suppress(OSError, ValueError):  # no real stream, as under a test's runner
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return typer.Exit(CLOSED_PIPE)
 
 
 @contextmanager
 def resumable(state: Callable[[], str]) -> Iterator[None]:
-    """Turn Ctrl-C into one clear line and exit code 130.
+    """Turn Ctrl-C or a polite kill into one clear line and exit code 130.
 
     Args:
         state: what is finished and stays, such as "3 cells are kept"; asked after the interrupt.
     """
+
+    def terminate(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    handler = signal.signal(signal.SIGTERM, terminate)
     try:
         yield
     except KeyboardInterrupt:
         message = f"interrupted; {state()}, the same command goes on from here"
         raise fail(message, INTERRUPTED) from None
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 def names(text: str | None) -> list[str] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Interval, front
 
 if TYPE_CHECKING:
@@ -61,9 +63,10 @@ def drawing(
             layout="constrained",
         )
         yield list(axes.flat)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, metadata={"Date": None, "Creator": None})
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
         plt.close(figure)
+        write_atomic(path, buffer.getvalue())
 
 
 @dataclass

@@ -53,6 +53,19 @@ def _embedder(root: Path):  # type: ignore[no-untyped-def]
     return embed
 
 
+def plain(text: str) -> str:
+    """Markdown text in which names cannot begin a tag, and code stays as it is.
+
+    >>> plain("fog < 2 px, `a<b`, <b>")
+    'fog < 2 px, `a<b`, &lt;b>'
+    """
+    return _TAG.sub(lambda match: match[1] or "&lt;", text)
+
+
+_TAG = re.compile(r"(`[^`]*`)|<(?=[A-Za-z/!?])")
+"""Code, in which nothing is a tag, or the beginning of one."""
+
+
 def terminal(table: Table) -> RichTable:
     """A table for a terminal; its cells are plain text, without markup."""
     from rich.table import Table as RichTable
@@ -73,6 +86,7 @@ def markdown(report: Report) -> str:
         undefined=StrictUndefined,
         autoescape=False,
     )
+    environment.filters["plain"] = plain
     text = environment.get_template("report.md.j2").render(report=report)
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 

@@ -10,7 +10,8 @@ from attnwarp_eval.document.write import markdown, page
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.results import lines, read_results
-from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.store import Store, StoreError
 
 __all__ = ["problems", "read_results", "write_report"]
 
@@ -27,8 +28,14 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
     Returns:
         The files written, the one a person opens first at the end.
+
+    Raises:
+        StoreError: the folder is no run, or a picture is not the one that was written.
     """
+    store.refuse_links()
     results = read_results(store)
+    if pictures:
+        _check_pictures(results, store)
     report = build(results, store.root, timings=timings, pictures=pictures)
     files = {
         "results.jsonl": "".join(f"{line}\n" for line in lines(results, timings)),
@@ -38,3 +45,11 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     for name, text in files.items():
         write_atomic(store.root / name, text.encode())
     return [store.root / name for name in files]
+
+
+def _check_pictures(results: Results, store: Store) -> None:
+    pictures = (p for cell in results.cells if cell.record for p in cell.record.pictures)
+    damaged = store.damaged_pictures(picture.to_json() for picture in pictures)
+    if damaged:
+        others = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
+        raise StoreError(f"{damaged[0]}{others}; --no-pictures writes the report without them")

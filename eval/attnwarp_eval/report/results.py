@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from attnwarp_eval.files import canonical_json
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.store import Store, StoreError
@@ -30,6 +30,14 @@ def read_results(store: Store) -> Results:
             f"{store.root / 'study.json'}: {explain(error)}; run the study again with --out"
             f" {store.root}, which writes it anew"
         ) from None
+    available = {p.name for p in probes()}
+    for cell in stored["cells"]:
+        if cell["probe"] not in available or cell["scene"] not in study.scenes:
+            raise StoreError(
+                f"{store.root / 'study.json'}: cell {cell['title']!r} names a probe or a scene"
+                f" that the study lacks; run the study again with --out {store.root}, which"
+                " writes it anew"
+            )
     done = store.done()
     failures = [Failure.from_json(failure) for failure in store.failures()]
     cells = []
@@ -37,7 +45,7 @@ def read_results(store: Store) -> Results:
         record: Record[Any] | None = None
         if cell["id"] in done:
             try:
-                record = probe(cell["probe"]).read(store.read(cell["id"]))
+                record = store.read_as(cell["id"], probe(cell["probe"]).read)
             except StoreError as error:
                 # One damaged file must not cost the report of the others.
                 failures.append(

@@ -80,7 +80,7 @@ def plan(study: Study, store: Store) -> Plan:
     for cell in cells:
         if cell.id in done:
             with contextlib.suppress(StoreError):  # a damaged record is computed again
-                record = probe(cell.probe).read(store.read(cell.id))
+                record = store.read_as(cell.id, probe(cell.probe).read)
                 if _has_pictures(cell, record, store):
                     finished[cell.id] = record
     this = Environment.from_json(environment())
@@ -89,12 +89,12 @@ def plan(study: Study, store: Store) -> Plan:
 
 
 def _has_pictures(cell: Cell, record: Record[Any], store: Store) -> bool:
-    """Whether the record's pictures exist, and those that the study wants are among them; pictures
-    are no part of a cell's id.
+    """Whether the record's pictures are whole, and those that the study wants are among them;
+    pictures are no part of a cell's id.
     """
     views = {p.view for p in record.pictures}
-    exist = all((store.root / p.path).is_file() for p in record.pictures)
-    return exist and set(cell.pictures) <= views
+    damaged = store.damaged_pictures(p.to_json() for p in record.pictures)
+    return not damaged and set(cell.pictures) <= views
 
 
 def verify(store: Store) -> Problems:
@@ -108,17 +108,32 @@ def verify(store: Store) -> Problems:
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
-        ids = {c.id for c in plan(study, store).cells}
+        cells = expected(plan(study, store))["cells"]
     except (InputError, ValidationError) as error:
         text = explain(error) if isinstance(error, ValidationError) else error
         problems.damaged.append(f"the study's cells cannot be listed again: {text}")
         return problems
-    if ids != {c["id"] for c in stored["cells"]}:
+    listed, today = (_labels(entries) for entries in (stored["cells"], cells))
+    if set(listed) != set(today):
         problems.damaged.append(
             "the study names other cells today: a scene or a protocol has changed since; run it"
             " again for the new ones"
         )
+    for cell_id in sorted(set(listed) & set(today)):
+        if listed[cell_id] != today[cell_id]:
+            problems.damaged.append(
+                f"{store.root / 'study.json'}: cell {cell_id} is called {listed[cell_id]}, but the"
+                f" study calls it {today[cell_id]}; run the study again with --out {store.root},"
+                " which writes it anew"
+            )
     return problems
+
+
+def _labels(cells: list[dict[str, Any]]) -> dict[str, Any]:
+    """By id, under which names figures appear. Their order follows that of the study's file, which
+    a run does not keep.
+    """
+    return {c["id"]: (c["scene"], c["probe"], c["seed"], sorted(c["variants"])) for c in cells}
 
 
 def expected(plan: Plan) -> dict[str, Any]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import remove_abandoned
@@ -18,6 +20,8 @@ from attnwarp_eval.files import digest, write_json
 
 FORMAT = 1
 """Version of the layout of a cell's file; a reader refuses others."""
+
+T = TypeVar("T")
 
 
 class StoreError(InputError):
@@ -33,6 +37,8 @@ class Problems:
     damaged: list[str] = field(default_factory=list)
     unexpected: list[str] = field(default_factory=list)
     checked: int = 0
+    sealed: bool = True
+    """Whether study.json carries a checksum; former code wrote none."""
 
     @property
     def ok(self) -> bool:
@@ -53,7 +59,16 @@ class Store:
     def lock(self) -> Iterator[None]:
         """Hold the folder against a second run that would write to it."""
         self.root.mkdir(parents=True, exist_ok=True)
-        with (self.root / ".lock").open("w") as file:
+        self.refuse_links()
+        path = self.root / ".lock"
+        try:
+            # Neither followed nor emptied: in a folder from elsewhere it may link to any file.
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        except OSError as error:
+            if error.errno != errno.ELOOP:
+                raise
+            raise StoreError(f"{path}: is a symbolic link, expected a file; delete it") from None
+        try:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -63,6 +78,21 @@ class Store:
                 ) from None
             self._sweep()
             yield
+        finally:
+            os.close(file)
+
+    def refuse_links(self) -> None:
+        """Check that what is written to the run's folder stays inside it.
+
+        Raises:
+            StoreError: one of its folders is a symbolic link.
+        """
+        for name in ("cells", "failed", "pictures", "figures", "fits"):
+            if (self.root / name).is_symlink():
+                raise StoreError(
+                    f"{self.root / name}: is a symbolic link, expected a folder; put the folder"
+                    " in its place"
+                )
 
     def _sweep(self) -> None:
         """Remove the temporary files of runs that were killed."""
@@ -70,14 +100,16 @@ class Store:
             remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
-        """Write the resolved study and its expected cells. Cells of a former study stay."""
-        write_json(self.root / "study.json", study)
+        """Write the resolved study and its expected cells with their checksum. Cells of a former
+        study stay.
+        """
+        write_json(self.root / "study.json", {**study, "sha256": digest(study)})
 
     def read_study(self) -> dict[str, Any]:
-        """The resolved study.
+        """The resolved study; without ``sha256`` where former code wrote it.
 
         Raises:
-            StoreError: the folder is not a run.
+            StoreError: the folder is not a run, or the file was changed since it was written.
         """
         path = self.root / "study.json"
         if not path.is_file():
@@ -86,14 +118,17 @@ class Store:
                 f"make one with: attnwarp-eval run quick --out {self.root}"
             )
         try:
-            study: dict[str, Any] = json.loads(path.read_text())
-            if "cells" in study:
-                return study
-        except (ValueError, AttributeError):
-            pass
-        raise StoreError(
-            f"{path}: damaged; run the study again with --out {self.root}, which writes it anew"
-        )
+            study = _read_object(path)
+        except ValueError as error:
+            problem: str | None = f"damaged ({error})"
+        else:
+            problem = _study_problem(study)
+        if problem:
+            raise StoreError(
+                f"{path}: {problem}; run the study again with --out {self.root}, which writes it"
+                " anew"
+            )
+        return study
 
     def path(self, cell_id: str) -> Path:
         """The path of a cell's record."""
@@ -126,7 +161,7 @@ class Store:
         for path in paths:
             if path.stem not in done:
                 with contextlib.suppress(ValueError):
-                    failures.append(json.loads(path.read_text()))
+                    failures.append({**_read_object(path), "id": path.stem})
         return failures
 
     def read(self, cell_id: str) -> dict[str, Any]:
@@ -137,15 +172,32 @@ class Store:
         """
         path = self.path(cell_id)
         try:
-            record: dict[str, Any] = json.loads(path.read_text())
+            record = _read_object(path)
         except FileNotFoundError:
             raise StoreError(f"{path}: no such cell") from None
         except ValueError as error:
-            raise StoreError(f"{path}: not JSON ({error}); delete it and run again") from None
+            raise StoreError(
+                f"{path}: not JSON ({error}); run again, which computes it anew"
+            ) from None
         problem = self._problem(cell_id, record)
         if problem:
-            raise StoreError(f"{path}: {problem}; delete it and run again")
+            raise StoreError(f"{path}: {problem}; run again, which computes it anew")
         return record
+
+    def read_as(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T:
+        """What ``read`` makes of the record of a finished cell.
+
+        Raises:
+            StoreError: as :meth:`read`, or the record is not one that ``read`` takes.
+        """
+        record = self.read(cell_id)
+        try:
+            return read(record)
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise StoreError(
+                f"{self.path(cell_id)}: not a record of its probe ({type(error).__name__}:"
+                f" {error}); run again, which computes it anew"
+            ) from None
 
     def resumed(
         self, spec: dict[str, Any], compute: Callable[[], dict[str, Any]]
@@ -163,7 +215,7 @@ class Store:
         if self.path(cell_id).is_file():
             with contextlib.suppress(StoreError):  # a damaged record is computed again
                 record = self.read(cell_id)
-                if not self._damaged_pictures(record):
+                if not self.damaged_pictures(record.get("pictures", [])):
                     return record
         self.write({"id": cell_id, "spec": spec, **compute()})
         return self.read(cell_id)
@@ -178,17 +230,18 @@ class Store:
     def _problem(self, cell_id: str, record: dict[str, Any]) -> str | None:
         if record.get("format") != FORMAT:
             return f"format {record.get('format')!r}, expected {FORMAT}"
-        if digest(record.get("spec")) != cell_id:
+        if _digest(record.get("spec")) != cell_id:
             return "the hash of its spec is not its id"
         body = {k: v for k, v in record.items() if k != "sha256"}
-        if digest(body) != record.get("sha256"):
+        if _digest(body) != record.get("sha256"):
             return "its checksum does not fit its content"
         return None
 
     def verify(self) -> Problems:
         """Recompute every hash and compare with the list of expected cells."""
-        expected = {c["id"]: c["title"] for c in self.read_study()["cells"]}
-        problems = Problems()
+        study = self.read_study()
+        expected = {c["id"]: c["title"] for c in study["cells"]}
+        problems = Problems(sealed="sha256" in study)
         done = self.done()
         failed = {f["id"]: f for f in self.failures()}
         for cell_id, title in expected.items():
@@ -199,7 +252,7 @@ class Store:
                 except StoreError as error:
                     problems.damaged.append(str(error))
                     continue
-                problems.damaged += self._damaged_pictures(record)
+                problems.damaged += self.damaged_pictures(record.get("pictures", []))
             elif cell_id in failed:
                 problems.failed.append(f"{title}: {failed[cell_id].get('error', 'failed')}")
             else:
@@ -207,15 +260,90 @@ class Store:
         problems.unexpected = sorted(done - set(expected))
         return problems
 
-    def _damaged_pictures(self, record: dict[str, Any]) -> list[str]:
+    def damaged_pictures(self, pictures: Iterable[Mapping[str, Any]]) -> list[str]:
+        """A line for each picture that is not the one that was written.
+
+        Args:
+            pictures: with ``path`` and ``sha256``, as a record has them.
+        """
+        remedy = f"run again with --out {self.root}, which makes it anew"
+        try:
+            named = [(picture["path"], picture["sha256"]) for picture in pictures]
+        except (LookupError, TypeError):
+            return [f"{self.root}: a record whose pictures have no path or checksum; {remedy}"]
         bad = []
-        for picture in record.get("pictures", []):
-            path = self.root / picture["path"]
-            if not path.is_file():
-                bad.append(f"{path}: missing; delete {self.path(record['id'])} and run again")
-            elif hashlib.sha256(path.read_bytes()).hexdigest() != picture["sha256"]:
-                bad.append(
-                    f"{path}: changed since it was written; delete {self.path(record['id'])} and"
-                    " run again"
-                )
+        for name, sha256 in named:
+            path = self.root / str(name)
+            if not self._is_inside(name):
+                bad.append(f"{name}: a picture outside the run's folder {self.root}; {remedy}")
+            elif not path.is_file():
+                bad.append(f"{path}: missing; {remedy}")
+            elif hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
+                bad.append(f"{path}: changed since it was written; {remedy}")
         return bad
+
+    def _is_inside(self, name: object) -> bool:
+        """Whether a relative path stays in the folder, whatever links there are."""
+        if not isinstance(name, str) or "\0" in name:
+            return False
+        path = PurePosixPath(name)
+        if path.is_absolute() or not path.parts or ".." in path.parts:
+            return False
+        ways = [self.root / path, *(self.root / parent for parent in path.parents)]
+        return not any(way.is_symlink() for way in ways if way != self.root)
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file.
+
+    Raises:
+        ValueError: it is not JSON or no object, in one line.
+    """
+    try:
+        value = json.loads(path.read_bytes(), parse_constant=_refuse_constant)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"got a {type(value).__name__}, expected an object")
+    return value
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+_LABELS: dict[str, type] = {
+    "id": str,
+    "title": str,
+    "scene": str,
+    "variants": list,
+    "probe": str,
+    "seed": int,
+}
+"""What ``study.json`` holds of each expected cell."""
+
+
+def _study_problem(study: dict[str, Any]) -> str | None:
+    """What is wrong with the content of ``study.json``."""
+    body = {key: value for key, value in study.items() if key != "sha256"}
+    if "sha256" in study and _digest(body) != study["sha256"]:
+        return "its checksum does not fit its content"
+    cells = study.get("cells")
+    if not isinstance(study.get("study"), dict) or not isinstance(cells, list):
+        return "damaged (no study, or no list of cells)"
+    for index, cell in enumerate(cells):
+        entry = cell if isinstance(cell, dict) else {}
+        for key, kind in _LABELS.items():
+            if not isinstance(entry.get(key), kind):
+                return f"damaged (cells[{index}].{key}: expected a {kind.__name__})"
+        if not entry["variants"] or not all(isinstance(name, str) for name in entry["variants"]):
+            return f"damaged (cells[{index}].variants: expected names)"
+    return None
+
+
+def _digest(value: Any) -> str | None:
+    """:func:`digest`, None for a value that has none: numbers such as 1e999 are infinite."""
+    try:
+        return digest(value)
+    except (ValueError, RecursionError):
+        return None

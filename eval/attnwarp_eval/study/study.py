@@ -158,6 +158,9 @@ def shipped_studies() -> dict[str, Path]:
 def load_study(name_or_path: str, **overrides: Any) -> Study:
     """Read a study by the name of a shipped one or by the path of a YAML file.
 
+    Relative paths in the file count from the file's folder; those of ``overrides`` from the current
+    one.
+
     Args:
         name_or_path: such as ``quick`` or ``my/study.yaml``.
         overrides: fields to replace, such as ``size`` or ``scenes``; None leaves a field as it is.
@@ -181,11 +184,49 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         raise StudyError(
             f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
         )
+    data = _beside(data, path.parent)
     data.update({k: v for k, v in overrides.items() if v is not None})
     try:
         return parse_study(data)
     except ValidationError as error:
         raise StudyError(f"{path}: {explain(error)}") from None
+
+
+def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A study's data with its relative paths taken from the folder of its file.
+
+    Paths are scenes such as ``my/scene.yaml`` and encoders such as ``clip:my/folder``. Values of
+    another type stay as they are, for the error that comes later.
+    """
+
+    def beside(text: Any) -> Any:
+        if not isinstance(text, str) or text.startswith("~"):
+            return text
+        return str(folder / text)
+
+    data = dict(data)
+    scenes, encoders = data.get("scenes"), data.get("encoders")
+    if isinstance(scenes, list):
+        data["scenes"] = [beside(name) if is_scene_file(name) else name for name in scenes]
+    if isinstance(encoders, dict):
+        data["encoders"] = {
+            kind: f"{name.partition(':')[0]}:{beside(name.partition(':')[2])}"
+            if isinstance(name, str) and name.partition(":")[2]
+            else name
+            for kind, name in encoders.items()
+        }
+    return data
+
+
+def is_scene_file(name: Any) -> bool:
+    """Whether a scene is named by its file, as :func:`attnwarp_eval.scene.file.load_scene` has it.
+
+    >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
+    (True, False)
+    """
+    if not isinstance(name, str):
+        return False
+    return Path(name).suffix in (".yaml", ".yml") or len(Path(name).parts) > 1
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:

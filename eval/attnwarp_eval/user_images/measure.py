@@ -191,6 +191,13 @@ def measure(
         for name in ("renders", "edited", "originals", "masks")
         if getattr(inputs, name) is not None
     }
+    for name in folders:
+        maps = normal_maps(getattr(inputs, name))
+        if maps:
+            done.notes.append(
+                f"{_option(name)}: {len(maps)} normal maps beside pictures of the same name are no"
+                f" views and are left out, {maps[0]} first"
+            )
     wanted = _possible(inputs, folders, encoders or {}, done)
     loaded = _load(wanted, encoders or {}, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
@@ -217,6 +224,9 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
     """The picture files of a folder by their names without suffix, in the order that a person would
     put them.
 
+    Normal maps that ``attnwarp render`` writes beside its pictures are left out; see
+    :func:`normal_maps`.
+
     Raises:
         InputError: no such folder, no picture in it, or two files that differ in their suffix
             alone.
@@ -225,21 +235,32 @@ def pictures_in(folder: Path, option: str) -> dict[str, Path]:
         raise InputError(
             f"{option}: {folder} is no folder; name the folder that holds the pictures"
         )
-    found: dict[str, Path] = {}
+    pictures: dict[str, Path] = {}
+    normals = normal_maps(folder)
     for path in sorted(folder.iterdir(), key=lambda p: natural(p.name)):
         if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
-        if path.stem in found:
+        if path.name in normals:
+            continue
+        if path.stem in pictures:
             raise InputError(
-                f"{option}: {found[path.stem]} and {path.name} have one name; pictures are paired"
-                " by their names without the suffix, so remove or rename one"
+                f"{option}: {pictures[path.stem]} and {path.name} have one name; pictures are"
+                " paired by their names without the suffix, so remove or rename one"
             )
-        found[path.stem] = path
-    if not found:
+        pictures[path.stem] = path
+    if not pictures:
         raise InputError(
             f"{option}: {folder} holds no picture, expected files ending in {', '.join(SUFFIXES)}"
         )
-    return found
+    return pictures
+
+
+def normal_maps(folder: Path) -> list[str]:
+    """File names of normal maps: NAME.normal.png beside NAME.png, as ``attnwarp render --normal``
+    writes them.
+    """
+    maps = folder.glob("*.normal.png")
+    return sorted(p.name for p in maps if (folder / f"{p.name[:-11]}.png").is_file())
 
 
 def read_picture(path: Path, background: Sequence[float] = (0.0, 0.0, 0.0)) -> Picture:

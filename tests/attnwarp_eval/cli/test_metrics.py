@@ -699,3 +699,41 @@ def test_a_measurement_that_was_interrupted_goes_on_and_ends_as_one_that_was_not
     write(tmp_path / "renders" / "v0.png", random_picture(random))
     changed, views = run("a")
     assert changed.exit_code == 0 and views == set(names[:BATCH])
+
+
+def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
+    from attnwarp.camera import Camera
+    from attnwarp.cli import app as renderer
+    from attnwarp.fit import from_points
+    from attnwarp.io import Dataset, write_ply, write_transforms
+
+    random = np.random.default_rng(0)
+    points = random.uniform(-1, 1, (50, 3))
+    colors = random.integers(0, 256, (50, 3), dtype=np.uint8)
+    write_ply(tmp_path / "splats.ply", from_points(points, colors, kind="2d", sh_degree=0, seed=0))
+    cameras = [
+        Camera.look_at((4 * x, 3, 1), (0, 0, 0), width=24, height=16, fov_y=40, name=name)
+        for x, name in ((-1, "left"), (1, "right"))
+    ]
+    (tmp_path / "cameras").mkdir()
+    write_transforms(tmp_path / "cameras", Dataset(cameras, [None] * 2))
+    for out, more in (("renders", ["--normal", "--depth"]), ("edited", ["--background", "white"])):
+        arguments = [tmp_path / "splats.ply", tmp_path / "cameras", "--out", tmp_path / out, *more]
+        done = CliRunner().invoke(renderer, ["render", *map(str, arguments)])
+        assert done.exit_code == 0, done.output
+    assert (tmp_path / "renders" / "left.normal.png").is_file()
+    # A map without its picture is a view like any other.
+    write(tmp_path / "renders" / "alone.normal.png", random_picture(random, (16, 24)))
+    folders = [f"--{name}={tmp_path / name}" for name in ("renders", "edited")]
+    done = call("metrics", *folders, "--perceptual=none", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    result = saved(tmp_path)
+    views = result["metrics"]["edit.psnr_mean"]["views"]
+    assert list(views) == ["left", "right"]
+    for view, value in views.items():
+        one, other = (
+            cv2.imread(str(tmp_path / name / f"{view}.png")) / 255 for name in ("renders", "edited")
+        )
+        assert value == pytest.approx(-10 * math.log10(((one - other) ** 2).mean()), abs=1e-4)
+    assert "2 normal maps beside pictures" in done.stderr and "left.normal.png" in done.stderr
+    assert "alone.normal" in done.stderr

@@ -6,7 +6,9 @@ results.jsonl of ``report --no-timings --no-pictures``. Where a protocol or a sc
 purpose, run the studies in their study.json again and put the new folders there.
 """
 
+import json
 import pathlib
+import shutil
 import tarfile
 
 import pytest
@@ -15,6 +17,7 @@ from attnwarp_eval.report import write_report
 from attnwarp_eval.study import Store
 from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.store import StoreError
 
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 
@@ -46,3 +49,30 @@ def test_ids_records_and_reports_are_the_bytes_that_they_were(folder, name):
         (store.root / file).unlink()
     write_report(store, timings=False, pictures=False)
     assert {file: (store.root / file).read_bytes() for file in files} == expected
+
+
+def test_swapped_labels_are_found_without_a_seal_and_refused_with_one(folder, tmp_path):
+    shutil.copytree(folder / "variants", tmp_path / "run")
+    store = Store(tmp_path / "run")
+    path = store.root / "study.json"
+    sealed = json.loads(path.read_text())
+    assert "sha256" not in sealed  # of former code
+    first, second = [cell for cell in sealed["cells"] if cell["probe"] == "warp"][:2]
+    first["variants"], second["variants"] = second["variants"], first["variants"]
+    path.write_text(json.dumps(sealed))
+    problems = runner.verify(store)
+    assert not problems.sealed
+    assert len(problems.damaged) == 2
+    for line, cell in zip(
+        problems.damaged, sorted([first, second], key=lambda c: c["id"]), strict=True
+    ):
+        assert cell["id"] in line and "is called" in line
+
+    first["variants"], second["variants"] = second["variants"], first["variants"]
+    store.write_study(sealed)
+    assert runner.verify(store).ok and runner.verify(store).sealed
+    text = path.read_text()
+    path.write_text(text.replace(first["variants"][0], "better"))
+    for command in (runner.verify, write_report):
+        with pytest.raises(StoreError, match="checksum does not fit"):
+            command(store)

@@ -125,6 +125,26 @@ def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, fol
     assert without_timings(run, folder) == without_timings(finished, folder)
 
 
+def test_a_damaged_picture_is_refused_by_name_and_made_anew(finished, folder):
+    run = folder / "damaged-pictures"
+    shutil.copytree(finished, run)
+    victim = sorted((run / "pictures").rglob("*.jpg"))[0]
+    whole = victim.read_bytes()
+    victim.write_bytes(whole[:-40] + bytes(40))
+    checked = call(folder, "verify", run)
+    assert checked.returncode == 3
+    assert f"{victim}: changed since it was written; run again with --out {run}" in checked.stdout
+    refused = call(folder, "report", run)
+    assert refused.returncode == 2
+    assert f"{victim}: changed since" in refused.stderr and refused.stderr.count("\n") == 1
+    assert call(folder, "report", run, "--no-pictures").returncode == 0
+    mended = call(folder, "run", "study.yaml", "--out", run)
+    assert mended.returncode == 0, mended.stderr
+    assert f"{CELLS - 1} already done" in mended.stderr
+    assert victim.read_bytes() == whole
+    assert call(folder, "verify", run).returncode == 0
+
+
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     # On a busy machine the run may be over before the signal is sent: then once more.
     for attempt in range(5):

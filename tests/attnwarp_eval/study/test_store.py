@@ -20,6 +20,17 @@ def record(**extra):
     return {"id": Cell(SPEC, "s", "v", "depth", 0).id, "spec": SPEC, "summary": {"x": 1.5}, **extra}
 
 
+def expected(cell_id, title):
+    return {
+        "id": cell_id,
+        "title": title,
+        "scene": "s",
+        "variants": ["v"],
+        "probe": "depth",
+        "seed": 0,
+    }
+
+
 def test_a_cells_id_is_the_sha256_of_its_canonical_json():
     text = b'{"probe":"depth","scene":"abc","seed":0}'
     assert Cell(SPEC, "s", "v", "depth", 0).id == hashlib.sha256(text).hexdigest()
@@ -79,6 +90,26 @@ def test_a_truncated_record_is_refused(tmp_path):
         store.read(record()["id"])
 
 
+@pytest.mark.parametrize("text", ["[]", "null", "NaN", '{"x": NaN}', '{"x": 1e999}', "[" * 10**5])
+def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_path, text):
+    store = Store(tmp_path)
+    store.write(record())
+    whole = store.path(record()["id"]).read_bytes()
+    store.path(record()["id"]).write_text(text)
+    with pytest.raises(StoreError, match="run again, which computes it anew") as caught:
+        store.read(record()["id"])
+    assert "\n" not in str(caught.value)
+    assert store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})["summary"] == {"x": 1.5}
+    assert store.path(record()["id"]).read_bytes() == whole
+
+
+def test_a_sealed_record_that_its_probe_cannot_read_is_refused_in_one_line(tmp_path):
+    store = Store(tmp_path)
+    store.write(record())
+    with pytest.raises(StoreError, match=r"not a record of its probe \(KeyError: 'views'\)"):
+        store.read_as(record()["id"], lambda data: data["views"])
+
+
 def test_verify_names_missing_failed_damaged_and_unexpected_cells(tmp_path):
     store = Store(tmp_path)
     picture = tmp_path / "pictures" / "a.png"
@@ -91,11 +122,11 @@ def test_verify_names_missing_failed_damaged_and_unexpected_cells(tmp_path):
     store.write({"id": other.id, "spec": other.spec})
     store.write_failure("f" * 64, {"error": "ValueError: no"})
     cells = [
-        {"id": good["id"], "title": "good"},
-        {"id": "f" * 64, "title": "fails"},
-        {"id": "e" * 64, "title": "absent"},
+        expected(good["id"], "good"),
+        expected("f" * 64, "fails"),
+        expected("e" * 64, "absent"),
     ]
-    store.write_study({"cells": cells})
+    store.write_study({"study": {}, "cells": cells})
     problems = store.verify()
     assert problems.missing == ["absent"]
     assert problems.failed == ["fails: ValueError: no"]
@@ -106,6 +137,107 @@ def test_verify_names_missing_failed_damaged_and_unexpected_cells(tmp_path):
     assert "changed since" in store.verify().damaged[0]
     picture.unlink()
     assert "missing" in store.verify().damaged[0]
+
+
+def test_study_json_carries_the_sha256_of_its_content(tmp_path):
+    store = Store(tmp_path)
+    content = {"study": {"name": "s"}, "cells": [expected("a" * 64, "first")]}
+    store.write_study(content)
+    path = tmp_path / "study.json"
+    stored = json.loads(path.read_text())
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    assert stored == {**content, "sha256": hashlib.sha256(text.encode()).hexdigest()}
+    assert store.verify().sealed
+    path.write_text(path.read_text().replace("first", "other"))
+    with pytest.raises(StoreError, match=r"study\.json: its checksum does not fit.*writes it anew"):
+        store.read_study()
+    # Former code wrote no checksum: its runs are read, and verify says so.
+    path.write_text(json.dumps(content))
+    assert store.read_study() == content
+    assert not store.verify().sealed
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[]", "null", "NaN", '{"cells": NaN}', '{"study": {}, "cells": 3}', '{"cells": []}', "[" * 10**5,
+     '{"study": {}, "cells": [[]]}', '{"study": {}, "cells": [{"id": "a"}]}', "9" * 5000, ""],
+)  # fmt: skip
+def test_a_study_json_of_another_content_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "study.json").write_text(text)
+    with pytest.raises(StoreError, match="damaged.*writes it anew") as caught:
+        Store(tmp_path).verify()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def pictured(tmp_path):
+    """A run's folder with one picture, and a file beside the folder with the same content."""
+
+    def write(path):
+        store = Store(tmp_path / "run")
+        write_atomic(store.root / "pictures" / "a.png", b"png")
+        (tmp_path / "outside.png").write_bytes(b"png")
+        sha256 = hashlib.sha256(b"png").hexdigest()
+        store.write(record(pictures=[{"path": path(tmp_path), "sha256": sha256}]))
+        store.write_study({"study": {}, "cells": [expected(record()["id"], "first")]})
+        return store
+
+    return write
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        lambda folder: "../outside.png",
+        lambda folder: "pictures/../../outside.png",
+        lambda folder: str(folder / "outside.png"),
+        lambda folder: "",
+        lambda folder: ".",
+        lambda folder: "a\0b",
+        lambda folder: 3,
+    ],
+)
+def test_a_picture_outside_the_folder_is_refused_by_name(pictured, path):
+    (line,) = pictured(path).verify().damaged
+    assert "outside the run's folder" in line
+
+
+def test_no_link_is_followed_to_a_picture(pictured, tmp_path):
+    store = pictured(lambda folder: "pictures/a.png")
+    assert store.verify().ok
+    picture = store.root / "pictures" / "a.png"
+    picture.unlink()
+    picture.symlink_to(tmp_path / "outside.png")
+    (line,) = store.verify().damaged
+    assert "pictures/a.png: a picture outside" in line
+    picture.unlink()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "a.png").write_bytes(b"png")
+    (store.root / "pictures").rmdir()
+    (store.root / "pictures").symlink_to(tmp_path / "elsewhere")
+    (line,) = store.verify().damaged
+    assert "pictures/a.png: a picture outside" in line
+    with pytest.raises(StoreError, match="pictures: is a symbolic link"), store.lock():
+        pass
+
+
+def test_a_lock_that_is_a_link_leaves_its_target_alone(tmp_path):
+    target = tmp_path / "precious.txt"
+    target.write_text("precious")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").symlink_to(target)
+    with (
+        pytest.raises(StoreError, match=r"\.lock: is a symbolic link"),
+        Store(tmp_path / "run").lock(),
+    ):
+        pass
+    assert target.read_text() == "precious"
+    # A hard link cannot be told from a file, but nothing is written to it.
+    (tmp_path / "run" / ".lock").unlink()
+    os.link(target, tmp_path / "run" / ".lock")
+    with Store(tmp_path / "run").lock():
+        pass
+    assert target.read_text() == "precious"
 
 
 def test_a_folder_that_is_not_a_run_says_how_to_make_one(tmp_path):

@@ -1,5 +1,8 @@
 """Oracles: what the YAML says, counted and named by hand."""
 
+import os
+import pathlib
+
 import pytest
 import yaml
 
@@ -143,3 +146,30 @@ def test_feature_grids_follow_the_image_where_a_study_names_none(tmp_path):
     path.write_text(yaml.safe_dump(study))
     assert load_study(str(path)).feature_sizes == [64, 8, 4]
     assert load_study(str(path), size=128).feature_sizes == [128, 16, 8]
+
+
+def test_relative_paths_count_from_the_studys_file(tmp_path, monkeypatch):
+    own = tmp_path / "studies" / "scenes" / "own.yaml"
+    own.parent.mkdir(parents=True)
+    (tmp_path / "elsewhere").mkdir()
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    own.write_text(shipped.read_text())
+    path = tmp_path / "studies" / "study.yaml"
+    path.write_text(
+        "name: s\nscenes: [scenes/own.yaml, bear, /abs/other.yaml]\nprobes: {sensitivity: []}\n"
+        "encoders: {clip: 'clip:models/clip', dino: dino-small, perceptual: 'lpips:/abs/lpips'}\n"
+    )
+    for folder in (tmp_path, tmp_path / "elsewhere"):
+        monkeypatch.chdir(folder)
+        study = load_study(os.path.relpath(path))
+        assert pathlib.Path(study.scenes[0]).samefile(own)
+        assert study.scenes[1:] == ["bear", "/abs/other.yaml"]
+        clip = study.encoders["clip"].removeprefix("clip:")
+        assert os.path.realpath(clip) == str(tmp_path / "studies" / "models" / "clip")
+        assert study.encoders["dino"] == "dino-small"
+        assert study.encoders["perceptual"] == "lpips:/abs/lpips"
+    # From the study's own folder a path is what the file has.
+    monkeypatch.chdir(path.parent)
+    assert load_study("study.yaml").scenes[0] == "scenes/own.yaml"
+    # What a person types on the command line counts from where they are.
+    assert load_study("study.yaml", scenes=["x/y.yaml"]).scenes == ["x/y.yaml"]
