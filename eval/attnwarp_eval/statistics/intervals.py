@@ -2,9 +2,8 @@
 
 Views of one scene are correlated, so the scene is the unit of evidence: an interval is Student's t
 over the means of the scenes. The views are a designed set (the same yaws for every scene and
-variant), not a sample, so they are not resampled. docs/statistics.md has the coverage that was
-measured for this and for two bootstraps: with three scenes theirs is 73 to 92 %, or above 97 %, at
-a stated 95 %.
+variant), not a sample, so they are not resampled. reports/statistics/coverage.md has the measured
+coverage of this interval and of two bootstraps.
 """
 
 from __future__ import annotations
