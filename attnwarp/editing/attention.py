@@ -360,8 +360,8 @@ def record(
                 )
             recording.timesteps.append(call.timestep)
         parts = features.chunk(len(plan.branches))
-        kept = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
-        recording.put(call.timestep, layer, kept)
+        selected = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
+        recording.put(call.timestep, layer, selected)
 
     with hooked(unet, plan.layers, keep):
         yield recording

@@ -97,8 +97,8 @@ def kind_of(name: str) -> Kind:
                 f"encoder {name!r}: no place behind the colon, expected {_pattern(scheme)}"
             )
         return _SCHEMES[scheme]
-    known = [*BUNDLED, *_SCHEMES]
-    near = nearest((scheme if colon else name).lower(), known)
+    names = [*BUNDLED, *_SCHEMES]
+    near = nearest((scheme if colon else name).lower(), names)
     guess = "." if near is None else f"; did you mean {_pattern(near)!r}?"
     raise InputError(f"encoder {name!r}: unknown{guess} Known are {', '.join([*BUNDLED, *REAL])}")
 

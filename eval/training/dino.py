@@ -201,9 +201,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             cls = torch.stack(terms).mean()
             dense_terms = []
             for side, scores in enumerate(s_small_patch.chunk(2)):
-                at = places(small[side][1], large[side][1], SMALL // DinoSmall.patch)
-                inside = (at.abs() <= 1).all(dim=-1)
-                wanted = F.grid_sample(dense_target[side], at, align_corners=False)
+                positions = places(small[side][1], large[side][1], SMALL // DinoSmall.patch)
+                inside = (positions.abs() <= 1).all(dim=-1)
+                wanted = F.grid_sample(dense_target[side], positions, align_corners=False)
                 loss = -(wanted * F.log_softmax(scores.float() / STUDENT_TEMPERATURE, dim=1)).sum(1)
                 dense_terms.append((loss * inside).sum() / inside.sum().clamp(min=1))
             dense = torch.stack(dense_terms).mean()

@@ -145,13 +145,13 @@ def render_edit_world(index: int, split: PairSplit) -> dict[str, Any]:
 
     world = edit_world(index, split)
     looks, valid, base = edit_looks(index, split)
-    shown = np.flatnonzero(valid)
+    valid_looks = np.flatnonzero(valid)
     images = np.zeros((VIEWS, LOOKS, SIZE, SIZE, 3), dtype=np.uint8)
     ids, depth = [], []
     cameras = world.scene(looks[base], SIZE).cameras
     for view in range(VIEWS):
-        made, hits = pictures(world, [looks[k] for k in shown], SIZE, view=view)
-        images[view, shown] = np.stack(made)
+        made, hits = pictures(world, [looks[k] for k in valid_looks], SIZE, view=view)
+        images[view, valid_looks] = np.stack(made)
         objects = np.where(hits.object_id < 0, SKY, np.minimum(hits.object_id, OTHER))
         ids.append(np.where(hits.valid, objects, SKY).astype(np.uint8))
         depth.append(hits.depth.astype(np.float32))

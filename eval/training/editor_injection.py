@@ -211,8 +211,8 @@ def injected_loss(
     if inject:
         answers = [replace(r, target=s.target) for r, s in zip(rows, sources, strict=True)]
         wanted = pairs.latents([pairs.picture(r, r.target) if k else pairs.picture(o, o.target) for r, o, k in zip(answers, rows, related.tolist(), strict=True)])  # fmt: skip
-        where = mask.view(count, 1, cells, cells) & related[:, None, None, None]
-        target = torch.where(where, wanted, b.after)
+        warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
+        target = torch.where(warped, wanted, b.after)
         with hooked(net.unet, layers, blend):
             second = net(state, b.before, t, b.tokens)
     else:

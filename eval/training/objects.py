@@ -221,13 +221,13 @@ def _house(u: _Dice) -> list[Part]:
 
 def _car(u: _Dice) -> list[Part]:
     long, wide, low = u(1.25, 1.5), u(0.55, 0.65), u(0.24, 0.3)
-    cabin, r, at = u(0.22, 0.28), u(0.13, 0.16), u(-0.15, 0.05)
+    cabin, r, center = u(0.22, 0.28), u(0.13, 0.16), u(-0.15, 0.05)
     parts = [
         _block(0, 0, r + low / 2, long, wide, low, 0.07),
-        _block(at, 0, r + low + cabin / 2 - 0.02, long * u(0.45, 0.55), wide * 0.88, cabin, 0.08, blend=0.04),
+        _block(center, 0, r + low + cabin / 2 - 0.02, long * u(0.45, 0.55), wide * 0.88, cabin, 0.08, blend=0.04),
         _both(
             _block(
-                at,
+                center,
                 wide * 0.44,
                 r + low + cabin / 2,
                 long * 0.36,
@@ -239,7 +239,7 @@ def _car(u: _Dice) -> list[Part]:
             )
         ),
         _block(
-            at + long * 0.255, 0, r + low + cabin / 2, 0.06, wide * 0.7, cabin * 0.5, 0.01, color="#22303c", blend=False
+            center + long * 0.255, 0, r + low + cabin / 2, 0.06, wide * 0.7, cabin * 0.5, 0.01, color="#22303c", blend=False
         ),
         _both(_ellipsoid(long / 2, wide * 0.33, r + low * 0.55, 0.04, 0.06, 0.05, color="#f5f0d0", blend=False)),
     ]

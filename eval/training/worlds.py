@@ -490,9 +490,9 @@ def surface_words(finish: int, color: int, second: int, rng: np.random.Generator
     return _one(words, rng), bool(rng.uniform() < 0.4)
 
 
-def sentence(said: tuple[int, ...], rng: np.random.Generator, *, fillers: bool = False) -> str:
-    """A caption that says the attributes that are not -1; ``said`` as :func:`attributes` orders them."""
-    thing, finish, color, second, ground, time = said
+def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool = False) -> str:
+    """A caption of the attributes that are not -1; ``values`` in the order of :func:`attributes`."""
+    thing, finish, color, second, ground, time = values
     noun = _one(NOUNS[OBJECTS[thing]], rng) if thing >= 0 else _one(("thing", "object", "something"), rng)
     statue = False
     words = ""
@@ -518,9 +518,9 @@ def sentence(said: tuple[int, ...], rng: np.random.Generator, *, fillers: bool =
     return " ".join(" ".join(parts + tail).split())
 
 
-def told(shown: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
+def told(pictured: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
     """What a caption says of a picture: the object and the surface nearly always, ground and time half of the time."""
-    thing, finish, color, second, ground, time = shown
+    thing, finish, color, second, ground, time = pictured
     if rng.uniform() < 0.2:
         return thing, -1, -1, -1, -1, -1
     if rng.uniform() < 0.06:

@@ -47,11 +47,13 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
     Raises:
         SceneError: they disagree, so that a plan made from the file would be wrong.
     """
-    said = transport.called_for(scene.spec)
+    spec_effects = transport.called_for(scene.spec)
     plugins, objects = graph(scene)
     seen = _in_graphs(plugins, objects)
     for effect, evidence in seen.items():
-        if effect not in said and not (effect == "textures" and not _checked_textures(scene)):
+        if effect not in spec_effects and not (
+            effect == "textures" and not _checked_textures(scene)
+        ):
             raise SceneError(
                 f"Mitsuba's scene shows {effect} ({'; '.join(evidence)}) that the file does not; a"
                 " plan would be wrong",
@@ -60,8 +62,8 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
     bounces = scene.spec.appearance.bounces
     out: dict[Effect, Finding] = {}
     for effect in EFFECTS:
-        if effect in said:
-            evidence = (said[effect], *seen.get(effect, ()))
+        if effect in spec_effects:
+            evidence = (spec_effects[effect], *seen.get(effect, ()))
             pinned = effect in scene.spec.effects.pin
             caustic = effect == "caustics" and not _caustic_simulated(scene)
             out[effect] = Finding(
@@ -131,15 +133,15 @@ def _in_graphs(
     """Effects that Mitsuba's own graphs show.
 
     Args:
-        plugins: (where, plugin name) of the graph as parsed.
-        objects: (where, object) of the scene as loaded.
+        plugins: (path, plugin name) of the graph as parsed.
+        objects: (path, object) of the scene as loaded.
     """
     import mitsuba as mi
 
-    found: dict[Effect, list[str]] = {}
+    evidence_of: dict[Effect, list[str]] = {}
 
     def note(effect: Effect, evidence: str) -> None:
-        found.setdefault(effect, []).append(evidence)
+        evidence_of.setdefault(effect, []).append(evidence)
 
     by_plugin: dict[str, Effect] = {
         "envmap": "environment",
@@ -157,35 +159,35 @@ def _in_graphs(
         "pplastic": "polarisation",
         "measured_polarized": "polarisation",
     }
-    for where, name in plugins:
+    for path, name in plugins:
         if name in by_plugin:
-            note(by_plugin[name], f"plugin {name} at {where}")
+            note(by_plugin[name], f"plugin {name} at {path}")
         elif name in ("homogeneous", "heterogeneous"):
             note(
                 "subsurface"
-                if where.endswith("interior") and not where.startswith("medium")
+                if path.endswith("interior") and not path.startswith("medium")
                 else "medium",
-                f"plugin {name} at {where}",
+                f"plugin {name} at {path}",
             )
     F = mi.BSDFFlags
-    for where, thing in objects:
+    for path, thing in objects:
         if isinstance(thing, mi.BSDF):
             if thing.class_name() == "Null":
                 continue  # the walls of the fog
             flags = int(thing.flags())
             if flags & int(F.Delta):
-                note("specular", f"BSDF flag Delta of {thing.class_name()} at {where}")
+                note("specular", f"BSDF flag Delta of {thing.class_name()} at {path}")
             if flags & int(F.Glossy):
-                note("glossy", f"BSDF flag Glossy of {thing.class_name()} at {where}")
+                note("glossy", f"BSDF flag Glossy of {thing.class_name()} at {path}")
             if flags & (
                 int(F.DeltaTransmission) | int(F.GlossyTransmission) | int(F.DiffuseTransmission)
             ):
-                note("refraction", f"BSDF flag Transmission of {thing.class_name()} at {where}")
+                note("refraction", f"BSDF flag Transmission of {thing.class_name()} at {path}")
         elif isinstance(thing, mi.Emitter):
-            note("direct", f"emitter {thing.class_name()} at {where}")
-            note("shadows", f"emitter {thing.class_name()} at {where}")
+            note("direct", f"emitter {thing.class_name()} at {path}")
+            note("shadows", f"emitter {thing.class_name()} at {path}")
             if thing.is_environment():
-                note("environment", f"emitter {thing.class_name()} at {where}")
+                note("environment", f"emitter {thing.class_name()} at {path}")
         elif (
             isinstance(thing, mi.Texture)
             and thing.class_name().startswith("Bitmap")
@@ -193,10 +195,10 @@ def _in_graphs(
         ):
             # A mesh's attribute is not looked at: whether its colours vary the file and the mesh's
             # tint say.
-            note("textures", f"texture {thing.class_name()} at {where} varies")
+            note("textures", f"texture {thing.class_name()} at {path} varies")
     return {
         effect: tuple(dict.fromkeys(evidence[:1] + evidence[-1:]))
-        for effect, evidence in found.items()
+        for effect, evidence in evidence_of.items()
     }
 
 

@@ -261,12 +261,12 @@ def prove(
 
     if rungs and rungs[0].passed is False:
         return finish("refused")
-    found = climb(
+    ladder = climb(
         lambda side, spp, first, count: pictures((ours, against)[side], spp, first, count),
         seeds=seeds, seconds=seconds - (time.perf_counter() - start), seed=seed,
     )  # fmt: skip
-    rungs.extend(found.rungs)
-    return finish(found.verdict, found.detectable)
+    rungs.extend(ladder.rungs)
+    return finish(ladder.verdict, ladder.detectable)
 
 
 Pictures = Callable[[int, int, int, int], Array]
@@ -329,9 +329,9 @@ def climb(
     spp = _samples(pictures, seed + pairs, seeds, seconds - (time.perf_counter() - start))
     a = pictures(0, spp, seed + 1000, seeds)
     b = pictures(1, spp, seed + 2000, seeds)
-    found = levels(a, b, alpha=share)
-    detectable = {level.name: level.detectable for level in found}
-    for level in found:
+    compared = levels(a, b, alpha=share)
+    detectable = {level.name: level.detectable for level in compared}
+    for level in compared:
         rungs.append(
             Rung(
                 f"Welch, {level.name}",
@@ -350,7 +350,7 @@ def climb(
             asdict(same) | {"spp": spp, "seeds": seeds},
         )
     )  # fmt: skip
-    if any(level.differs for level in found):
+    if any(level.differs for level in compared):
         return Climb("refused", tuple(rungs), detectable)
     return Climb("certified" if same.equal else "can't tell", tuple(rungs), detectable)
 
@@ -387,16 +387,18 @@ def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
 
 def _structural(scene: Scene, ours: Plan) -> Rung:
     """Whether what the plan leaves out is absent from all that was looked at."""
-    found = detect(scene)
-    blind: list[str] = [name for name in found if found[name].needed and not found[name].simulated]
-    if found["caustics"].simulated and small_lights(scene) is not None:
+    findings = detect(scene)
+    blind: list[str] = [
+        name for name in findings if findings[name].needed and not findings[name].simulated
+    ]
+    if findings["caustics"].simulated and small_lights(scene) is not None:
         blind.append("caustics seen in mirrors and through glass")
     lacks = list(
-        _lacks(scene, ours, caustic=found["caustics"].needed and found["caustics"].simulated)
+        _lacks(scene, ours, caustic=findings["caustics"].needed and findings["caustics"].simulated)
     )
     bounces = scene.spec.appearance.bounces
     words = "what is left out is in neither the file nor Mitsuba's graphs"
-    if found["interreflection"].source == "said":
+    if findings["interreflection"].source == "said":
         words += (
             f"; bounces beyond {bounces} are left out by the scene's own word and not part of this"
             " proof"
@@ -422,12 +424,12 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
         not ours.media or any(step.integrator not in ("volpath", "ptracer") for step in ours.passes)
     ):
         yield "a medium needs volpath, in every pass"
-    said = spec.cameras.lens
-    if said is not None and ours.lens is None:
+    lens = spec.cameras.lens
+    if lens is not None and ours.lens is None:
         yield "depth of field needs a lens"
-    elif said is not None and ours.lens != Lens(said.aperture, said.focus):
-        yield f"the lens is another: aperture {said.aperture:g} and focus {said.focus} are said"
-    elif said is None and ours.lens is not None:
+    elif lens is not None and ours.lens != Lens(lens.aperture, lens.focus):
+        yield f"the lens is another: aperture {lens.aperture:g} and focus {lens.focus} are said"
+    elif lens is None and ours.lens is not None:
         yield "the scene says no lens, but the plan has one"
 
     # What a light shows where something rough is seen first, and where something smooth is (or a
@@ -446,8 +448,8 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
                 )
         missing = sorted(both - seen)
         if missing:
-            where = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
-            yield f"{name} shines in no pass{where}"
+            condition = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
+            yield f"{name} shines in no pass{condition}"
         taken = sum(step.beam and step.sign < 0 and shines(step) for step in cameras)
         given = sum(step.beam and step.sign > 0 and shines(step) for step in ours.passes)
         if taken > given:

@@ -189,11 +189,12 @@ def _ratio_interval(
     apart = [np.array([[((x - y) ** 2).mean() / 2 for y in p] for x in p]) for p in (ours, other)]
     draws = np.random.default_rng(0).integers(0, rounds, (1000, rounds))
     spread = [np.array([_between(a, d) for d in draws]) for a in apart]
-    known = (spread[0] > 0) & (spread[1] > 0)
-    if not known.any():
+    positive = (spread[0] > 0) & (spread[1] > 0)
+    if not positive.any():
         return None
     low, high = np.percentile(
-        np.median(ratio[draws], axis=1)[known] * spread[1][known] / spread[0][known], [2.5, 97.5]
+        np.median(ratio[draws], axis=1)[positive] * spread[1][positive] / spread[0][positive],
+        [2.5, 97.5],
     )
     return float(low), float(high)
 

@@ -78,8 +78,8 @@ def _entry(
         def pictures() -> dict[str, Any]:
             path = store.root / entry["picture"]
             about = side_by_side(scene, path)
-            kept = [store.keep_picture(path, view=scene.source.name, what="side by side")]
-            return {"about": about, "pictures": kept}
+            saved = [store.keep_picture(path, view=scene.source.name, what="side by side")]
+            return {"about": about, "pictures": saved}
 
         samples = {"size": table.PICTURE_SIZE, "plan": table.PLAN_SAMPLES}
         samples |= {"everything_on": table.FULL_SAMPLES}

@@ -72,7 +72,7 @@ class Disagreement:
             self.delta_e[self.counted],
         )
         pixels = int(self.counted.sum())
-        found = {
+        values = {
             "mae_linear": mean(np.abs(linear)),
             "rmse_linear": float(np.sqrt(mean(linear**2))),
             "rmse_srgb": float(np.sqrt(mean(srgb**2))),
@@ -81,7 +81,7 @@ class Disagreement:
             "share": share(pixels, self.candidates),
             "pixels": pixels,
         }
-        return {f"consistency.{prefix}{name}": value for name, value in found.items()}
+        return {f"consistency.{prefix}{name}": value for name, value in values.items()}
 
 
 def cross_view(
@@ -109,10 +109,10 @@ def cross_view(
     """
     source, target = _pictures(source_srgb, target_srgb, pair)
     asked = region(mask, target.shape) & pair.visible
-    kept = asked & ~pair.edge
+    counted = asked & ~pair.edge
     if exclude is not None:
-        kept &= ~region(exclude, target.shape, "exclude")
-    return _disagreement(source, target, pair.xy, kept, int(asked.sum()))
+        counted &= ~region(exclude, target.shape, "exclude")
+    return _disagreement(source, target, pair.xy, counted, int(asked.sum()))
 
 
 def view_dependent(
@@ -149,9 +149,9 @@ def view_dependent(
         [source[row, column], source[row, right], source[below, column], source[below, right]]
     )
     beyond = np.maximum(taps.min(axis=0) - target[ask], target[ask] - taps.max(axis=0))
-    found = np.zeros(ask.shape, dtype=bool)
-    found[ask] = (beyond > tolerance).any(axis=-1)
-    return found
+    result = np.zeros(ask.shape, dtype=bool)
+    result[ask] = (beyond > tolerance).any(axis=-1)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,16 +249,16 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
     asked = region(mask, shape)
     seen = asked & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
     offset = np.hypot(*np.moveaxis(flow.xy - pair.xy, -1, 0))
-    every, kept = offset[seen], offset[seen & flow.accepted]
+    every, accepted_offset = offset[seen], offset[seen & flow.accepted]
     accepted = asked & flow.accepted
     wrong = accepted & pair.unseen
     return {
         "consistency.flow_epe_median": quantile(every, 0.5),
         "consistency.flow_epe_p95": quantile(every, 0.95),
         "consistency.flow_below_1px": share(int((every < 1).sum()), every.size),
-        "consistency.flow_epe_median_accepted": quantile(kept, 0.5),
-        "consistency.flow_epe_p95_accepted": quantile(kept, 0.95),
-        "consistency.flow_recall": share(kept.size, every.size),
+        "consistency.flow_epe_median_accepted": quantile(accepted_offset, 0.5),
+        "consistency.flow_epe_p95_accepted": quantile(accepted_offset, 0.95),
+        "consistency.flow_recall": share(accepted_offset.size, every.size),
         "consistency.flow_false": share(int(wrong.sum()), int(accepted.sum())),
     }
 
@@ -302,10 +302,10 @@ def _sample(image: Array, xy: Array) -> Array:
     """(N, C) bilinear samples of an (H, W, C) picture at (N, 2) positions that have taps."""
     from scipy.ndimage import map_coordinates
 
-    at = (xy[:, ::-1] - 0.5).T
+    indices = (xy[:, ::-1] - 0.5).T
     return np.stack(
         [
-            map_coordinates(image[..., c], at, order=1, mode="nearest")
+            map_coordinates(image[..., c], indices, order=1, mode="nearest")
             for c in range(image.shape[-1])
         ],
         -1,
@@ -313,12 +313,12 @@ def _sample(image: Array, xy: Array) -> Array:
 
 
 def _disagreement(
-    source: Array, target: Array, xy: Array, kept: Mask, candidates: int
+    source: Array, target: Array, xy: Array, pixels: Mask, candidates: int
 ) -> Disagreement:
-    """Of sRGB pictures, at the pixels of ``kept`` whose position has taps."""
+    """Of sRGB pictures, at the pixels of ``pixels`` whose position has taps."""
     from skimage.color import deltaE_ciede2000, rgb2lab
 
-    counted = kept & _has_taps(xy, source.shape)
+    counted = pixels & _has_taps(xy, source.shape)
     shape = counted.shape
     linear, srgb, delta_e = (np.full((*shape, *rest), np.nan) for rest in ((3,), (3,), ()))
     if counted.any():
@@ -343,9 +343,9 @@ def _flow(here: npt.NDArray[np.uint8], there: npt.NDArray[np.uint8], method: Flo
 
     cv: Any = cv2  # its stubs lack DIS, and None for the flow to start from
     if method == "dis":
-        found = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(here, there, None)
+        flow = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(here, there, None)
     else:
-        found = cv.calcOpticalFlowFarneback(
+        flow = cv.calcOpticalFlowFarneback(
             here,
             there,
             None,
@@ -357,4 +357,4 @@ def _flow(here: npt.NDArray[np.uint8], there: npt.NDArray[np.uint8], method: Flo
             poly_sigma=1.5,
             flags=0,
         )
-    return found.astype(np.float64)
+    return flow.astype(np.float64)

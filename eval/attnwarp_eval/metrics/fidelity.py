@@ -117,9 +117,9 @@ def nearest_answer(
                 f"answers[{name!r}]: got views {sorted(truth)}, expected those of images,"
                 f" {sorted(images)}"
             )
-    found = {name: edit_psnr(images, truth, masks).pooled for name, truth in answers.items()}
-    defined = {name: value for name, value in found.items() if not math.isnan(value)}
-    return (max(defined, key=defined.__getitem__) if defined else None), found
+    scores = {name: edit_psnr(images, truth, masks).pooled for name, truth in answers.items()}
+    defined = {name: value for name, value in scores.items() if not math.isnan(value)}
+    return (max(defined, key=defined.__getitem__) if defined else None), scores
 
 
 def _shrunk(part: Mask) -> Mask:
@@ -128,5 +128,5 @@ def _shrunk(part: Mask) -> Mask:
     """
     from scipy.ndimage import binary_erosion
 
-    kept: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)
-    return kept
+    inner: Mask = binary_erosion(part, np.ones((3, 3), dtype=bool), border_value=1)
+    return inner

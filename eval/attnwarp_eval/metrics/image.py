@@ -74,8 +74,8 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
         NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
         11 square.
     """
-    found = ssim_map(image, target, mask)
-    return mean(found[np.isfinite(found)])
+    values = ssim_map(image, target, mask)
+    return mean(values[np.isfinite(values)])
 
 
 def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
@@ -260,10 +260,12 @@ def edit_psnr(
     for name, other in (("rendered", rendered), ("masks", masks)):
         if other is not None and set(other) != set(edited):
             without, beyond = sorted(set(edited) - set(other)), sorted(set(other) - set(edited))
-            said = [f"no view {without[0]!r}"] if without else []
-            said += [f"a view {beyond[0]!r} that is not among the edited ones"] if beyond else []
+            problems = [f"no view {without[0]!r}"] if without else []
+            problems += (
+                [f"a view {beyond[0]!r} that is not among the edited ones"] if beyond else []
+            )
             raise ValueError(
-                f"{name}: got {' and '.join(said)}, expected the {len(edited)} views of edited"
+                f"{name}: got {' and '.join(problems)}, expected the {len(edited)} views of edited"
             )
     errors = []
     for view, image in edited.items():

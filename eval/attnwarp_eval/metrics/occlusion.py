@@ -58,7 +58,7 @@ def confusion(
         raise ValueError(
             f"label: got values {np.unique(truth).tolist()}, expected 0 to {AMBIGUOUS}"
         )
-    kept = mask(accepted, truth.shape, "accepted")
+    passed = mask(accepted, truth.shape, "accepted")
     has = mask(surface, truth.shape, "surface")
     counted = (
         np.ones(truth.shape, dtype=bool) if among is None else mask(among, truth.shape, "among")
@@ -74,10 +74,10 @@ def confusion(
         "behind": outside & back,
         "ambiguous": truth == AMBIGUOUS,
     }
-    counts = {"empty_accepted": int(((truth == NONE) & ~has & kept & counted).sum())}
+    counts = {"empty_accepted": int(((truth == NONE) & ~has & passed & counted).sum())}
     for name, member in classes.items():
-        counts[f"{name}_accepted"] = int((member & kept & counted).sum())
-        counts[f"{name}_rejected"] = int((member & ~kept & counted).sum())
+        counts[f"{name}_accepted"] = int((member & passed & counted).sum())
+        counts[f"{name}_rejected"] = int((member & ~passed & counted).sum())
     return {name: counts[name] for name in COUNTS}
 
 

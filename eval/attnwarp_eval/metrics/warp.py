@@ -86,19 +86,19 @@ def feature_error(
     truth = floats(exact, ("C", "H", "W"), "exact")
     shape = truth.shape[1:]
     estimate = floats(warped, truth.shape, "warped")
-    kept, seen = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
+    passed, seen = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
     surface = np.isfinite(truth).all(axis=0)
     square = ((estimate - truth) ** 2).sum(axis=0)
     power = (truth**2).sum(axis=0)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        groups = {"accepted": kept & seen, "visible": seen, "all_accepted": kept & surface}
+        groups = {"accepted": passed & seen, "visible": seen, "all_accepted": passed & surface}
         for name, group in groups.items():
             among = group & region
             total = float(power[among].sum())
             figures[f"warp.feature_{name}{suffix}"] = (
                 float(np.sqrt(square[among].sum() / total)) if total > 0 else float("nan")
             )
-        figures[f"warp.feature_pixels{suffix}"] = int((kept & seen & region).sum())
+        figures[f"warp.feature_pixels{suffix}"] = int((passed & seen & region).sum())
     return figures

@@ -88,8 +88,8 @@ class Spec(BaseModel):
 
     @model_serializer(mode="wrap")
     def _leave_out_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        said: dict[str, Any] = handler(self)
+        values: dict[str, Any] = handler(self)
         for name, about in type(self).model_fields.items():
             if about.json_schema_extra == LATER and getattr(self, name) == about.default:
-                said.pop(name, None)
-        return said
+                values.pop(name, None)
+        return values

@@ -34,8 +34,8 @@ def pick(edit: EditSpec, answer: str | None = None) -> AnswerSpec | None:
     for one in edit.answers:
         if one.name == answer:
             return one
-    known = ", ".join(one.name for one in edit.answers) or "none: its result is the only one"
-    raise ValueError(f"edit {edit.name!r}: no answer {answer!r}; it has {known}")
+    names = ", ".join(one.name for one in edit.answers) or "none: its result is the only one"
+    raise ValueError(f"edit {edit.name!r}: no answer {answer!r}; it has {names}")
 
 
 def apply(spec: SceneSpec, edit: EditSpec, answer: AnswerSpec | None = None) -> SceneSpec:
@@ -69,48 +69,48 @@ def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
     Raises:
         ValueError: ``recolor`` names a colour that the object does not have.
     """
-    said = item.model_dump(mode="json", exclude_unset=True)
+    values = item.model_dump(mode="json", exclude_unset=True)
     if change.recolor:
         met: set[str] = set()
-        said = _recolored(said, change.recolor, met)
+        values = _recolored(values, change.recolor, met)
         missing = sorted(set(change.recolor) - met)
         if missing:
             raise ValueError(
                 f"recolor: {item.name!r} has no colour {missing[0]!r}; it has"
-                f" {', '.join(_colors(said))}"
+                f" {', '.join(_colors(values))}"
             )
     if change.texture is not None:
-        said["texture"] = change.texture.model_dump(mode="json")
+        values["texture"] = change.texture.model_dump(mode="json")
     if change.paint is not None:
-        for part in said["shape"].get("parts", ()):
+        for part in values["shape"].get("parts", ()):
             if part.get("color", WHITE) not in change.keep:
                 part["color"] = WHITE
-        if "texture" in said:
-            said["texture"] = _painted(said["texture"], change.paint)
+        if "texture" in values:
+            values["texture"] = _painted(values["texture"], change.paint)
     if change.material is not None:
-        said["material"] = change.material.model_dump(mode="json")
+        values["material"] = change.material.model_dump(mode="json")
         if not isinstance(change.material, TEXTURED):
-            said.pop("texture", None)
-    return type(item).model_validate(said)
+            values.pop("texture", None)
+    return type(item).model_validate(values)
 
 
-def _recolored(said: Any, colors: dict[str, str], met: set[str]) -> Any:
-    if isinstance(said, dict):
-        return {key: _recolored(value, colors, met) for key, value in said.items()}
-    if isinstance(said, list):
-        return [_recolored(value, colors, met) for value in said]
-    if isinstance(said, str) and said in colors:
-        met.add(said)
-        return colors[said]
-    return said
+def _recolored(node: Any, colors: dict[str, str], met: set[str]) -> Any:
+    if isinstance(node, dict):
+        return {key: _recolored(value, colors, met) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_recolored(value, colors, met) for value in node]
+    if isinstance(node, str) and node in colors:
+        met.add(node)
+        return colors[node]
+    return node
 
 
-def _colors(said: Any) -> list[str]:
-    if isinstance(said, dict):
-        said = list(said.values())
-    if isinstance(said, list):
-        return sorted({color for value in said for color in _colors(value)})
-    return [said] if isinstance(said, str) and said.startswith("#") else []
+def _colors(node: Any) -> list[str]:
+    if isinstance(node, dict):
+        node = list(node.values())
+    if isinstance(node, list):
+        return sorted({color for value in node for color in _colors(value)})
+    return [node] if isinstance(node, str) and node.startswith("#") else []
 
 
 def _painted(texture: dict[str, Any], paint: str) -> dict[str, Any]:

@@ -51,10 +51,10 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     for folder in scene_folders():
         if (folder / f"{text}.yaml").is_file():
             return _read(folder / f"{text}.yaml")
-    known = list_scenes()
+    available = list_scenes()
     raise SceneError(
-        f"no scene named {text!r}{suggest(text, known)}; known scenes:"
-        f" {', '.join(known) or 'none'}; a file of your own is named by its path, such as"
+        f"no scene named {text!r}{suggest(text, available)}; known scenes:"
+        f" {', '.join(available) or 'none'}; a file of your own is named by its path, such as"
         " my/scene.yaml"
     )
 
@@ -217,20 +217,20 @@ def _check(scene: Scene, root: yaml.Node) -> None:
                 )
         if isinstance(item.shape, MeshSpec):
             path = scene.mesh_path(item.shape)
-            where = ("objects", k, "shape", "file")
+            key = ("objects", k, "shape", "file")
             if path.suffix.lower() not in MESH_SUFFIXES:
                 near = suggest(path.suffix.lower(), MESH_SUFFIXES)
                 refuse(
                     f"objects[{k}].shape.file: {item.shape.file!r} is not of a known mesh"
                     f" format{near}; one of {', '.join(MESH_SUFFIXES)}",
-                    *where,
+                    *key,
                 )
             if not path.is_file():
                 there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
                 refuse(
                     f"objects[{k}].shape.file: there is no file {path}{suggest(path.name, there)}; "
                     "the path counts from the folder of the scene file",
-                    *where,
+                    *key,
                 )
     skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
     if len(skies) > 1:
@@ -254,10 +254,11 @@ def _check(scene: Scene, root: yaml.Node) -> None:
         holds = inside(scene, item)
         for camera, loc in cameras:
             if holds(camera.position):
-                at = ", ".join(f"{x:.4g}" for x in camera.position)
+                position = ", ".join(f"{x:.4g}" for x in camera.position)
                 refuse(
-                    f"{'.'.join(map(str, loc))}: the camera {camera.name!r} at ({at}) is inside the"
-                    f" object {item.name!r}; change its yaw, height or radius, or move the object",
+                    f"{'.'.join(map(str, loc))}: the camera {camera.name!r} at ({position}) is"
+                    f" inside the object {item.name!r}; change its yaw, height or radius, or move"
+                    " the object",
                     *loc,
                 )
 

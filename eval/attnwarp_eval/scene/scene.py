@@ -144,9 +144,10 @@ class Scene:
         for edit in self.edits:
             if edit.name == name:
                 return edit
-        known = [edit.name for edit in self.edits]
+        available = [edit.name for edit in self.edits]
         raise SceneError(
-            f"no edit {name!r}{suggest(name, known)}; {self.name} has {', '.join(known) or 'none'}",
+            f"no edit {name!r}{suggest(name, available)}; {self.name} has"
+            f" {', '.join(available) or 'none'}",
             self.path,
         )
 
@@ -257,10 +258,10 @@ class Scene:
             for item in self.spec.objects
             if isinstance(item.shape, MeshSpec)
         }
-        said = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
+        spec = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
         # Scenes without mesh files keep the names that they had before meshes had a reader of ours.
         reader = (READER_PROTOCOL,) if files else ()
-        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, said, files, *reader)
+        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader)
 
     @functools.cached_property
     def content_hash(self) -> str:

@@ -314,9 +314,9 @@ def _part_colors(parts: Sequence[Part], width: float, points: Array) -> Array:
             weights[k] = 0
         # A cut without a colour of its own shows that of what was cut.
         if not part.blend or (part.carve and part.color != (1.0, 1.0, 1.0)):
-            mine = (np.abs(distances[k]) if part.carve else distances[k]) < 1e-3 * width + 1e-9
-            weights[:, mine] = 0
-            weights[k, mine] = 1
+            inside = (np.abs(distances[k]) if part.carve else distances[k]) < 1e-3 * width + 1e-9
+            weights[:, inside] = 0
+            weights[k, inside] = 1
     colors = np.array([part.color for part in parts])
     return (weights.T @ colors) / weights.sum(0)[:, None]
 

@@ -100,13 +100,13 @@ class ObjectSpec(Spec):
     @model_validator(mode="after")
     def _a_texture_where_it_shows(self) -> ObjectSpec:
         shows = isinstance(self.material, TEXTURED) and self.emission is None
-        said = "texture" in self.model_fields_set
-        if shows and not said:
+        given = "texture" in self.model_fields_set
+        if shows and not given:
             raise ValueError(
                 f"got no texture, but {self.material.type} things need one; add 'texture: {{type:"
                 " ...}'"
             )
-        if said and not isinstance(self.material, TEXTURED):
+        if given and not isinstance(self.material, TEXTURED):
             raise ValueError(
                 f"got a texture, but {self.material.type} shows none; use the material's 'tint'"
                 " instead"
@@ -202,8 +202,10 @@ class ObjectChange(Spec):
 
     @model_validator(mode="after")
     def _one_way_of_colouring(self) -> ObjectChange:
-        said = [name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)]
-        if not said:
+        given = [
+            name for name in ("texture", "material", "recolor", "paint") if getattr(self, name)
+        ]
+        if not given:
             raise ValueError(
                 "got a change that changes nothing; add a texture, a material, recolor or paint"
             )

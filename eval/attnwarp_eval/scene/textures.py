@@ -116,9 +116,9 @@ def albedo(
             value = np.clip(
                 1.8 * (fractal_noise(points / texture.size, texture.octaves, 3) - 0.5) + 0.5, 0, 1
             )
-            at = value * (len(ramp) - 1)
-            low = np.minimum(at.astype(np.int64), len(ramp) - 2)
-            part = (at - low)[:, None]
+            position = value * (len(ramp) - 1)
+            low = np.minimum(position.astype(np.int64), len(ramp) - 2)
+            part = (position - low)[:, None]
             color = ramp[low] * (1 - part) + ramp[low + 1] * part
         case Rings():
             away = points[:, :2] - np.array(texture.center)

@@ -28,10 +28,10 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
     It reads the file alone, without rendering or loading anything;
     :mod:`attnwarp_eval.effects.detect` looks closer.
     """
-    found: dict[Effect, str] = {"geometry": f"{len(spec.objects)} objects"}
+    evidence_of: dict[Effect, str] = {"geometry": f"{len(spec.objects)} objects"}
 
     def note(effect: Effect, evidence: str) -> None:
-        found.setdefault(effect, evidence)
+        evidence_of.setdefault(effect, evidence)
 
     lamps = [f"lights[{k}] is a {light.type}" for k, light in enumerate(spec.lights)]
     lamps += [f"object {item.name!r} shines" for item in spec.objects if item.emission]
@@ -76,11 +76,11 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
                 note("dispersion", f"{name} of Abbe number {material.abbe:g}")
     if bent and small:
         note("caustics", f"{bent[0]}, and {small[0]}")
-    if "refraction" in found or (len(bent) > 1 and polarising):
+    if "refraction" in evidence_of or (len(bent) > 1 and polarising):
         note(
             "polarisation",
             "light meets specular surfaces more than once:"
-            f" {bent[0] if bent else found['refraction']}",
+            f" {bent[0] if bent else evidence_of['refraction']}",
         )
     for k, light in enumerate(spec.lights):
         if isinstance(light, SkySpec):
@@ -91,7 +91,7 @@ def called_for(spec: SceneSpec) -> dict[Effect, str]:
         note("depth_of_field", f"cameras.lens has an aperture of {spec.cameras.lens.aperture:g}")
     if spec.appearance.bounces != 1:
         note("interreflection", f"appearance.bounces is {spec.appearance.bounces}")
-    return found
+    return evidence_of
 
 
 _REMEDIES: dict[Effect, str] = {
@@ -114,22 +114,22 @@ _REMEDIES: dict[Effect, str] = {
 
 
 def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
-    """What a scene file says that cannot all be true: message, and where in the file it stands."""
-    found = called_for(spec)
+    """Contradictions in a scene file: a message, and the key in the file."""
+    present = called_for(spec)
     pinned, forbidden = spec.effects.pin, spec.effects.forbid
     for k, effect in enumerate(forbidden):
-        where = ("effects", "forbid", k)
+        key = ("effects", "forbid", k)
         if effect == "geometry":
-            yield "effects.forbid: every picture needs the geometry; take it off the list", where
+            yield "effects.forbid: every picture needs the geometry; take it off the list", key
         elif effect in pinned:
-            yield f"effects.forbid: {effect!r} is pinned as well; keep one of the two", where
-        elif effect in found:
+            yield f"effects.forbid: {effect!r} is pinned as well; keep one of the two", key
+        elif effect in present:
             yield (
                 (
                     f"effects.forbid: {effect!r} is forbidden, but the scene calls for it"
-                    f" ({found[effect]}); {_REMEDIES[effect]}, or take {effect!r} off the list"
+                    f" ({present[effect]}); {_REMEDIES[effect]}, or take {effect!r} off the list"
                 ),
-                where,
+                key,
             )
     for k, effect in enumerate(pinned):
         if effect in NOT_SIMULATED:
@@ -140,7 +140,7 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
                 ),
                 ("effects", "pin", k),
             )
-        elif effect not in found:
+        elif effect not in present:
             yield (
                 (
                     f"effects.pin: {effect!r} is pinned, but nothing here causes it;"

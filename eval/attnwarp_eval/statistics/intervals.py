@@ -2,9 +2,8 @@
 
 Views of one scene are correlated, so the scene is the unit of evidence: an interval is Student's t
 over the means of the scenes. The views are a designed set (the same yaws for every scene and
-variant), not a sample, so they are not resampled. docs/statistics.md has the coverage that was
-measured for this and for two bootstraps: with three scenes theirs is 73 to 92 %, or above 97 %, at
-a stated 95 %.
+variant), not a sample, so they are not resampled. reports/statistics/coverage.md has the measured
+coverage of this interval and of two bootstraps.
 """
 
 from __future__ import annotations
@@ -64,12 +63,12 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     """
     from scipy import stats
 
-    kept = {
+    defined = {
         scene: np.asarray(v, dtype=np.float64)[np.isfinite(v)]
         for scene, v in sorted(values.items())
     }
-    undefined = sum(len(v) for v in values.values()) - sum(len(v) for v in kept.values())
-    groups = [v for v in kept.values() if len(v)]
+    undefined = sum(len(v) for v in values.values()) - sum(len(v) for v in defined.values())
+    groups = [v for v in defined.values() if len(v)]
     views = sum(len(v) for v in groups)
     if not groups:
         return Interval(np.nan, np.nan, np.nan, 0, 0, undefined, np.nan, np.nan)
@@ -167,8 +166,8 @@ def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
         for view in a[scene]
         if view in b[scene]
     ]
-    known = [d for d in differences if np.isfinite(d)]
-    return sum(d * sign > 0 for d in known), len(known)
+    defined = [d for d in differences if np.isfinite(d)]
+    return sum(d * sign > 0 for d in defined), len(defined)
 
 
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:
@@ -177,8 +176,8 @@ def benjamini_hochberg(p: Sequence[float]) -> list[float]:
     """
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(values.shape, np.nan)
-    known = np.flatnonzero(np.isfinite(values))
-    order = known[np.argsort(values[known], kind="stable")]
+    defined = np.flatnonzero(np.isfinite(values))
+    order = defined[np.argsort(values[defined], kind="stable")]
     smallest = 1.0
     for rank in range(len(order), 0, -1):
         smallest = min(smallest, float(values[order[rank - 1]]) * len(order) / rank)
@@ -220,10 +219,10 @@ def front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """
     c, e = np.asarray(cost, dtype=np.float64), np.asarray(error, dtype=np.float64)
     order = [int(i) for i in np.lexsort((e, c)) if np.isfinite(c[i]) and np.isfinite(e[i])]
-    kept: list[int] = []
+    indices: list[int] = []
     best = np.inf
     for i in order:
         if e[i] < best:
-            kept.append(i)
+            indices.append(i)
             best = float(e[i])
-    return kept
+    return indices

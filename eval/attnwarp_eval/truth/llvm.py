@@ -71,9 +71,9 @@ def variant() -> str:
     named = os.environ.get("ATTNWARP_MITSUBA")
     if named:
         return named
-    said = os.environ.get("DRJIT_LIBLLVM_PATH")
+    chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
     # With nothing found in the usual places Dr.Jit may still know one that is not.
-    tried: list[str | None] = [said] if said else [*libraries()[:TRIES]] or [None]
+    tried: list[str | None] = [chosen] if chosen else [*libraries()[:TRIES]] or [None]
     for library in tried:
         if works(library):
             if library:
@@ -84,13 +84,13 @@ def variant() -> str:
 
 def libraries() -> list[str]:
     """LLVM libraries in the usual places that may work: one path for each version, newest first."""
-    found: dict[tuple[int, ...], str] = {}
+    newest: dict[tuple[int, ...], str] = {}
     for place in PLACES:
         for path in sorted(glob.glob(place.format(prefix=sys.prefix))):  # noqa: PTH207 - absolute patterns
-            known = version(os.path.realpath(path)) or version(path)
-            if known is not None and known[0] >= OLDEST and Path(path).is_file():
-                found.setdefault(known, os.path.realpath(path))
-    return [found[key] for key in sorted(found, reverse=True)]
+            number = version(os.path.realpath(path)) or version(path)
+            if number is not None and number[0] >= OLDEST and Path(path).is_file():
+                newest.setdefault(number, os.path.realpath(path))
+    return [newest[key] for key in sorted(newest, reverse=True)]
 
 
 def version(path: str) -> tuple[int, ...] | None:

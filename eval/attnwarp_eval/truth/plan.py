@@ -178,11 +178,11 @@ def plan(
     for message, _ in transport.contradictions(scene.spec):
         raise SceneError(message, scene.path)
 
-    found = transport.called_for(scene.spec)
+    needed = transport.called_for(scene.spec)
     lights = scene.spec.lights
     everything = tuple(range(len(lights)))
     lamps = any(item.emission for item in scene.spec.objects)
-    media = "medium" in found or "subsurface" in found
+    media = "medium" in needed or "subsurface" in needed
     lens = scene.spec.cameras.lens
     reasons: list[str] = []
     optic = Lens(lens.aperture, lens.focus) if lens else None
@@ -200,10 +200,11 @@ def plan(
 
     if media:
         reasons.append(
-            f"light passes through a medium ({found.get('medium') or found['subsurface']}): volpath"
+            "light passes through a medium"
+            f" ({needed.get('medium') or needed['subsurface']}): volpath"
         )
         return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, roulette))
-    if not {"specular", "glossy", "refraction"} & set(found):
+    if not {"specular", "glossy", "refraction"} & set(needed):
         reasons.append(
             "every material is diffuse and opaque: no path passes through glass or a medium, and"
             " none is specular"
@@ -213,11 +214,11 @@ def plan(
             f"the scene asks for {wanted.bounces} bounces: paths "
             + ("until roulette ends them" if depth < 0 else f"of up to {depth} edges")
         )
-        small = small_lights(scene) if "caustics" in found and optic is None else None
+        small = small_lights(scene) if "caustics" in needed and optic is None else None
         if small is None:
             return finish(Pass(everything, "path", depth, 1, 1, spp, lamps, roulette))
         reasons.append(
-            f"light of {small} is bent by {found['caustics'].split(',')[0]}: paths from the light"
+            f"light of {small} is bent by {needed['caustics'].split(',')[0]}: paths from the light"
             " find its caustic"
         )
         reasons.append(
@@ -253,7 +254,7 @@ def plan(
     reasons.append(
         "the scene asks for one bounce: light sampled at each visible point is the whole sum"
     )
-    glossy = "glossy" in found
+    glossy = "glossy" in needed
     passes = []
     # One direction or one point is one sample: its own pass has no noise but that of the pixel's
     # area.
@@ -338,8 +339,8 @@ def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
             )
             return replace(ours, passes=passes, media=False)
         case "caustics":
-            kept = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
-            passes = tuple(replace(step, first="any") for step in kept)
+            remaining = (step for step in passes if step.integrator != "ptracer" and step.sign > 0)
+            passes = tuple(replace(step, first="any") for step in remaining)
         case "environment":
             skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
             passes = tuple(
@@ -389,7 +390,7 @@ def small_lamps(scene: Scene) -> list[int]:
         for shape in scene.shapes():
             if shape.object_id in bent or shape.object_id in lamps:
                 boxes.setdefault(shape.object_id, []).append(shape.bounds())
-        middle = {k: np.mean([b.mean(0) for b in found], axis=0) for k, found in boxes.items()}
+        middle = {k: np.mean([b.mean(0) for b in corners], axis=0) for k, corners in boxes.items()}
         for k in lamps:
             low, high = (
                 np.min([b[0] for b in boxes[k]], axis=0),
@@ -413,13 +414,13 @@ def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
 
     None for other lights, or where the cone would be wider than 60 degrees: then it saves little.
     """
-    said = scene.spec.lights[light]
+    spec = scene.spec.lights[light]
     smooth = smooth_objects(scene)
-    if said.type != "point" or not smooth:
+    if spec.type != "point" or not smooth:
         return None
     bounds = [shape.bounds() for shape in scene.shapes() if shape.object_id in smooth]
     low, high = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
-    axis = (low + high) / 2 - np.array(said.position)
+    axis = (low + high) / 2 - np.array(spec.position)
     reach = BEAM_MARGIN * float(np.linalg.norm(high - low)) / 2 / float(np.linalg.norm(axis))
     if reach >= 1 or np.degrees(np.arcsin(reach)) > 60:
         return None

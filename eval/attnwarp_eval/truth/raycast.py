@@ -254,9 +254,9 @@ class Geometry:
             meet(every, t, np.full(len(t), self._object[len(self._faces) + k]))
         if self._embree is not None:
             rays = self._o3d.core.Tensor(np.concatenate([origins, local], axis=1, dtype=np.float32))
-            found = self._embree.list_intersections(rays)
-            ray = found["ray_ids"].numpy().astype(np.int64)
-            face = found["primitive_ids"].numpy().astype(np.int64)
+            crossings = self._embree.list_intersections(rays)
+            ray = crossings["ray_ids"].numpy().astype(np.int64)
+            face = crossings["primitive_ids"].numpy().astype(np.int64)
             normal = self._face_normal[face]
             with np.errstate(divide="ignore", invalid="ignore"):
                 t = np.einsum(

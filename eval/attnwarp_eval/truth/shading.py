@@ -55,11 +55,11 @@ def object_albedo(
     objects = geometry.object_of(primitive_id)
     color = np.zeros((len(points), 3))
     for k, item in enumerate(scene.spec.objects):
-        mine = objects == k
-        if item.emission is not None or not mine.any():
+        pixels = objects == k
+        if item.emission is not None or not pixels.any():
             continue  # what shines reflects nothing
         tint = getattr(item.material, "tint", None)
-        color[mine] = albedo(item.texture, points[mine]) if tint is None else linear_rgb(tint)
+        color[pixels] = albedo(item.texture, points[pixels]) if tint is None else linear_rgb(tint)
     return color * geometry.tint(points, primitive_id)
 
 
@@ -152,9 +152,9 @@ def _lamp_irradiance(
         if emission is None:
             continue
         for part in shape.rectangles() if isinstance(shape, Box) else [shape]:
-            at, facing, area = _spread(part, rays)
+            origins, facing, area = _spread(part, rays)
             # Just off the lamp, which otherwise would hide the point from itself.
-            eyes = at + 1e-5 * geometry.extent * facing
+            eyes = origins + 1e-5 * geometry.extent * facing
             share = emission.radiance * area / rays
             for eye, turned in zip(eyes, facing, strict=True):
                 way = eye - points
@@ -177,9 +177,11 @@ def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array,
     first = (np.arange(count) + 0.5) / count
     second = np.array([int(f"{k:032b}"[::-1], 2) / 2**32 for k in range(count)])
     if isinstance(shape, Rectangle):
-        at = shape.center + (2 * first - 1)[:, None] * shape.u + (2 * second - 1)[:, None] * shape.v
+        points = (
+            shape.center + (2 * first - 1)[:, None] * shape.u + (2 * second - 1)[:, None] * shape.v
+        )
         area = 4 * float(np.linalg.norm(np.cross(shape.u, shape.v)))
-        return at, np.broadcast_to(shape.normal, at.shape), area
+        return points, np.broadcast_to(shape.normal, points.shape), area
     if isinstance(shape, Sphere):
         z, phi = 1 - 2 * first, 2 * np.pi * second
         r = np.sqrt(1 - z**2)
@@ -192,8 +194,8 @@ def _spread(shape: Sphere | Rectangle | Mesh, count: int) -> tuple[Array, Array,
     a, b, c = (corners[picked, k] for k in range(3))
     root = np.sqrt(second)[:, None]
     across = ((np.arange(count) * 0.6180339887498949) % 1.0)[:, None]
-    at = (1 - root) * a + root * (1 - across) * b + root * across * c
-    return at, normal[picked] / (2 * areas[picked, None]), float(areas.sum())
+    points = (1 - root) * a + root * (1 - across) * b + root * across * c
+    return points, normal[picked] / (2 * areas[picked, None]), float(areas.sum())
 
 
 def _sky_irradiance(

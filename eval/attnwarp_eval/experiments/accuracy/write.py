@@ -141,7 +141,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
             rows = []
             for k, c in enumerate(panel.contestants):
                 value, low, high = c.error
-                shown = (
+                error = (
                     number(value)
                     if low == high
                     else f"{number(value)} [{number(low)}, {number(high)}]"
@@ -155,15 +155,15 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                         f"{c.more['p99']:.1e}",
                         f"{100 * c.more['wrong']:.2f} %",
                     ]
-                    shown = f"{value:.1e}"
+                    error = f"{value:.1e}"
                 else:
                     more = [f"{100 * c.more[key]:.1f} %" for key in ("wrong", "unanswered")]
-                    shown = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+                    error = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
                 times = [
                     number(1000 * float(np.median(c.seconds))),
                     "1" if k == 0 else ratio(panel.ratio(k)),
                 ]
-                rows.append([c.name, shown, *more, *times])
+                rows.append([c.name, error, *more, *times])
             blank = ["–"] * (1 + len(extra))
             rows.append(
                 [

@@ -163,9 +163,9 @@ def interior(item: ObjectSpec) -> InteriorSpec | None:
 
 def fog_box(scene: Scene) -> tuple[Array, Array]:
     """(3,) lowest and highest corner of the scene's medium."""
-    said = scene.spec.medium
-    if said is not None and said.box is not None:
-        middle, half = np.array(said.box.center), np.array(said.box.size) / 2
+    medium = scene.spec.medium
+    if medium is not None and medium.box is not None:
+        middle, half = np.array(medium.box.center), np.array(medium.box.size) / 2
         return middle - half, middle + half
     points = [corner for shape in scene.shapes() for corner in shape.bounds()]
     points += [camera.position for camera in scene.cameras]
@@ -187,13 +187,13 @@ def _within(scene: Scene, owner: int, box: tuple[Array, Array] | None) -> bool:
     return bool(((middle > box[0]) & (middle < box[1])).all())
 
 
-def medium_form(said: InteriorSpec) -> dict[str, Any]:
+def medium_form(spec: InteriorSpec) -> dict[str, Any]:
     """A homogeneous medium as Mitsuba reads it."""
     return {
         "type": "homogeneous",
-        "sigma_t": said.sigma_t,
-        "albedo": _rgb(said.albedo, said.tint),
-        "phase": {"type": "hg", "g": said.g},
+        "sigma_t": spec.sigma_t,
+        "albedo": _rgb(spec.albedo, spec.tint),
+        "phase": {"type": "hg", "g": spec.g},
     }
 
 
@@ -452,9 +452,9 @@ def _write_ply(path: Path, mesh: Mesh, center: Array, color: Array) -> None:
         names += ["nx", "ny", "nz"]
     columns.append(color)
     names += ["r", "g", "b"]
-    kept = without_needles(mesh.vertices, mesh.faces)
-    faces = np.zeros(len(kept), dtype=[("n", "u1"), ("v", "<i4", 3)])
-    faces["n"], faces["v"] = 3, kept
+    triangles = without_needles(mesh.vertices, mesh.faces)
+    faces = np.zeros(len(triangles), dtype=[("n", "u1"), ("v", "<i4", 3)])
+    faces["n"], faces["v"] = 3, triangles
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(mesh.vertices)}"]
     header += [f"property float {name}" for name in names]
     header += [
@@ -479,16 +479,16 @@ def light_form(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -
             "irradiance": {"type": "rgb", "value": color},
         }
     if isinstance(light, PointSpec | SpotSpec):
-        at = (np.array(light.position) - center).tolist()
+        position = (np.array(light.position) - center).tolist()
         strength = _rgb(light.intensity, light.color)
         if isinstance(light, PointSpec):
-            return {"type": "point", "position": at, "intensity": strength}
+            return {"type": "point", "position": position, "intensity": strength}
         toward = (np.array(light.target) - center).tolist()
         upright = np.cross(np.array(light.target) - np.array(light.position), [0, 0, 1.0])
         up = [0, 0, 1] if np.linalg.norm(upright) > 1e-6 else [1, 0, 0]
         return {
             "type": "spot",
-            "to_world": mi.ScalarTransform4f().look_at(origin=at, target=toward, up=up),
+            "to_world": mi.ScalarTransform4f().look_at(origin=position, target=toward, up=up),
             "intensity": strength,
             "cutoff_angle": light.cutoff,
             "beam_width": 0.75 * light.cutoff if light.beam is None else light.beam,
@@ -507,16 +507,16 @@ def light_form(light: SunSpec | SkySpec | PointSpec | SpotSpec, center: Array) -
 
 def _beam(scene: Scene, light: int, center: Array) -> dict[str, Any]:
     """A point light as a spot upon what is smooth: the same light within the cone, none outside."""
-    cone, said = beam(scene, light), scene.spec.lights[light]
-    if cone is None or not isinstance(said, PointSpec):
-        raise ValueError(f"lights[{light}]: got a {said.type} without a beam upon smooth objects")
+    cone, spec = beam(scene, light), scene.spec.lights[light]
+    if cone is None or not isinstance(spec, PointSpec):
+        raise ValueError(f"lights[{light}]: got a {spec.type} without a beam upon smooth objects")
     axis, angle = cone
     spot = SpotSpec(
         type="spot",
-        position=said.position,
-        target=tuple(np.array(said.position) + axis),
-        intensity=said.intensity,
-        color=said.color,
+        position=spec.position,
+        target=tuple(np.array(spec.position) + axis),
+        intensity=spec.intensity,
+        color=spec.color,
         cutoff=angle,
         beam=0.999 * angle,
     )
@@ -595,11 +595,11 @@ def focus_distance(scene: Scene, camera: Camera) -> float:
     return depth if depth > 0 else scene.spec.cameras.radius
 
 
-def plugin_names(where: str, form: Any) -> list[tuple[str, str]]:
+def plugin_names(path: str, form: Any) -> list[tuple[str, str]]:
     """(place, plugin name) of a form and of all forms in it."""
     if not isinstance(form, dict):
         return []
-    out = [(where, str(form["type"]))] if "type" in form else []
+    out = [(path, str(form["type"]))] if "type" in form else []
     for key, value in form.items():
-        out += plugin_names(f"{where}.{key}", value)
+        out += plugin_names(f"{path}.{key}", value)
     return out

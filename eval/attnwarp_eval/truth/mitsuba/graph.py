@@ -22,7 +22,7 @@ from attnwarp_eval.truth.plan import plan
 
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
-    """The whole scene as Mitsuba has it: (where, plugin name) as parsed, and (where, object) as
+    """The whole scene as Mitsuba has it: (path, plugin name) as parsed, and (path, object) as
     loaded.
     """
     mi = library(variant())
@@ -34,8 +34,8 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     )
     names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}
     parsed = [
-        (where.replace(where.split(".")[0], names.get(where.split(".")[0], where), 1), n)
-        for where, n in plugins
+        (path.replace(path.split(".")[0], names.get(path.split(".")[0], path), 1), n)
+        for path, n in plugins
     ]
     for k in everything:
         parsed += plugin_names(f"lights[{k}]", light_form(scene.spec.lights[k], center))
@@ -52,26 +52,26 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     )
     loaded = [
         (
-            names.get(where.split(".")[0], where.split(".")[0]) + where[len(where.split(".")[0]) :],
+            names.get(path.split(".")[0], path.split(".")[0]) + path[len(path.split(".")[0]) :],
             thing,
         )
-        for where, thing in _walk(world)
+        for path, thing in _walk(world)
     ]
     return parsed, loaded
 
 
-def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
+def _walk(thing: Any, path: str = "") -> list[tuple[str, Any]]:
     """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
     it.
     """
     mi = library()
-    found: list[tuple[str, Any]] = []
+    objects: list[tuple[str, Any]] = []
 
     class Visit(mi.TraversalCallback):  # type: ignore[name-defined]
         def put(self, name: str, value: Any, *_: Any) -> None:
             if isinstance(value, mi.Object):
-                found.append((where + name, value))
-                found.extend(_walk(value, f"{where}{name}."))
+                objects.append((path + name, value))
+                objects.extend(_walk(value, f"{path}{name}."))
 
         put_object = put
 
@@ -79,4 +79,4 @@ def _walk(thing: Any, where: str = "") -> list[tuple[str, Any]]:
             """Numbers are of no interest here."""
 
     thing.traverse(Visit())
-    return found
+    return objects
