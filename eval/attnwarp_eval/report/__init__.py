@@ -27,6 +27,17 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
     Returns:
         The files written, the one a person opens first at the end.
+
+    Example:
+        >>> from attnwarp_eval.study import Store, parse_study
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> study = parse_study(
+        ...     {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}, "probes": {"depth": ["a"]}}
+        ... )
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> [path.name for path in write_report(store)]
+        ['results.jsonl', 'report.md', 'report.html']
     """
     results = read_results(store)
     report = build(results, store.root, timings=timings, pictures=pictures)

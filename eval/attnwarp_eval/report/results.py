@@ -21,6 +21,16 @@ def read_results(store: Store) -> Results:
 
     Raises:
         StoreError: the folder is no run, or its study cannot be read.
+
+    Example:
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> study = parse_study(
+        ...     {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}, "probes": {"depth": ["a"]}}
+        ... )
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]  # none is done
+        [('calibration', None), ('depth', None)]
     """
     stored = store.read_study()
     try:
