@@ -31,9 +31,8 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     Example:
         >>> from attnwarp_eval.study import Store, parse_study
         >>> from attnwarp_eval.study.run import expected, plan
-        >>> study = parse_study(
-        ...     {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}, "probes": {"depth": ["a"]}}
-        ... )
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
         >>> store = Store("run")
         >>> store.write_study(expected(plan(study, store)))
         >>> [path.name for path in write_report(store)]

@@ -67,9 +67,8 @@ def problems(results: Results) -> list[str]:
     Example:
         >>> from attnwarp_eval.study import parse_study
         >>> from attnwarp_eval.study.results import Results
-        >>> study = parse_study(
-        ...     {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}, "probes": {"depth": ["a"]}}
-        ... )
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
         >>> problems(Results(study, cells=[], failures=[]))  # nothing measured, nothing wrong
         []
     """

@@ -24,12 +24,11 @@ def read_results(store: Store) -> Results:
 
     Example:
         >>> from attnwarp_eval.study.run import expected, plan
-        >>> study = parse_study(
-        ...     {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}, "probes": {"depth": ["a"]}}
-        ... )
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
         >>> store = Store("run")
         >>> store.write_study(expected(plan(study, store)))
-        >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]  # none is done
+        >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]
         [('calibration', None), ('depth', None)]
     """
     stored = store.read_study()

@@ -24,7 +24,8 @@ class Cell:
 
     Example:
         >>> from attnwarp_eval.study import Cell
-        >>> a, b = (Cell({"scene": "hash"}, "bear", name, "depth", seed=0) for name in ("good", "same"))
+        >>> a = Cell({"scene": "hash"}, "bear", "good", "depth", seed=0)
+        >>> b = Cell({"scene": "hash"}, "bear", "same", "depth", seed=0)
         >>> a.title, a.id == b.id  # names are not in the spec
         ('bear / good / depth', True)
     """

@@ -106,9 +106,8 @@ def parse_study(data: Any) -> Study:
 
     Example:
         >>> variants = {"corrected": {}, "slipped": {"set": {"pixel_centers": "integer"}}}
-        >>> study = parse_study(
-        ...     {"name": "my", "scenes": ["spheres"], "variants": variants, "probes": {"warp": ["slipped"]}}
-        ... )
+        >>> content = dict(name="my", scenes=["spheres"], variants=variants)
+        >>> study = parse_study(content | {"probes": {"warp": ["slipped"]}})
         >>> study.variants["slipped"].settings().pixel_centers
         'integer'
     """
@@ -148,9 +147,8 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
         >>> variants = {"a": {}, "b": {"preset": "corrected"}}  # of the same content
-        >>> study = parse_study(
-        ...     {"name": "my", "scenes": ["spheres"], "variants": variants, "probes": {"warp": ["a", "b"]}}
-        ... )
+        >>> content = dict(name="my", scenes=["spheres"], variants=variants)
+        >>> study = parse_study(content | {"probes": {"warp": ["a", "b"]}})
         >>> cells = cells_of(study, {"spheres": load_scene("spheres")})
         >>> [cell.labels for cell in cells if cell.probe == "warp"]
         [('a', 'b')]
