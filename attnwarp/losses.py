@@ -58,6 +58,10 @@ def psnr(image: Tensor, target: Tensor) -> float:
 def psnr_of_mse(error: float) -> float:
     """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0. To average views,
     average the error.
+
+    Example:
+        >>> psnr_of_mse(0.001), psnr_of_mse(0.0)
+        (30.0, inf)
     """
     return -10 * math.log10(error) if error > 0 else math.inf
 
@@ -88,7 +92,14 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`."""
+    """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`.
+
+    Example:
+        >>> import torch
+        >>> picture = torch.rand(16, 12, 3)
+        >>> ssim_map(picture, picture).shape  # one value a window
+        torch.Size([6, 2, 3])
+    """
     _windowed(image, target)
     result: Tensor = _Ssim.apply(image, target)
     return result
@@ -103,6 +114,13 @@ def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
     Raises:
         ValueError: as :func:`ssim`.
+
+    Example:
+        >>> import torch
+        >>> black, white = torch.zeros(11, 11, 3), torch.ones(11, 11, 3)
+        >>> luminance, structure = ssim_terms(black, white)
+        >>> luminance.max().item() < 1e-3, bool((structure > 0.99).all())  # both are flat
+        (True, True)
     """
     _windowed(image, target)
     _, _, a1, a2, b1, b2 = _moments(image.detach(), target.detach())
@@ -200,6 +218,17 @@ def normal_consistency(view: Render) -> Tensor:
 
     That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges
     of what is drawn) count as 0. Gradients flow through both normals.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.render import render
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=16, height=16, fov_y=40, up=(0, 1, 0))
+        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
+        >>> normal_consistency(render(disc, camera)).item() < 1e-5  # a disc is flat
+        True
     """
     N = view.normal_from_depth
     defined = torch.isfinite(N.detach()).all(-1)
@@ -219,6 +248,17 @@ def depth_distortion(view: Render, form: Distortion = "l1", *, scale: float = 1.
 
     Raises:
         ValueError: another form.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.render import render
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=16, height=16, fov_y=40, up=(0, 1, 0))
+        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
+        >>> depth_distortion(render(disc, camera)).item()  # one splat has no spread
+        0.0
     """
     check.one_of(form, ("l1", "l2_ndc"), "form")
     return view.distortion_l1.mean() / scale if form == "l1" else view.distortion_l2_ndc.mean()

@@ -2,7 +2,9 @@
 
 import doctest
 import importlib
+import inspect
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +19,62 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "attnwarp_eval"}
 
 
+DOORS = [
+    "attnwarp",
+    "attnwarp.encoders",
+    "attnwarp.fit",
+    "attnwarp.io",
+    "attnwarp.losses",
+    "attnwarp.render",
+    "attnwarp.warp",
+    "attnwarp_eval.document.model",
+    "attnwarp_eval.document.numbers",
+    "attnwarp_eval.document.write",
+    "attnwarp_eval.metrics",
+    "attnwarp_eval.report",
+    "attnwarp_eval.scene.file",
+    "attnwarp_eval.scene.scene",
+    "attnwarp_eval.splats.export",
+    "attnwarp_eval.splats.surface",
+    "attnwarp_eval.statistics.equivalence",
+    "attnwarp_eval.statistics.intervals",
+    "attnwarp_eval.study",
+    "attnwarp_eval.truth",
+]
+"""Modules that other code imports from: what ``__all__`` names, else their own public names."""
+
+
+def public(door):
+    """The functions and classes of a door, by name."""
+    module = importlib.import_module(door)
+    names = getattr(module, "__all__", None)
+    for name, value in sorted(vars(module).items()) if names is None else ():
+        if not name.startswith("_") and getattr(value, "__module__", None) == door:
+            yield name, value
+    for name in names or ():
+        yield name, getattr(module, name)
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_every_public_function_and_class_of_a_door_has_an_example(door):
+    values = {
+        name: value
+        for name, value in public(door)
+        if inspect.isclass(value) or inspect.isroutine(value)
+    }
+    assert values, f"{door}: no public names"
+    missing = [
+        name
+        for name, value in values.items()
+        if not re.search(r"^ *Example:\n(?:.*\n)*? *>>> ", value.__doc__ or "", re.M)
+    ]
+    assert not missing, f"{door}: no example of {', '.join(missing)}"
+
+
 def modules_with_examples():
     for package, folder in PACKAGES.items():
         for path in sorted(folder.rglob("*.py")):
-            lines = path.read_text().splitlines()
-            if any(">>> " in line and "+SKIP" not in line for line in lines):
+            if ">>> " in path.read_text():
                 parts = path.relative_to(folder).with_suffix("").parts
                 yield ".".join((package, *parts)).removesuffix(".__init__")
 
@@ -69,8 +122,10 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE | doctest.FAIL_FAST
     )
     output = []
-    for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
-        runner.run(example, out=output.append)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
+            runner.run(example, out=output.append)
     assert runner.failures == 0, "".join(output)
     assert runner.tries > 0, f"{name}: no example ran"
 

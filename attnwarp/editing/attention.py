@@ -48,6 +48,11 @@ class Layer:
         kind: "self" or "cross".
         level: how often the latents are halved before it; its size is that fraction of theirs.
         channels: of its output.
+
+    Example:
+        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 1, 64)
+        >>> layer.size((64, 48))  # half the latents' size
+        (32, 24)
     """
 
     name: str
@@ -379,7 +384,12 @@ def decay(a0: float = 0.9) -> Callable[[int, int], float]:
 
 
 def constant(a: float) -> Callable[[int, int], float]:
-    """The same weight at every step."""
+    """The same weight at every step.
+
+    Example:
+        >>> [constant(0.5)(step, 4) for step in range(4)]
+        [0.5, 0.5, 0.5, 0.5]
+    """
     _check_share(a, "a")
     return lambda step, steps: a
 

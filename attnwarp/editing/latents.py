@@ -25,6 +25,11 @@ def haar_basis() -> Tensor:
 
     Channels 0 to 2 are the mean of a block's luminance, red against blue, green against both; 3 to
     11 the coarse details; 12 to 47 the fine ones.
+
+    Example:
+        >>> kernels = haar_basis().flatten(1)
+        >>> torch.allclose(kernels @ kernels.T, torch.eye(48, dtype=kernels.dtype), atol=1e-6)
+        True
     """
     color = torch.tensor([[1.0, 1, 1], [1, 0, -1], [1, -2, 1]], dtype=torch.float64)
     color = color / color.norm(dim=1, keepdim=True)

@@ -93,5 +93,10 @@ def steps_from(start: int, steps: int) -> list[int]:
 
 
 def following(timesteps: list[int]) -> list[tuple[int, int | None]]:
-    """Each timestep with the one that follows it; None after the last."""
+    """Each timestep with the one that follows it; None after the last.
+
+    Example:
+        >>> following([999, 499])
+        [(999, 499), (499, None)]
+    """
     return list(zip(timesteps, [*timesteps[1:], None], strict=True))

@@ -33,6 +33,12 @@ class EncoderInfo:
         preprocessing: the steps before the network, in words.
         size: side in px of the network's square input; None: pictures keep their size.
         dim: length of an embedding; None for a distance.
+
+    Example:
+        >>> from attnwarp.encoders import load_encoder
+        >>> about = load_encoder("perceptual-small").about
+        >>> about.name, about.kind, about.source, len(about.weights_sha256), about.dim
+        ('perceptual-small', 'perceptual', 'bundled', 64, None)
     """
 
     name: str
@@ -50,7 +56,15 @@ class EncoderInfo:
 
 @runtime_checkable
 class ImageEncoder(Protocol):
-    """Pictures to embeddings."""
+    """Pictures to embeddings.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.encoders import ImageEncoder, load_encoder
+        >>> encoder = load_encoder("dino-small")
+        >>> isinstance(encoder, ImageEncoder), encoder.images([np.zeros((64, 96, 3))]).shape
+        (True, (1, 192))
+    """
 
     @property
     def about(self) -> EncoderInfo:
@@ -72,7 +86,17 @@ class ImageEncoder(Protocol):
 
 @runtime_checkable
 class TextImageEncoder(ImageEncoder, Protocol):
-    """Pictures and texts to one space, as CLIP."""
+    """Pictures and texts to one space, as CLIP.
+
+    Example:
+        >>> from attnwarp.encoders import TextImageEncoder, load_encoder
+        >>> encoder = load_encoder("clip-small")
+        >>> isinstance(encoder, TextImageEncoder)
+        True
+        >>> red, again = encoder.texts(["a red sphere", "a red sphere"])
+        >>> bool((red == again).all())
+        True
+    """
 
     def texts(self, texts: Sequence[str]) -> npt.NDArray[np.float64]:
         """(N, D) float64 embeddings, not normalised; (0, D) of an empty list."""
@@ -81,7 +105,15 @@ class TextImageEncoder(ImageEncoder, Protocol):
 
 @runtime_checkable
 class TokenEncoder(ImageEncoder, Protocol):
-    """Pictures to embeddings and to grids of patch embeddings, as DINO."""
+    """Pictures to embeddings and to grids of patch embeddings, as DINO.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.encoders import TokenEncoder, load_encoder
+        >>> encoder = load_encoder("dino-small")
+        >>> isinstance(encoder, TokenEncoder), encoder.tokens([np.zeros((64, 64, 3))]).shape
+        (True, (1, 8, 8, 192))
+    """
 
     def tokens(self, images: Sequence[Image]) -> npt.NDArray[np.float64]:
         """(N, h, w, D) float64 embeddings of the patches of the preprocessed picture, by row."""
@@ -90,7 +122,17 @@ class TokenEncoder(ImageEncoder, Protocol):
 
 @runtime_checkable
 class PerceptualDistance(Protocol):
-    """A distance of pictures that follows human judgement, as LPIPS."""
+    """A distance of pictures that follows human judgement, as LPIPS.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.encoders import load_encoder
+        >>> encoder = load_encoder("perceptual-small", "perceptual")
+        >>> black, white = np.zeros((64, 64, 3)), np.ones((64, 64, 3))
+        >>> same, other = encoder.distance([black, black], [black, white])
+        >>> bool(same == 0), bool(other > 0)
+        (True, True)
+    """
 
     @property
     def about(self) -> EncoderInfo:

@@ -48,6 +48,12 @@ class Record:
             their pictures.
         psnr_pooled: of their mean squared error.
         measures: what the caller's own measure gave.
+
+    Example:
+        >>> from attnwarp.fit import Record
+        >>> record = Record(100, 2.0, 3.5, 60, loss=0.02, psnr=28.0, psnr_pooled=27.5)
+        >>> record.iteration / record.seconds  # iterations a second
+        50.0
     """
 
     iteration: int
@@ -70,6 +76,12 @@ class Step:
         held_out: PSNR at the last evaluation, dB, or None.
         splats: their number.
         seconds: spent on iterations.
+
+    Example:
+        >>> from attnwarp.fit import Step
+        >>> step = Step(100, 3000, loss=0.02, psnr=28.0, held_out=None, splats=60, seconds=2.0)
+        >>> print(f"{step.iteration / step.iterations:.0%} done")
+        3% done
     """
 
     iteration: int
@@ -93,6 +105,17 @@ class Fit:
         seconds, cpu_seconds: spent on them.
         stopped: why it ended: "iterations" (all done), "time", "patience", or "asked".
         extent: of the scene, by which the settings' shares are measured.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import FitSettings, Views, fit, from_points
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=16, height=16, fov_y=40)
+        >>> start = from_points(np.eye(3), kind="3d", sh_degree=0)
+        >>> grey = Views([camera], [np.full((16, 16, 3), 0.5)])
+        >>> result = fit(start, grey, FitSettings(kind="3d", iterations=2, sh_degree=0))
+        >>> result.stopped, [record.iteration for record in result.history]
+        ('iterations', [0, 2])
     """
 
     gaussians: Gaussians

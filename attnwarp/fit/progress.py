@@ -34,8 +34,13 @@ def progress_display(
     """What to pass as ``watch`` to :func:`attnwarp.fit.fit`; writes to stderr unless told where.
 
     Example:
-        >>> with progress_display(title="bear") as watch:  # doctest: +SKIP
-        ...     result = fit(start, views, settings, watch=watch)
+        >>> import sys
+        >>> from rich.console import Console
+        >>> from attnwarp.fit import Step
+        >>> from attnwarp.fit.progress import progress_display
+        >>> with progress_display(Console(file=sys.stdout, width=100), title="bear") as watch:
+        ...     watch(Step(9, 9, loss=0.02, psnr=28.0, held_out=None, splats=60, seconds=2.0))
+        bear [9/9] 2 s: loss 0.0200, PSNR 28.00 dB, 60 splats
     """
     from rich.console import Console as Terminal
     from rich.progress import (

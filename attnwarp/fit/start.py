@@ -26,6 +26,14 @@ def extent_of(cameras: Sequence[Camera]) -> float:
     (3DGS).
 
     Cameras that stand at one place say nothing about it; then it is 1.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import extent_of
+        >>> view = dict(width=64, height=48, fov_y=40)
+        >>> cameras = [Camera.look_at((x, 0, 0), (0, 5, 0), **view) for x in (-3, 3)]
+        >>> round(extent_of(cameras), 6)  # 1.1 * 3
+        3.3
     """
     centers = np.stack([camera.position for camera in cameras])
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
@@ -122,6 +130,16 @@ def random_points(
     Returns:
         points: (count, 3) world coordinates.
         colors: (count, 3) uint8, at random.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import random_points
+        >>> view = dict(width=64, height=48, fov_y=40)
+        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
+        >>> points, colors = random_points(cameras, 100)
+        >>> points.shape, bool((np.abs(points) <= 3 + 1e-9).all()), colors.dtype
+        ((100, 3), True, dtype('uint8'))
     """
     if count < 1:
         raise ValueError(f"count: got {count}, expected at least 1")

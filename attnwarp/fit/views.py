@@ -123,6 +123,20 @@ def load_views(dataset: Dataset, *, max_size: int | None = None) -> Views:
     Raises:
         FileFormatError: a picture that cannot be read, or of another size than its camera.
         ValueError: no camera has a picture.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import load_views
+        >>> from attnwarp.io import Dataset
+        >>> from attnwarp.io.images import encode_png
+        >>> path = Path("a.png")
+        >>> _ = path.write_bytes(encode_png(np.full((48, 64, 3), 255, np.uint8)))
+        >>> camera = Camera.look_at((3, 0, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+        >>> views = load_views(Dataset([camera], [path]), max_size=32)
+        >>> views.cameras[0].width, views.cameras[0].height
+        (32, 24)
     """
     cameras, images = [], []
     for camera, path, lens in zip(

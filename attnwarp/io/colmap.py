@@ -101,6 +101,17 @@ def read_colmap(
     Raises:
         FileNotFoundError: no model there.
         FileFormatError: a camera with lens distortion, a damaged or truncated file, missing images.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp.io import read_colmap
+        >>> model = Path("sparse/0")
+        >>> model.mkdir(parents=True)
+        >>> _ = (model / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24")
+        >>> _ = (model / "images.txt").write_text("1 1 0 0 0 0 0 2 1 a.png\\n\\n")
+        >>> [camera] = read_colmap(".", missing_images="none", points=False).cameras
+        >>> camera.name, camera.position.tolist()
+        ('a.png', [0.0, 0.0, -2.0])
     """
     check.one_of(distorted, ("error", "keep"), "distorted")
     path = Path(path)

@@ -27,6 +27,13 @@ class FileFormatError(InputError):
         path: the file.
         field: the property or key at fault, or None when it is the file as a whole.
         row: the first bad row or frame, counted from 0, or None.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp.io import FileFormatError
+        >>> error = FileFormatError(Path("a.ply"), "got NaN, expected numbers", field="x", row=3)
+        >>> print(error, error.row)
+        a.ply: x: got NaN, expected numbers 3
     """
 
     def __init__(

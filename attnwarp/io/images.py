@@ -29,6 +29,15 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     Raises:
         FileNotFoundError: no such file.
         FileFormatError: not a picture, or larger than Pillow opens.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from attnwarp.io import image_size
+        >>> from attnwarp.io.images import encode_png
+        >>> _ = Path("image.png").write_bytes(encode_png(np.zeros((2, 3, 3), np.uint8)))
+        >>> image_size("image.png")
+        (3, 2)
     """
     path = existing_file(path)
     size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size)

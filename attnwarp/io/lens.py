@@ -40,6 +40,11 @@ class Lens:
 
     Raises:
         ValueError: another kind, too many coefficients, or one that is not finite.
+
+    Example:
+        >>> from attnwarp.io import Lens
+        >>> Lens("brown", (0.1,)).undistort([1.1, 0.0]).round(9).tolist()  # 1.1 = 1 + 0.1 * 1^3
+        [1.0, 0.0]
     """
 
     kind: Literal["brown", "fisheye"]
@@ -154,6 +159,14 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
 
     Raises:
         ValueError: the coefficients fold the picture over, so that no inverse exists.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Lens, undistorted_camera
+        >>> camera = Camera.look_at((0, 5, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+        >>> pinhole = undistorted_camera(camera, Lens("brown", (-0.2,)))  # a barrel shows more
+        >>> pinhole.width > 64, bool(pinhole.K[0, 0] == camera.K[0, 0])
+        (True, True)
     """
     W, H = camera.width, camera.height
     across, down = np.arange(W) + 0.5, np.arange(H) + 0.5
@@ -194,6 +207,17 @@ def undistorted_image(
 
     Raises:
         ValueError: ``image`` has another size than ``camera``.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.io import Lens, undistorted_camera, undistorted_image
+        >>> camera = Camera.look_at((0, 5, 0), (0, 0, 0), width=64, height=48, fov_y=40)
+        >>> lens = Lens("brown", (-0.2,))
+        >>> grey = np.full((48, 64, 3), 128, np.uint8)
+        >>> image = undistorted_image(grey, camera, lens, undistorted_camera(camera, lens))
+        >>> np.unique(image).tolist()  # grey everywhere, no blank border
+        [128]
     """
     from scipy.ndimage import map_coordinates
 

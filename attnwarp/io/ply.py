@@ -187,6 +187,16 @@ def write_ply(
         ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
             ``third_scale`` is not positive or is given for the 3D kind, ``tolerance`` is negative,
             or a world coordinate does not fit float32.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.io import read_ply, write_ply
+        >>> splat = Gaussians("2d", torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                   torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> write_ply("splat.ply", splat)
+        >>> read_ply("splat.ply").means.tolist()
+        [[1.0, 1.0, 1.0]]
     """
     from plyfile import PlyData, PlyElement
 
@@ -244,6 +254,13 @@ def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uin
         FileNotFoundError: no such file.
         FileFormatError: not a PLY, truncated, no ``x y z``, a value that is not finite, colours
             that are not uchar.
+
+    Example:
+        >>> from attnwarp.io import read_points, write_points
+        >>> write_points("points.ply", [[0.1, 0.2, 0.3]])
+        >>> points, colors = read_points("points.ply")
+        >>> points.tolist(), colors  # doubles, and no colours
+        ([[0.1, 0.2, 0.3]], None)
     """
     path = existing_file(path)
     columns, _ = _read_vertices(path)
@@ -272,6 +289,13 @@ def write_points(
         path: the file; an older one is replaced.
         points: (P, 3) finite.
         colors: (P, 3) uint8, optional.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.io import read_points, write_points
+        >>> write_points("points.ply", [[0.1, 0.2, 0.3]], np.array([[255, 128, 0]], np.uint8))
+        >>> read_points("points.ply")[1].tolist()
+        [[255, 128, 0]]
     """
     from plyfile import PlyData, PlyElement
 

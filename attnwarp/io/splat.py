@@ -49,6 +49,17 @@ def write_splat(
         ValueError: a value of ``gaussians`` is out of range, ``third_scale`` is not positive, or
             float32 world positions would move a splat by more than a hundredth of its largest
             scale.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.io import write_splat
+        >>> splat = Gaussians("2d", torch.ones(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                   torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> write_splat("splat.splat", splat)
+        >>> Path("splat.splat").stat().st_size  # bytes of one record
+        32
     """
     g = replace(gaussians.detach().to(device="cpu"))
     if not (np.isfinite(third_scale) and third_scale > 0):

@@ -138,6 +138,18 @@ def read_transforms(
 
     Warns:
         InputWarning: keys that are not understood; frames that no split names.
+
+    Example:
+        >>> import json
+        >>> from pathlib import Path
+        >>> from attnwarp.io import read_transforms
+        >>> pose = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]  # camera to world
+        >>> frame = {"file_path": "a.png", "transform_matrix": pose}
+        >>> file = {"w": 64, "h": 48, "fl_x": 60, "frames": [frame]}
+        >>> _ = Path("transforms.json").write_text(json.dumps(file))
+        >>> [camera] = read_transforms("transforms.json", missing_images="none").cameras
+        >>> camera.position.tolist(), camera.K[1].tolist()
+        ([0.0, 0.0, 2.0], [0.0, 60.0, 24.0])
     """
     check.one_of(distorted, ("error", "keep"), "distorted")
     path = Path(path)

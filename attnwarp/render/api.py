@@ -122,6 +122,15 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
         depth: (H, W) depth along the optical axis, NaN where undefined.
         camera: its camera.
         pose: (4, 4) world-to-camera transform in place of the camera's.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera
+        >>> from attnwarp.render import normal_from_depth
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> normal = normal_from_depth(torch.full((8, 8), 2.0), camera)  # a wall that faces it
+        >>> (normal[4, 4] + 0.0).tolist(), bool(normal[0, 0].isnan().all())
+        ([0.0, 0.0, -1.0], True)
     """
     check.shape(depth, (camera.height, camera.width), "depth")
     rays = torch.as_tensor(camera.directions(), dtype=depth.dtype)

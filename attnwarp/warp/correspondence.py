@@ -35,6 +35,17 @@ class Correspondence:
         target_depth: (H, W) depth along the target's optical axis; NaN where undefined.
         pixel_centers: the convention it was computed with, see :func:`correspond`.
         in_front: points at and behind the source camera have no ``xy``.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import correspond
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> depth = np.full((8, 8), 2.0)
+        >>> depth[0, 0] = np.nan  # no surface
+        >>> c = correspond(camera, camera, depth)
+        >>> c.defined.sum().item(), c.xy[1, 2].tolist(), c.z[1, 2].item()
+        (63, [2.5, 1.5], 2.0)
     """
 
     source: Camera

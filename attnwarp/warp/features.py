@@ -29,6 +29,16 @@ class FeatureWarp:
         correspondence: on the target's feature grid of H x W, into the source's of h x w.
         mask: (H, W) bool, where the warped features count.
         backend: "auto" or "reference"; both give the same bits.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import FeatureWarp, correspond
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> c = correspond(camera, camera, np.full((8, 8), 2.0))  # a view onto itself
+        >>> warp, features = FeatureWarp(c, c.defined), torch.rand(4, 8, 8)
+        >>> torch.equal(warp.warp(features), features)
+        True
     """
 
     correspondence: Correspondence

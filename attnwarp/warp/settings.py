@@ -74,6 +74,16 @@ class WarpSettings:
 
     Raises:
         ValueError: an unknown choice or a number out of range; the message names the field.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from attnwarp.warp import PRESETS, WarpSettings
+        >>> settings = WarpSettings()
+        >>> settings == PRESETS["corrected"]
+        True
+        >>> replace(settings, opaque=2.0)
+        Traceback (most recent call last):
+        ValueError: opaque: ...
     """
 
     pixel_centers: PixelCenters = "half"

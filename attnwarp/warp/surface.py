@@ -17,6 +17,13 @@ class Surface:
         alpha: (H, W) in [0, 1].
         image: (H, W, C) sRGB in [0, 1], before any edit.
         counters: how much work it was to render, see :class:`attnwarp.render.Render`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.warp import Surface
+        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+        >>> wall.depth.shape, wall.alpha is None  # enough for exact depth
+        ((8, 8), True)
     """
 
     depth: Array

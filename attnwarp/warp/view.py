@@ -47,6 +47,16 @@ class WarpedView:
             always among them.
         target, source: the surfaces it was made from; ``source`` is None where no rule needed it.
         backend: who computes the feature grids, see :func:`warp_surfaces`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp import Camera
+        >>> from attnwarp.warp import Surface, warp_surfaces
+        >>> camera = Camera(np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4), 8, 8)
+        >>> wall = Surface(np.full((8, 8), 2.0), np.broadcast_to([0.0, 0, -1], (8, 8, 3)))
+        >>> view = warp_surfaces(camera, camera, wall, wall)
+        >>> view.mask.all().item(), view.at((4, 4)).mask.shape
+        (True, torch.Size([4, 4]))
     """
 
     settings: WarpSettings

@@ -11,6 +11,10 @@ import numpy.typing as npt
 def to_srgb(linear: npt.ArrayLike) -> npt.NDArray[Any]:
     """Linear values to sRGB-encoded ones in [0, 1]; what lies outside [0, 1] is clipped. The float
     dtype is kept.
+
+    Example:
+        >>> [round(float(value), 4) for value in to_srgb([0.0, 0.2140411, 1.0, 2.0])]
+        [0.0, 0.5, 1.0, 1.0]
     """
     value = np.asarray(linear)
     value = np.clip(value if value.dtype.kind == "f" else value.astype(np.float64), 0, 1)

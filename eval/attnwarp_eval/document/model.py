@@ -12,6 +12,11 @@ class Table:
 
     Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until
     a reader opens it.
+
+    Example:
+        >>> table = Table(["variant", "seconds"], [["paper", "0.1"]], timed=("seconds",))
+        >>> table.without_timings().columns
+        ['variant']
     """
 
     columns: list[str]
@@ -29,7 +34,12 @@ class Table:
 
 @dataclass
 class Picture:
-    """An image file of the run's folder, with what it shows."""
+    """An image file of the run's folder, with what it shows.
+
+    Example:
+        >>> Picture("pictures/a.png", "the source").caption
+        'the source'
+    """
 
     path: str
     caption: str
@@ -37,14 +47,26 @@ class Picture:
 
 @dataclass
 class Gallery:
-    """Pictures in rows: a line of text, then pictures side by side."""
+    """Pictures in rows: a line of text, then pictures side by side.
+
+    Example:
+        >>> gallery = Gallery([("yaw 30", [Picture("a.png", "truth"), Picture("b.png", "warp")])])
+        >>> [len(pictures) for _, pictures in gallery.rows]
+        [2]
+    """
 
     rows: list[tuple[str, list[Picture]]]
 
 
 @dataclass
 class Section:
-    """A heading with text, tables, figures and galleries, in this order."""
+    """A heading with text, tables, figures and galleries, in this order.
+
+    Example:
+        >>> section = Section("Depth", ["Against exact depth."], [Table(["AbsRel"], [["0.01"]])])
+        >>> section.title, section.figures
+        ('Depth', [])
+    """
 
     title: str
     text: list[str] = field(default_factory=list)
@@ -55,7 +77,13 @@ class Section:
 
 @dataclass
 class Report:
-    """The whole report."""
+    """The whole report.
+
+    Example:
+        >>> from attnwarp_eval.document.write import markdown
+        >>> markdown(Report("Warps", ["Two views."], [Section("Depth")])).splitlines()[0]
+        '# Warps'
+    """
 
     title: str
     lead: list[str]

@@ -33,6 +33,11 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     Args:
         value: the interval.
         scenes: of the study; where fewer were measured, the text says how many.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> spread(interval({"bear": [1.0], "fence": [1.1], "glass": [0.9]}))
+        '1.00 ± 0.25'
     """
     if not math.isfinite(value.mean):
         return "–"

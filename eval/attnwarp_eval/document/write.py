@@ -30,7 +30,12 @@ _CLASSES = {
 
 def inline(text: str) -> Markup:
     """Escaped text in which `code`, **bold** and `#rrggbb` (a swatch of that colour) have been
-    set."""
+    set.
+
+    Example:
+        >>> print(inline("`a` < **b**"))
+        <code>a</code> &lt; <strong>b</strong>
+    """
     escaped = html.escape(text, quote=False)
     escaped = re.sub(
         r"`(#[0-9a-f]{6})`", r'<span class="swatch" style="background:\1"></span>', escaped
@@ -67,7 +72,12 @@ _TAG = re.compile(r"(`[^`]*`)|<(?=[A-Za-z/!?])")
 
 
 def terminal(table: Table) -> RichTable:
-    """A table for a terminal; its cells are plain text, without markup."""
+    """A table for a terminal; its cells are plain text, without markup.
+
+    Example:
+        >>> terminal(Table(["variant", "AbsRel"], [["paper", "0.01"]])).row_count
+        1
+    """
     from rich.table import Table as RichTable
     from rich.text import Text
 
@@ -78,7 +88,15 @@ def terminal(table: Table) -> RichTable:
 
 
 def markdown(report: Report) -> str:
-    """The report as Markdown; pictures are links relative to the run's folder."""
+    """The report as Markdown; pictures are links relative to the run's folder.
+
+    Example:
+        >>> from attnwarp_eval.document.model import Section
+        >>> table = Table(["variant", "AbsRel"], [["paper", "0.01"]])
+        >>> text = markdown(Report("Warps", [], [Section("Depth", tables=[table])]))
+        >>> "| paper | 0.01 |" in text
+        True
+    """
     environment = Environment(
         loader=PackageLoader("attnwarp_eval.document", "."),
         trim_blocks=True,
@@ -92,7 +110,15 @@ def markdown(report: Report) -> str:
 
 
 def page(report: Report, root: Path) -> str:
-    """The report as one HTML file with every picture inside it."""
+    """The report as one HTML file with every picture inside it.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp_eval.document.model import Section
+        >>> text = page(Report("Warps & views", [], [Section("Depth")]), Path())
+        >>> "<title>Warps &amp; views</title>" in text
+        True
+    """
     environment = Environment(
         loader=PackageLoader("attnwarp_eval.document", "."),
         trim_blocks=True,

@@ -54,6 +54,16 @@ class Disagreement:
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
         candidates: number of pixels that could have been compared: those asked about that have a
             position.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval.metrics import Disagreement
+        >>> counted = np.array([[True, False]])
+        >>> grey = np.array([[[0.1] * 3, [np.nan] * 3]])
+        >>> difference = Disagreement(counted, grey, grey, np.array([[4.0, np.nan]]), candidates=2)
+        >>> figures = difference.figures()
+        >>> figures["consistency.delta_e"], figures["consistency.share"]
+        (4.0, 0.5)
     """
 
     counted: Mask
@@ -106,6 +116,18 @@ def cross_view(
 
     Raises:
         ValueError: a picture that is not sRGB in [0, 1] or has another size than its camera.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import Geometry, two_view
+        >>> scene = load_scene("spheres").with_size(32, 32)
+        >>> pair = two_view(Geometry(scene), scene.source, scene.targets[0])
+        >>> grey = np.full((32, 32, 3), 0.5)
+        >>> difference = metrics.cross_view(grey, grey + 0.1, pair)
+        >>> round(float(np.nanmax(difference.srgb)), 6), difference.counted.any().item()
+        (0.1, True)
     """
     source, target = _pictures(source_srgb, target_srgb, pair)
     asked = region(mask, target.shape) & pair.visible
@@ -132,6 +154,19 @@ def view_dependent(
             two masks.
         pair: as for :func:`cross_view`.
         tolerance: in linear light, of 1; above the noise of the pictures.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import Geometry, two_view
+        >>> scene = load_scene("spheres").with_size(32, 32)
+        >>> pair = two_view(Geometry(scene), scene.source, scene.targets[0])
+        >>> grey = np.full((32, 32, 3), 0.5)
+        >>> highlight = grey.copy()
+        >>> highlight[16, 16] = 1.0
+        >>> metrics.view_dependent(grey, highlight, pair).nonzero()
+        (array([16]), array([16]))
     """
     if not tolerance >= 0:
         raise ValueError(
@@ -162,6 +197,14 @@ class Flow:
         xy: (H, W, 2) source positions in pixels, centres at +0.5; NaN where there is no flow.
         accepted: (H, W) bool: passes the forward-backward check, inside the source picture.
         method: which algorithm.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval.metrics import Flow
+        >>> xy = np.array([[[0.5, 0.5], [1.5, 0.5]]])  # each pixel onto itself
+        >>> flow = Flow(xy, np.array([[True, True]]), "dis")
+        >>> flow.accepted.mean().item()
+        1.0
     """
 
     xy: Array
@@ -184,6 +227,16 @@ def optical_flow(source_srgb: Any, target_srgb: Any, method: FlowMethod = "dis")
 
     Raises:
         ValueError: pictures of different sizes or not sRGB in [0, 1]; another method.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> x, y = np.meshgrid(np.arange(64), np.arange(64))
+        >>> grey = 0.5 + 0.2 * (np.sin(x / 3) + np.sin(y / 4))
+        >>> pattern = np.stack([grey] * 3, axis=-1)
+        >>> flow = metrics.optical_flow(pattern, pattern)
+        >>> np.abs(flow.xy[32, 32] - 32.5).max().item() < 0.1  # nothing moved
+        True
     """
     check.one_of(method, ("dis", "farneback"), "method")
     target = picture(target_srgb, "target_srgb")
@@ -217,6 +270,16 @@ def flow_consistency(
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
         flow: from :func:`optical_flow`.
         mask: (H, W) bool of the target, pixels that are asked about; all if left out.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> y, x = np.mgrid[:16, :16]
+        >>> still = metrics.Flow(np.stack([x + 0.5, y + 0.5], -1), np.ones((16, 16), bool), "dis")
+        >>> grey = np.full((16, 16, 3), 0.5)
+        >>> difference = metrics.flow_consistency(grey, grey + 0.1, still)
+        >>> round(float(np.nanmax(difference.srgb)), 6)
+        0.1
     """
     shape = flow.accepted.shape
     target = picture(target_srgb, "target_srgb", shape=shape)
@@ -239,6 +302,17 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
         over those of them that pass the forward-backward check; ``flow_recall``, the share that
         passes; and ``flow_false``, of all that pass the share that the source certainly does not
         show. NaN where there is nothing to measure.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import Geometry, two_view
+        >>> scene = load_scene("spheres").with_size(32, 32)
+        >>> pair = two_view(Geometry(scene), scene.source, scene.targets[0])
+        >>> exact = metrics.Flow(pair.xy + [3, 4], pair.visible, "dis")  # 5 px off everywhere
+        >>> error = metrics.flow_error(exact, pair)
+        >>> round(error["consistency.flow_epe_median"], 9), error["consistency.flow_recall"]
+        (5.0, 1.0)
     """
     shape = pair.label.shape
     if flow.accepted.shape != shape:
@@ -268,6 +342,16 @@ def approximation_error(exact: Disagreement, flow: Disagreement) -> dict[str, fl
     DeltaE as a ratio.
 
     NaN where either side counted nothing; the ratio too where the exact one is 0.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> y, x = np.mgrid[:16, :16]
+        >>> still = metrics.Flow(np.stack([x + 0.5, y + 0.5], -1), np.ones((16, 16), bool), "dis")
+        >>> grey = np.full((16, 16, 3), 0.5)
+        >>> difference = metrics.flow_consistency(grey, grey + 0.1, still)
+        >>> metrics.approximation_error(difference, difference)["consistency.flow_ratio_delta_e"]
+        1.0
     """
     one, other = exact.figures(), flow.figures()
     gaps = {

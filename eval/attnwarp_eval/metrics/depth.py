@@ -25,6 +25,13 @@ def depth_error(
         Figures of :data:`attnwarp_eval.metrics.registry.METRICS`. Means are over pixels with a
         surface and a depth; the delta shares over all pixels with a surface: one without a depth is
         not within anything. NaN where there is nothing to measure.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> error = metrics.depth_error(np.full((4, 4), 2.2), np.full((4, 4), 2.0))
+        >>> round(error["depth.abs_rel"], 9), round(error["depth.bias"], 9)
+        (0.1, 0.2)
     """
     truth = floats(true_depth, ("H", "W"), "true_depth")
     estimate = floats(depth, truth.shape, "depth")

@@ -28,6 +28,13 @@ class Similarity:
 
     Attributes:
         values: (N,) float64 in [-1, 1]; NaN where undefined.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval.metrics import Similarity
+        >>> result = Similarity(np.array([0.5, 1.0, np.nan]))
+        >>> result.mean, result.defined, result.undefined
+        (0.75, 2, 1)
     """
 
     values: npt.NDArray[np.float64]
@@ -64,6 +71,11 @@ def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
 
     Source: A. Radford et al., "Learning Transferable Visual Models From Natural Language
         Supervision", ICML 2021.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> metrics.clip_similarity([[1.0, 0.0], [0.0, 3.0]], [2.0, 0.0]).values.tolist()
+        [1.0, 0.0]
     """
     pictures = _embeddings(images, "images")
     return Similarity(_cosine(_unit(pictures), _unit(_matching(text, pictures, "text"))))
@@ -93,6 +105,12 @@ def directional_similarity(
     Source: R. Gal et al., "StyleGAN-NADA: CLIP-Guided Domain Adaptation of Image Generators",
         SIGGRAPH 2022; as a
     metric of edits, T. Brooks, A. Holynski, A. A. Efros, "InstructPix2Pix", CVPR 2023.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> before, after = [[1.0, 0.0]], [[0.0, 1.0]]  # the picture changed as the prompt did
+        >>> round(metrics.directional_similarity(before, after, [1.0, 0.0], [0.0, 1.0]).mean, 9)
+        1.0
     """
     after = _embeddings(images_after, "images_after")
     before = _embeddings(images_before, "images_before")
@@ -121,6 +139,11 @@ def image_similarity(source_edit: npt.ArrayLike, renders: npt.ArrayLike) -> Simi
 
     Raises:
         ValueError: other shapes, or embeddings that are NaN or infinite.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> metrics.image_similarity([1.0, 0.0], [[2.0, 0.0], [0.0, 1.0]]).values.tolist()
+        [1.0, 0.0]
     """
     pictures = _embeddings(renders, "renders")
     source = _matching(source_edit, pictures, "source_edit")

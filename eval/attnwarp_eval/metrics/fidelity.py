@@ -59,6 +59,15 @@ def fidelity(
     Raises:
         ValueError: a picture that is not sRGB in [0, 1], pictures of different sizes, a mask that
             is not bool.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> truth, mask = np.full((32, 32, 3), 0.5), np.zeros((32, 32), bool)
+        >>> mask[8:24, 8:24] = True
+        >>> figures = metrics.fidelity(truth + 0.1 * mask[..., None], truth, mask)
+        >>> round(figures["fidelity.psnr.inside"], 9), figures["fidelity.psnr.outside"]
+        (20.0, inf)
     """
     image = picture(image_srgb, "image_srgb")
     truth = picture(truth_srgb, "truth_srgb", shape=image.shape)
@@ -108,6 +117,15 @@ def nearest_answer(
 
     Raises:
         ValueError: no answers, or one that does not have the views of ``images``.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> black, grey, white = (np.full((4, 4, 3), value) for value in (0.0, 0.4, 1.0))
+        >>> answers = {"dark": {"yaw010": black}, "bright": {"yaw010": white}}
+        >>> name, psnr = metrics.nearest_answer({"yaw010": grey}, answers)
+        >>> name, round(psnr["dark"], 2)
+        ('dark', 7.96)
     """
     if not answers:
         raise ValueError("answers: got none, expected the truth of at least one")

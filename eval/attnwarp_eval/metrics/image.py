@@ -48,6 +48,13 @@ def mse(image: Any, target: Any, mask: Any = None) -> float:
     Raises:
         ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
             1].
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> black, grey = np.zeros((2, 2, 3)), np.full((2, 2, 3), 0.5)
+        >>> metrics.mse(black, grey), metrics.mse(black, grey, np.zeros((2, 2), bool))
+        (0.25, nan)
     """
     return _mse(*pair(image, target, mask))
 
@@ -58,6 +65,13 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
     The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to
     0, gains -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see
     :func:`edit_psnr`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> black, grey = np.zeros((2, 2, 3)), np.full((2, 2, 3), 0.1)
+        >>> round(metrics.psnr(black, grey), 9), metrics.psnr(grey, grey)
+        (20.0, inf)
     """
     return psnr_of_mse(mse(image, target, mask))
 
@@ -73,6 +87,13 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
     Returns:
         NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
         11 square.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> picture = np.random.default_rng(0).uniform(size=(16, 16, 3))
+        >>> round(metrics.ssim(picture, picture), 9), metrics.ssim(picture, 1 - picture) < 0
+        (1.0, True)
     """
     values = ssim_map(image, target, mask)
     return mean(values[np.isfinite(values)])
@@ -84,6 +105,13 @@ def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
 
     The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
     px.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> picture = np.random.default_rng(0).uniform(size=(16, 12, 3))
+        >>> metrics.ssim_map(picture, picture).shape
+        (6, 2)
     """
     first, second, inside = pair(image, target, mask)
     if min(inside.shape) < WINDOW:
@@ -117,6 +145,13 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     Returns:
         NaN when some scale has no window: a side below 176 px, or a mask that holds no square of
         about that size.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> picture = np.full((176, 176, 3), 0.5)
+        >>> round(metrics.ms_ssim(picture, picture), 9), metrics.ms_ssim(picture[1:], picture[1:])
+        (1.0, nan)
     """
     first, second, inside = pair(image, target, mask)
     product = 1.0
@@ -154,6 +189,14 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
     Raises:
         ValueError: another dtype or shape, or in the mask a value that is not finite or outside [0,
             1].
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> black, white = np.zeros((4, 4, 3)), np.ones((4, 4, 3))
+        >>> mask = np.arange(16).reshape(4, 4) < 4  # the first row
+        >>> metrics.perceptual(black, white, lambda a, b: float(np.abs(a - b).mean()), mask)
+        1.0
     """
     image, target, inside = pair(image_srgb, target_srgb, mask, ("image_srgb", "target_srgb"))
     covered = share(int(inside.sum()), inside.size)
@@ -173,6 +216,14 @@ def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str
     Args:
         image_srgb, target_srgb: (H, W, 3), sRGB-encoded, in [0, 1].
         mask: (H, W) bool, the pixels that count; all if left out.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> black, grey = np.zeros((16, 16, 3)), np.full((16, 16, 3), 0.1)
+        >>> error = metrics.image_error(black, grey)
+        >>> round(error["image.psnr"], 9)
+        20.0
     """
     first, second, inside = pair(image_srgb, target_srgb, mask, ("image_srgb", "target_srgb"))
     error, linear = _mse(first, second, inside), _mse(to_linear(first), to_linear(second), inside)
@@ -196,6 +247,13 @@ class EditPsnr:
             are not comparable by this figure: fewer edited views are easier to follow.
         mse: of each view; NaN where it is undefined.
         psnr: of each view in dB; +inf where the pictures are equal, NaN where it is undefined.
+
+    Example:
+        >>> import math
+        >>> from attnwarp_eval.metrics import EditPsnr
+        >>> result = EditPsnr(("a", "b"), mse=(0.0, 0.002), psnr=(math.inf, 26.9897))
+        >>> result.pooled, result.mean_finite, result.identical  # of the mean error, 0.001
+        (30.0, 26.9897, 1)
     """
 
     views: tuple[str, ...]
@@ -256,6 +314,14 @@ def edit_psnr(
     Raises:
         ValueError: the three do not name the same views; a picture that :func:`mse` refuses, with
             the view's name.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> edited = {"yaw010": np.zeros((4, 4, 3))}
+        >>> result = metrics.edit_psnr(edited, {"yaw010": np.full((4, 4, 3), 0.1)})
+        >>> round(result.pooled, 9), result.views
+        (20.0, ('yaw010',))
     """
     for name, other in (("rendered", rendered), ("masks", masks)):
         if other is not None and set(other) != set(edited):

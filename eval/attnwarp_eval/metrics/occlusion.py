@@ -51,6 +51,14 @@ def confusion(
 
     Returns:
         One integer for each of :data:`COUNTS`.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> accepted, label = np.array([[True, True, False]]), np.array([[1, 2, 1]])
+        >>> counts = metrics.confusion(accepted, label, np.ones((1, 3), bool))
+        >>> {name: count for name, count in counts.items() if count}
+        {'visible_accepted': 1, 'visible_rejected': 1, 'hidden_accepted': 1}
     """
     truth = np.asarray(label)
     check.shape(truth, ("H", "W"), "label")
@@ -89,6 +97,14 @@ def scores(counts: Mapping[str, int]) -> dict[str, float]:
     recall, no false negative rate and no F1: NaN. Accepted background counts against precision and
     F1, and not in the false positive rate, whose base is surface that the source does not show: a
     large sky would dilute it.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> counts = dict.fromkeys(metrics.COUNTS, 0)
+        >>> counts |= {"visible_accepted": 3, "hidden_accepted": 1}
+        >>> result = metrics.scores(counts)
+        >>> result["occlusion.precision"], result["occlusion.recall"]
+        (0.75, 1.0)
     """
     tp, fn = counts["visible_accepted"], counts["visible_rejected"]
     unseen = counts["hidden_accepted"] + counts["outside_accepted"]
@@ -114,6 +130,14 @@ def mask_error(
     Args:
         accepted, label, surface, behind: as in :func:`confusion`.
         edge: (H, W) bool, the band around edges.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> accepted, label = np.array([[True, True, False]]), np.array([[1, 2, 1]])
+        >>> error = metrics.mask_error(accepted, label, np.ones((1, 3), bool))
+        >>> error["occlusion.precision"], error["occlusion.hidden_accepted"]
+        (0.5, 1)
     """
     shape = np.asarray(label).shape
     band = None if edge is None else mask(edge, shape, "edge")
@@ -134,6 +158,14 @@ class YawBin:
         views: how many views fell in.
         counts: their counts, summed.
         scores: of the sums, NaN where undefined.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> counts = dict.fromkeys(metrics.COUNTS, 0)
+        >>> counts |= {"visible_accepted": 3, "hidden_accepted": 1}
+        >>> near, far = metrics.by_yaw([(-10.0, counts)], edges=(0, 90, 180))
+        >>> near.views, near.scores["occlusion.precision"], far.views
+        (1, 0.75, 0)
     """
 
     low: float
@@ -156,6 +188,12 @@ def by_yaw(
 
     Returns:
         One entry for each bin, empty ones included: their scores are NaN.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> counts = dict.fromkeys(metrics.COUNTS, 0) | {"visible_accepted": 3}
+        >>> [entry.views for entry in metrics.by_yaw([(10, counts), (-20, counts), (180, counts)])]
+        [1, 1, 0, 0, 0, 0, 1]
     """
     ends = [float(edge) for edge in edges]
     if (

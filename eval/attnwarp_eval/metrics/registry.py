@@ -208,10 +208,22 @@ METRICS = Registry({metric.name: metric for metric in _SPECS})
 
 
 def metric(key: str) -> Metric:
-    """The specification behind a result's key. KeyError: no such metric."""
+    """The specification behind a result's key. KeyError: no such metric.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> metrics.metric("warp.epe_median.64").unit
+        'px'
+    """
     return METRICS[key]
 
 
 def at_size(figures: Mapping[str, float], size: int) -> dict[str, float]:
-    """The same figures, named for a feature size: ``warp.epe_median`` becomes ``warp.epe_median.64``."""
+    """The same figures, named for a feature size: ``warp.epe_median`` becomes ``warp.epe_median.64``.
+
+    Example:
+        >>> from attnwarp_eval import metrics
+        >>> metrics.at_size({"warp.epe_median": 0.5}, 64)
+        {'warp.epe_median.64': 0.5}
+    """
     return {f"{name}.{size}": value for name, value in figures.items()}

@@ -28,6 +28,14 @@ def endpoint_error(
         ones in the units of ``xy``. The shares are of all visible pixels: one without a position is
         not within anything. Median, percentile and mean are over those that have one, with
         ``coverage`` beside them. NaN where there is nothing to measure.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> exact = np.zeros((4, 4, 2))
+        >>> error = metrics.endpoint_error(exact + [3, 4], exact, np.ones((4, 4), bool))
+        >>> error["warp.epe_median"], error["warp.coverage"]
+        (5.0, 1.0)
     """
     truth = floats(true_xy, ("H", "W", 2), "true_xy")
     shape = truth.shape[:2]
@@ -82,6 +90,14 @@ def feature_error(
         ``feature_accepted`` over accepted and visible pixels, ``feature_visible`` over all visible
         ones, ``feature_all_accepted`` over accepted ones with a surface, visible or not: what is
         injected. NaN where there is nothing to measure.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp_eval import metrics
+        >>> exact, all_pixels = np.ones((8, 4, 4)), np.ones((4, 4), bool)
+        >>> error = metrics.feature_error(1.5 * exact, exact, all_pixels, all_pixels)
+        >>> error["warp.feature_accepted"]
+        0.5
     """
     truth = floats(exact, ("C", "H", "W"), "exact")
     shape = truth.shape[1:]

@@ -31,6 +31,16 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
 
     Raises:
         StoreError: the folder is no run, or a picture is not the one that was written.
+
+    Example:
+        >>> from attnwarp_eval.study import Store, parse_study
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> [path.name for path in write_report(store)]
+        ['results.jsonl', 'report.md', 'report.html']
     """
     store.refuse_links()
     results = read_results(store)

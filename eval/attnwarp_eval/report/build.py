@@ -62,5 +62,14 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
 
 
 def problems(results: Results) -> list[str]:
-    """What is wrong with the instrument in this run, one line each; empty when it is calibrated."""
+    """What is wrong with the instrument in this run, one line each; empty when it is calibrated.
+
+    Example:
+        >>> from attnwarp_eval.study import parse_study
+        >>> from attnwarp_eval.study.results import Results
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> problems(Results(study, cells=[], failures=[]))  # nothing measured, nothing wrong
+        []
+    """
     return [line for probe in probes() for line in probe.problems(results)]

@@ -21,6 +21,15 @@ def read_results(store: Store) -> Results:
 
     Raises:
         StoreError: the folder is no run, or its study cannot be read.
+
+    Example:
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]
+        [('calibration', None), ('depth', None)]
     """
     stored = store.read_study()
     try:

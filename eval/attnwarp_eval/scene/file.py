@@ -25,13 +25,22 @@ from attnwarp_eval.scene.yaml import YamlError, read_yaml
 def scene_folders() -> list[Path]:
     """Where scenes are looked for by name: ``./scenes``, then those of the package (in a checkout:
     its ``scenes``).
+
+    Example:
+        >>> [folder.name for folder in scene_folders()][-1]
+        'scenes'
     """
     folders = [Path.cwd() / "scenes", (Path(__file__).parents[1] / "scenes").resolve()]
     return [f for k, f in enumerate(folders) if f.is_dir() and f not in folders[:k]]
 
 
 def list_scenes() -> list[str]:
-    """Names of the scenes that :func:`load_scene` finds by name, sorted."""
+    """Names of the scenes that :func:`load_scene` finds by name, sorted.
+
+    Example:
+        >>> "spheres" in list_scenes()
+        True
+    """
     return sorted({path.stem for folder in scene_folders() for path in folder.glob("*.yaml")})
 
 
@@ -41,6 +50,14 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     Raises:
         SceneError: the file is missing or says something that cannot be used; the message names the
             file, the line where it can, what came and the remedy.
+
+    Example:
+        >>> scene = load_scene("spheres")
+        >>> scene.object_names[0], scene.source.width
+        ('ground', 512)
+        >>> load_scene("sphere")
+        Traceback (most recent call last):
+        attnwarp_eval.scene.scene.SceneError: ...
     """
     text = os.fspath(name_or_path)
     path = Path(text).expanduser()

@@ -45,6 +45,10 @@ content hash.
 class SceneError(InputError):
     """A scene file that cannot be used: names the file, the line where it can, what came, and the
     remedy.
+
+    Example:
+        >>> print(SceneError("objects: got none, expected at least one", "my.yaml", 3))
+        my.yaml:3: objects: got none, expected at least one
     """
 
     def __init__(
@@ -62,6 +66,15 @@ class Scene:
     Attributes:
         spec: what the file says.
         path: the file, or None for one made in code; mesh files are relative to its folder.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("spheres")
+        >>> small = scene.with_size(32, 32)
+        >>> small.source.width, len(small.targets) == len(small.cameras) - 1
+        (32, True)
+        >>> small.content_hash == scene.content_hash
+        False
     """
 
     def __init__(self, spec: SceneSpec, path: Path | None = None) -> None:
@@ -291,14 +304,29 @@ def _placed(mesh: Mesh, R: Array, scale: float, position: Vector, object_id: int
 
 
 def view_name(view: ViewSpec, index: int) -> str:
-    """The camera's name: its own, else 'source' for the first and 'yaw030' for the others."""
+    """The camera's name: its own, else 'source' for the first and 'yaw030' for the others.
+
+    Example:
+        >>> from attnwarp_eval.scene.spec import ViewSpec
+        >>> view = ViewSpec(yaw=30, height=1.9)
+        >>> view_name(view, 0), view_name(view, 1)
+        ('source', 'yaw030')
+    """
     return view.name or (
         "source" if index == 0 else f"yaw{view.yaw:03g}".replace(".", "p").replace("-", "m")
     )
 
 
 def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
-    """The camera of a view: the source has index 0, the targets those after it."""
+    """The camera of a view: the source has index 0, the targets those after it.
+
+    Example:
+        >>> from attnwarp_eval.scene.spec import CamerasSpec, ViewSpec
+        >>> view = ViewSpec(yaw=0, height=0)
+        >>> orbit = CamerasSpec(look_at=(0, 0, 0), radius=3, source=view, targets=(view,))
+        >>> round(float(np.linalg.norm(orbit_camera(orbit, view, 0).position)), 9)
+        3.0
+    """
     look_at = view.look_at or orbit.look_at
     radius, yaw = view.radius or orbit.radius, math.radians(view.yaw)
     position = (
@@ -319,6 +347,14 @@ def orbit_camera(orbit: CamerasSpec, view: ViewSpec, index: int) -> Camera:
 def inside(scene: Scene, item: ObjectSpec) -> Callable[[Array], bool]:
     """A test whether a point is inside the object. A body is asked by its distance, which needs no
     meshing.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("spheres")
+        >>> melon = next(item for item in scene.spec.objects if item.name == "melon")
+        >>> contains = inside(scene, melon)  # center (0, 0, 0.8), radius 0.8
+        >>> contains(np.array([0, 0, 0.8])), contains(np.array([0, 0, 1.7]))
+        (True, False)
     """
     spec = item.shape
     if isinstance(spec, BodySpec):

@@ -50,6 +50,12 @@ class FirstPoints:
     Attributes:
         points: (P, 3) float64 world coordinates.
         colors: (P, 3) uint8 sRGB.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> points = first_points(load_scene("spheres"), 20)
+        >>> points.points.shape, points.colors.dtype
+        ((20, 3), dtype('uint8'))
     """
 
     points: Array
@@ -69,6 +75,12 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
 
     Raises:
         SceneError: a camera would be inside an object; the message names both.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> cameras = orbit(load_scene("spheres"), 8, size=32)
+        >>> len(cameras), cameras[0].width
+        (8, 32)
     """
     if count < 1:
         raise ValueError(f"count: got {count}, expected at least 1")
@@ -99,17 +111,32 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
 
 
 def orbit_name(index: int, count: int) -> str:
-    """Name of a camera of :func:`orbit`."""
+    """Name of a camera of :func:`orbit`.
+
+    Example:
+        >>> orbit_name(0, 64) == orbit_name(1, 64)
+        False
+    """
     return f"orbit_{index:03d}_of_{count}"
 
 
 def held_out(count: int) -> list[bool]:
-    """Whether each of ``count`` views is held out: the first of every eight."""
+    """Whether each of ``count`` views is held out: the first of every eight.
+
+    Example:
+        >>> [index for index, held in enumerate(held_out(20)) if held]
+        [0, 8, 16]
+    """
     return [k % HELD_OUT_EVERY == 0 for k in range(count)]
 
 
 def held_out_names(count: int) -> list[str]:
-    """Names of the cameras of :func:`orbit` that are held out."""
+    """Names of the cameras of :func:`orbit` that are held out.
+
+    Example:
+        >>> held_out_names(16) == [orbit_name(0, 16), orbit_name(8, 16)]
+        True
+    """
     return [orbit_name(k, count) for k, out in enumerate(held_out(count)) if out]
 
 
@@ -128,6 +155,13 @@ def first_points(
             points.
         seed: of the sampling and the noise.
         geometry: ``Geometry(scene)``, if there is one already.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("spheres")
+        >>> again = first_points(scene, 20, seed=3).points == first_points(scene, 20, seed=3).points
+        >>> bool(again.all())
+        True
     """
     if count < 10:
         raise ValueError(f"count: got {count}, expected at least 10")
@@ -152,7 +186,15 @@ def first_points(
 
 
 def picture(scene: Scene, camera: Camera, spp: int) -> npt.NDArray[np.uint8]:
-    """(H, W, 3) uint8 sRGB truth of a view, rounded as an 8-bit file would have it."""
+    """(H, W, 3) uint8 sRGB truth of a view, rounded as an 8-bit file would have it.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("spheres").with_size(8, 8)
+        >>> image = picture(scene, scene.source, spp=1)
+        >>> image.shape, image.dtype
+        ((8, 8, 3), dtype('uint8'))
+    """
     return np.round(255 * to_srgb(appearance(scene, camera, spp=spp))).astype(np.uint8)
 
 
@@ -180,6 +222,12 @@ def export(
         spp: samples a pixel.
         points, noise, seed: see :func:`first_points`.
         progress: told in words what is done next.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> data = export(load_scene("spheres"), "data", views=2, size=8, spp=1, points=20)
+        >>> data.splits, [path.parent.name for path in data.image_paths]
+        (['test', 'train'], ['images', 'images'])
     """
     from attnwarp.io import Dataset, write_transforms
     from attnwarp_eval.files import write_picture

@@ -97,6 +97,16 @@ def surface_error(
         truth: of the same view.
         settings: how depth is read off the splats; the median depth if left out.
         edge: (H, W) bool, the band around edges; None for no scores by place.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.splats.surface import surface_splats
+        >>> from attnwarp_eval.truth import Geometry
+        >>> scene = load_scene("spheres").with_size(16, 16)
+        >>> truth = Geometry(scene).trace(scene.source)
+        >>> surface, error = surface_error(surface_splats(scene, count=2000), scene.source, truth)
+        >>> surface.depth.shape, error["depth.abs_rel"] < 0.2
+        (torch.Size([16, 16]), True)
     """
     from attnwarp.warp import WarpSettings, render_surface
 
@@ -112,6 +122,12 @@ def picture_error(image: npt.NDArray[Any], true_image: npt.NDArray[np.uint8]) ->
     8-bit truth.
 
     SSIM is NaN below 11 x 11 px.
+
+    Example:
+        >>> black = np.zeros((16, 16, 3))
+        >>> error = picture_error(black + 0.1, black.astype(np.uint8))
+        >>> round(error["fit.mse"], 9), round(error["fit.psnr"], 9)
+        (0.01, 20.0)
     """
     estimate = np.clip(np.asarray(image, dtype=np.float64), 0, 1)
     truth = true_image.astype(np.float64) / 255

@@ -30,6 +30,11 @@ class Welch:
         error: its standard error.
         freedom: Satterthwaite's degrees of freedom.
         p: two-sided probability of a difference this large if there were none.
+
+    Example:
+        >>> result = welch([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
+        >>> round(float(result.error) ** 2, 9), round(float(result.freedom), 3)  # 1/3 + 4/3
+        (1.666666667, 2.941)
     """
 
     difference: Array
@@ -51,9 +56,10 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
     Raises:
         ValueError: fewer than two samples on a side.
 
-    >>> result = welch([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
-    >>> float(result.difference), round(float(result.p), 3)
-    (2.0, 0.221)
+    Example:
+        >>> result = welch([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
+        >>> float(result.difference), round(float(result.p), 3)
+        (2.0, 0.221)
     """
     from scipy import stats
 
@@ -91,6 +97,11 @@ def welch_interval(
 
     Raises:
         ValueError: fewer than two samples on a side.
+
+    Example:
+        >>> difference, low, high = welch_interval([1.0, 2.0, 3.0], [2.0, 4.0, 6.0])
+        >>> difference, low < 0 < high  # three samples cannot tell
+        (2.0, True)
     """
     from scipy import stats
 
@@ -127,8 +138,9 @@ def sidak(alpha: float, tests: int) -> float:
     ``alpha`` (Sidak 1967, "Rectangular confidence regions for the means of multivariate normal
     distributions", JASA 62).
 
-    >>> round(sidak(0.05, 10), 6)
-    0.005116
+    Example:
+        >>> round(sidak(0.05, 10), 6)
+        0.005116
     """
     return -math.expm1(math.log1p(-alpha) / max(tests, 1))
 
@@ -140,6 +152,11 @@ class Equivalence:
     Attributes:
         difference, error: of the means, as shares of the mean.
         margin: the share that counts as equal.
+
+    Example:
+        >>> close, vague = (Equivalence(0.001, error, margin=0.02) for error in (0.001, 0.1))
+        >>> close.equal, vague.equal
+        (True, False)
     """
 
     difference: float
@@ -168,8 +185,9 @@ def equivalence(a: npt.ArrayLike, b: npt.ArrayLike, *, margin: float) -> Equival
         a, b: (n, ...) and (m, ...) independent samples, such as pictures; each counts by its mean.
         margin: a share of the mean.
 
-    >>> equivalence([1.0, 1.01, 0.99], [1.0, 1.0, 1.0], margin=0.02).equal
-    True
+    Example:
+        >>> equivalence([1.0, 1.01, 0.99], [1.0, 1.0, 1.0], margin=0.02).equal
+        True
     """
     first, second = (_means(x)[:, None] for x in (a, b))
     result, scale = welch(first, second), max(abs(float(second.mean())), 1e-300)
@@ -184,6 +202,11 @@ class PairedTest:
         difference, error: shares of the mean.
         p: two-sided.
         pairs: how many.
+
+    Example:
+        >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])
+        >>> result.pairs, result.p < 0.01
+        (3, True)
     """
 
     difference: float
@@ -198,6 +221,11 @@ def paired_test(a: npt.ArrayLike, b: npt.ArrayLike) -> PairedTest:
     Args:
         a, b: (n, ...) samples of which the k-th belong together, such as pictures of one seed; each
             counts by its mean.
+
+    Example:
+        >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])
+        >>> result.difference > 0, result.p < 0.01  # each pair differs by about as much
+        (True, True)
     """
     from scipy import stats
 

@@ -30,6 +30,11 @@ class Interval:
             under two scenes.
         p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with
             under two scenes.
+
+    Example:
+        >>> value = interval({"bear": [1.0, 3.0], "fence": [4.0]})
+        >>> value.mean, value.scenes, value.views
+        (3.0, 2, 3)
     """
 
     mean: float
@@ -60,6 +65,13 @@ def interval(values: Table, *, level: float = 0.95) -> Interval:
     Args:
         values: scene -> values of its views; NaN values are left out and counted.
         level: coverage of the interval, in (0, 1).
+
+    Example:
+        >>> value = interval({"bear": [1.0, 3.0], "fence": [4.0], "glass": [float("nan")]})
+        >>> value.mean, value.undefined  # mean of 2 and 4
+        (3.0, 1)
+        >>> interval({"bear": [1.0, 3.0]}).low  # one scene says nothing about others
+        nan
     """
     from scipy import stats
 
@@ -100,6 +112,13 @@ def paired(a: ByView, b: ByView) -> Interval:
     Args:
         a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN,
             count as undefined.
+
+    Example:
+        >>> ours = {"bear": {"yaw010": 1.0}, "fence": {"yaw010": 2.0}}
+        >>> theirs = {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 4.0, "yaw020": 9.0}}
+        >>> value = paired(ours, theirs)
+        >>> value.mean, value.undefined
+        (1.5, 1)
     """
     differences: dict[str, list[float]] = {}
     for scene in sorted(set(a) | set(b)):
@@ -117,6 +136,11 @@ class Ratio:
     Attributes:
         ratio: median over rounds of the ratio within a round, geometric mean over groups (scenes).
         low, high: 95 % bootstrap interval over rounds, resampled within each group.
+
+    Example:
+        >>> value = time_ratio([[2.0, 4.0, 6.0]], [[1.0, 2.0, 3.0]])
+        >>> round(value.ratio, 9), round(value.low, 9), round(value.high, 9)
+        (2.0, 2.0, 2.0)
     """
 
     ratio: float
@@ -132,6 +156,11 @@ def time_ratio(
 
     Raises:
         ValueError: other numbers of groups or rounds, or seconds that are not positive.
+
+    Example:
+        >>> slow = [[2.0, 4.0, 60.0], [8.0, 8.0, 8.0]]  # two scenes, one hiccup
+        >>> round(time_ratio(slow, [[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]]).ratio, 9)  # sqrt(2 * 8)
+        4.0
     """
     logs = []
     for left, right in zip(a, b, strict=True):
@@ -158,6 +187,11 @@ def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
     """In how many of the views that both have b - a has the given sign: (those, all).
 
     It says what was seen on these scenes, without speaking of others.
+
+    Example:
+        >>> a = {"bear": {"yaw010": 1.0, "yaw020": 1.0}}
+        >>> agreement(a, {"bear": {"yaw010": 2.0, "yaw020": 0.5}}, sign=1)
+        (1, 2)
     """
     differences = [
         b[scene][view] - a[scene][view]
@@ -173,6 +207,10 @@ def agreement(a: ByView, b: ByView, sign: int) -> tuple[int, int]:
 def benjamini_hochberg(p: Sequence[float]) -> list[float]:
     """p-values adjusted for the false discovery rate (Benjamini & Hochberg 1995); NaN stays NaN and
     does not count.
+
+    Example:
+        >>> [round(p, 6) for p in benjamini_hochberg([0.01, 0.04, 0.03, float("nan")])]
+        [0.03, 0.04, 0.04, nan]
     """
     values = np.asarray(p, dtype=np.float64)
     adjusted = np.full(values.shape, np.nan)
@@ -200,6 +238,11 @@ def verdict(
         atol: differences whose interval does not clear this size are not told apart.
         adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05
             nothing is told.
+
+    Example:
+        >>> difference = interval({"bear": [1.0], "fence": [1.1], "glass": [0.9]})
+        >>> verdict(difference, "lower"), verdict(difference, "lower", atol=2.0)
+        ('worse', "can't tell")
     """
     if not difference.known or (adjusted_p is not None and not adjusted_p <= 0.05):
         return "can't tell"
@@ -216,6 +259,10 @@ def front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """Indices of the Pareto front, cheapest first: a point stays when its error strictly improves.
 
     NaN and infinite points never enter.
+
+    Example:
+        >>> front([1.0, 2.0, 3.0], [0.5, 0.6, 0.1])  # the second costs more and errs more
+        [0, 2]
     """
     c, e = np.asarray(cost, dtype=np.float64), np.asarray(error, dtype=np.float64)
     order = [int(i) for i in np.lexsort((e, c)) if np.isfinite(c[i]) and np.isfinite(e[i])]

@@ -21,6 +21,13 @@ class Cell:
         labels: every variant name that leads to this same content.
         pictures: views of which pictures are wanted.
         sources: where the computation finds what ``spec`` names by content, such as encoders.
+
+    Example:
+        >>> from attnwarp_eval.study import Cell
+        >>> a = Cell({"scene": "hash"}, "bear", "good", "depth", seed=0)
+        >>> b = Cell({"scene": "hash"}, "bear", "same", "depth", seed=0)
+        >>> a.title, a.id == b.id  # names are not in the spec
+        ('bear / good / depth', True)
     """
 
     spec: dict[str, Any]

@@ -21,7 +21,16 @@ P = TypeVar("P", bound="Part")
 
 
 class StudyError(InputError):
-    """A study that cannot be run; the message names the file, what came and what to do."""
+    """A study that cannot be run; the message names the file, what came and what to do.
+
+    Example:
+        >>> from attnwarp_eval.study import StudyError, load_study
+        >>> try:
+        ...     load_study("quik")
+        ... except StudyError as error:
+        ...     print(error)
+        quik: no such study...quick...
+    """
 
 
 class Part(BaseModel):
@@ -103,7 +112,14 @@ class Pictures(Part):
 
 
 class Study(Part):
-    """Scenes x variants x seeds x probes, and what the report shows of them."""
+    """Scenes x variants x seeds x probes, and what the report shows of them.
+
+    Example:
+        >>> from attnwarp_eval.study import load_study
+        >>> study = load_study("quick", size=256)
+        >>> study.size, study.seeds, study.variants["paper"].preset
+        (256, [0], 'paper')
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     title: str = ""

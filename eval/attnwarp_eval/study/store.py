@@ -47,7 +47,16 @@ class Problems:
 
 
 class Store:
-    """The folder of one run: ``study.json``, ``cells/``, ``failed/``, ``pictures/``."""
+    """The folder of one run: ``study.json``, ``cells/``, ``failed/``, ``pictures/``.
+
+    Example:
+        >>> from attnwarp_eval.study import Store
+        >>> store = Store("run")
+        >>> record = store.resumed({"scene": "bear"}, lambda: {"answer": 42})
+        >>> again = store.resumed({"scene": "bear"}, lambda: {"answer": 0})  # read, not computed
+        >>> again["answer"], store.done() == {record["id"]}
+        (42, True)
+    """
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)

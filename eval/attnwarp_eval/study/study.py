@@ -103,6 +103,13 @@ def parse_study(data: Any) -> Study:
 
     Raises:
         ValidationError: an unknown key or a value out of range.
+
+    Example:
+        >>> variants = {"corrected": {}, "slipped": {"set": {"pixel_centers": "integer"}}}
+        >>> content = dict(name="my", scenes=["spheres"], variants=variants)
+        >>> study = parse_study(content | {"probes": {"warp": ["slipped"]}})
+        >>> study.variants["slipped"].settings().pixel_centers
+        'integer'
     """
     return _models(tuple(probes()))[0].model_validate(data)
 
@@ -136,6 +143,15 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
 
     Raises:
         StudyError: the study and a scene do not fit, such as a view that the scene lacks.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> variants = {"a": {}, "b": {"preset": "corrected"}}  # of the same content
+        >>> content = dict(name="my", scenes=["spheres"], variants=variants)
+        >>> study = parse_study(content | {"probes": {"warp": ["a", "b"]}})
+        >>> cells = cells_of(study, {"spheres": load_scene("spheres")})
+        >>> [cell.labels for cell in cells if cell.probe == "warp"]
+        [('a', 'b')]
     """
     ordered = {name: scenes[name] for name in study.scenes}
     names: dict[str, list[str]] = {p.name: [] for p in probes() if p.always}
@@ -167,6 +183,11 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
 
     Raises:
         StudyError: no such study, not YAML, an unknown key or a value out of range.
+
+    Example:
+        >>> study = load_study("quick", scenes=["spheres"])
+        >>> study.name, study.scenes
+        ('quick', ['spheres'])
     """
     shipped = shipped_studies()
     path = shipped.get(name_or_path, Path(name_or_path))

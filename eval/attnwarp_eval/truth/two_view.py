@@ -26,6 +26,14 @@ def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:
 
     No step has a length in it: scaling or moving the scene together with its cameras gives the same
     labels.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import Geometry, two_view
+        >>> scene = load_scene("spheres").with_size(16, 16)
+        >>> pair = two_view(Geometry(scene), scene.source, scene.source)  # a view and itself
+        >>> bool(np.nanmax(np.abs(pair.xy - scene.source.pixel_centers())) < 1e-9)
+        True
     """
     hits = geometry.trace(target)
     points = hits.point.reshape(-1, 3)
@@ -156,6 +164,15 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
     """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it
     included.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import Geometry, edge_band
+        >>> scene = load_scene("spheres").with_size(32, 32)
+        >>> geometry = Geometry(scene)
+        >>> thin, wide = (edge_band(geometry, scene.source, width) for width in (1, 3))
+        >>> bool((wide >= thin).all()), bool(thin.sum() < wide.sum())
+        (True, True)
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -53,6 +53,14 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
 
     Raises:
         ValueError: a camera that Mitsuba cannot express.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import appearance
+        >>> scene = load_scene("spheres").with_size(8, 8)
+        >>> image = appearance(scene, scene.source, spp=1)
+        >>> image.shape, image.dtype, bool((image >= 0).all())
+        ((8, 8, 3), dtype('float32'), True)
     """
     import mitsuba
 
@@ -92,6 +100,16 @@ def render_plan(
         made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
         seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads
             add them to pixels in any order, which shows in the last bits of float32.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> from attnwarp_eval.truth import render_plan
+        >>> from attnwarp_eval.truth.plan import plan
+        >>> scene = load_scene("spheres").with_size(8, 8)
+        >>> image = render_plan(scene, scene.source, plan(scene, spp=1), seed=0)
+        >>> again = render_plan(scene, scene.source, plan(scene, spp=1), seed=0)
+        >>> image.shape, bool((image == again).all())
+        ((8, 8, 3), True)
     """
     library(made_by or variant())
     total = _render_passes(scene, camera, plan, seed)
