@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import remove_abandoned, write_atomically
-from attnwarp_eval.files import digest
+from attnwarp_eval.canonical_json import digest
 
 
 def cache_dir() -> Path:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from attnwarp.io.file import ABANDONED_SECONDS, remove_abandoned, write_atomically
 from attnwarp.io.picture import encode_picture
-from attnwarp_eval import files
+from attnwarp_eval import canonical_json, files
 
 WRITER = """
 import sys, time
@@ -31,19 +31,19 @@ write_atomically(sys.argv[1], write)
 
 def test_numbers_that_json_lacks_become_null_and_all_others_stay():
     value = {"a": [1, 2.5, math.nan], "b": (math.inf, -math.inf), "c": np.float32(0.5), "d": None}
-    plain = files.without_nan(value)
+    plain = canonical_json.without_nan(value)
     assert plain == {"a": [1, 2.5, None], "b": [None, None], "c": 0.5, "d": None}
     assert json.loads(files.canonical_json(plain)) == plain
-    assert files.without_nan({"n": np.int64(3), "t": True}) == {"n": 3, "t": True}
-    assert type(files.without_nan(np.int64(3))) is int
+    assert canonical_json.without_nan({"n": np.int64(3), "t": True}) == {"n": 3, "t": True}
+    assert type(canonical_json.without_nan(np.int64(3))) is int
 
 
 def test_json_is_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "a.json"
-    files.write_json(path, {"b": 1, "a": [1.5]})
+    canonical_json.write_json(path, {"b": 1, "a": [1.5]})
     assert json.loads(path.read_text()) == {"a": [1.5], "b": 1}
     with pytest.raises(ValueError, match="not JSON compliant"):
-        files.write_json(path, math.nan)
+        canonical_json.write_json(path, math.nan)
     assert json.loads(path.read_text()) == {"a": [1.5], "b": 1}
     assert [p.name for p in path.parent.iterdir()] == ["a.json"]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.cost import AGAIN, in_turn
-from attnwarp_eval.files import without_nan
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.equivalence import welch_interval
 from attnwarp_eval.statistics.intervals import time_ratio

@@ -130,8 +130,9 @@ def _read(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _write(out: Path, available: Mapping[str, Any], asked: Sequence[Mapping[str, Any]]) -> None:
+    from attnwarp_eval.canonical_json import write_json
     from attnwarp_eval.cost import environment
-    from attnwarp_eval.files import write_atomic, write_json
+    from attnwarp_eval.files import write_atomic
 
     data: dict[str, Any] = {
         "environment": environment(),

@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp.errors import InputError
-from attnwarp_eval.files import without_nan, write_picture
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.files import write_picture
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.store import Store

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.experiments.flow import PAIRS, SLIP, Row
-from attnwarp_eval.files import without_nan, write_atomic, write_json
+from attnwarp_eval.files import write_atomic
 
 TITLES = {
     "truth": "truth",
@@ -162,11 +163,11 @@ def _summary(rows: Sequence[Row]) -> list[list[str]]:
 
 
 def _draw_consistency(rows: Sequence[Row], out: Path) -> Path:
-    from attnwarp_eval.document import figures
+    from attnwarp_eval.document import charts
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
     path = out / "figures" / "consistency.svg"
-    with figures.drawing(path, columns=len(scenes), width=4.0 * len(scenes)) as axes:
+    with charts.drawing(path, columns=len(scenes), width=4.0 * len(scenes)) as axes:
         for ax, scene in zip(axes, scenes, strict=True):
             selected = [row for row in rows if row.scene == scene]
             for k, kind in enumerate(PAIRS[1:]):
@@ -175,8 +176,8 @@ def _draw_consistency(rows: Sequence[Row], out: Path) -> Path:
                         [row.yaw for row in selected],
                         [row.figures[kind][f"consistency.{name}"] for row in selected],
                         style,
-                        color=figures.PALETTE[k],
-                        marker=figures.MARKERS[k],
+                        color=charts.PALETTE[k],
+                        marker=charts.MARKERS[k],
                         markersize=4,
                         linewidth=1.4,
                         label=f"{TITLES[kind]}, {'exact' if name == 'delta_e' else 'flow'}",
@@ -188,7 +189,7 @@ def _draw_consistency(rows: Sequence[Row], out: Path) -> Path:
 
 
 def _draw_flow(rows: Sequence[Row], out: Path) -> Path:
-    from attnwarp_eval.document import figures
+    from attnwarp_eval.document import charts
 
     scenes = list(dict.fromkeys(row.scene for row in rows))
     path = out / "figures" / "flow.svg"
@@ -197,15 +198,15 @@ def _draw_flow(rows: Sequence[Row], out: Path) -> Path:
         "flow_recall": "of the visible, the check passes",
         "flow_false": "of what passes, not in the source",
     }
-    with figures.drawing(path, columns=len(panels), width=4.0 * len(panels)) as axes:
+    with charts.drawing(path, columns=len(panels), width=4.0 * len(panels)) as axes:
         for ax, (name, title) in zip(axes, panels.items(), strict=True):
             for k, scene in enumerate(scenes):
                 selected = [row for row in rows if row.scene == scene]
                 ax.plot(
                     [row.yaw for row in selected],
                     [row.flow[f"consistency.{name}"] for row in selected],
-                    color=figures.PALETTE[k],
-                    marker=figures.MARKERS[k],
+                    color=charts.PALETTE[k],
+                    marker=charts.MARKERS[k],
                     markersize=4,
                     linewidth=1.4,
                     label=scene,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from attnwarp_eval.document import figures
+from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, Ratio, interval, time_ratio
@@ -36,8 +36,8 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
             continue
         path = layout.figure(f"front-{index}.svg")
         label = f"{metric} ({probe(front.probe).metric(metric).unit})"
-        with figures.drawing(path) as (axes,):
-            on_front = figures.cost_front(
+        with charts.drawing(path) as (axes,):
+            on_front = charts.cost_front(
                 axes, points, x="seconds a view", y=label, title=front.title
             )
         section.figures.append(Picture(f"figures/{path.name}", front.title))

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from attnwarp_eval.files import canonical_json
+from attnwarp_eval.canonical_json import canonical_json
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from attnwarp_eval.files import digest
+from attnwarp_eval.canonical_json import digest
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
-from attnwarp_eval.files import without_nan
+from attnwarp_eval.canonical_json import without_nan
 
 Json = dict[str, Any]
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from attnwarp.encoders import EncoderInfo, Kind, load_encoder
 from attnwarp.errors import InputError
 from attnwarp_eval import metrics
-from attnwarp_eval.files import without_nan
+from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.store import Store
 

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp_eval.files import without_nan, write_atomic
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
 from attnwarp_eval.user_images.measure import Measured, Row, natural
 

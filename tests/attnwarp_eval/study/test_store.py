@@ -9,7 +9,8 @@ import time
 
 import pytest
 
-from attnwarp_eval.files import canonical_json, write_atomic
+from attnwarp_eval.canonical_json import canonical_json
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.store import Store, StoreError
 

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import write_json
 from attnwarp_eval.experiments.accuracy.panel import Panel
-from attnwarp_eval.files import write_atomic, write_json
+from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Ratio
 
 
@@ -39,7 +40,7 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         InputError: an ``accuracy.json`` of something else.
     """
     from attnwarp_eval.cost import environment
-    from attnwarp_eval.document import figures
+    from attnwarp_eval.document import charts
     from attnwarp_eval.document.model import Picture, Report
     from attnwarp_eval.document.write import markdown
     from attnwarp_eval.statistics.intervals import Interval
@@ -70,10 +71,10 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         if not selected:
             continue
         path = out / f"{question}.svg"
-        with figures.drawing(path, columns=len(selected)) as axes:
+        with charts.drawing(path, columns=len(selected)) as axes:
             for ax, panel in zip(axes, selected, strict=True):
                 points = {c.name: point(panel, k) for k, c in enumerate(panel.contestants)}
-                figures.cost_front(ax, points, x="seconds", y=SHORT[question], title=panel.scene)
+                charts.cost_front(ax, points, x="seconds", y=SHORT[question], title=panel.scene)
         drawn.append((question, path))
     sections = _sections(panels)
     for section in sections:

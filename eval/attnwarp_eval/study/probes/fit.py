@@ -14,10 +14,10 @@ from pydantic import Field
 from attnwarp.fit import FitSettings
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
-from attnwarp_eval.document import figures
+from attnwarp_eval.canonical_json import canonical_json, digest
+from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.files import canonical_json, digest
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.statistics.intervals import Interval, interval
@@ -312,10 +312,10 @@ class Fit(Probe[Curve]):
         ]
 
     def _curves(self, results: Results, layout: Layout, names: list[str]) -> Picture:
-        with figures.drawing(layout.figure("fits.svg"), columns=len(CURVES)) as panels:
+        with charts.drawing(layout.figure("fits.svg"), columns=len(CURVES)) as panels:
             for axes, (title, (unit, pick)) in zip(panels, CURVES.items(), strict=True):
-                series = [figures.Line(name, *self._curve(results, name, pick)) for name in names]
-                figures.lines(
+                series = [charts.Line(name, *self._curve(results, name, pick)) for name in names]
+                charts.lines(
                     axes, series, x="CPU seconds", y=unit, title=title, log=unit == "ratio"
                 )
         return Picture("figures/fits.svg", "Accuracy against time as the fits proceed.")

@@ -21,7 +21,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.cost import in_turn
-from attnwarp_eval.document import figures
+from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.arrays import Array
@@ -540,8 +540,8 @@ def _flaws(
     means = np.array([[shares[row.key][c.name].mean for c in FLAWS] for row in rows])
     framed = np.array([[c.name in row.meant for c in FLAWS] for row in rows])
     path = layout.figure("sensitivity.svg")
-    with figures.drawing(path, height=0.8 + 0.34 * len(rows), width=9.6) as (axes,):
-        figures.heatmap(
+    with charts.drawing(path, height=0.8 + 0.34 * len(rows), width=9.6) as (axes,):
+        charts.heatmap(
             axes,
             means,
             rows=[row.title for row in rows],
@@ -588,15 +588,15 @@ def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
     columns = 3
     path = layout.figure("sensitivity-strength.svg")
     lines = -(-len(drawn) // columns)
-    with figures.drawing(path, columns, 1.9 * lines, rows=lines, width=3.0 * columns) as axes:
+    with charts.drawing(path, columns, 1.9 * lines, rows=lines, width=3.0 * columns) as axes:
         for panel, (row, means) in zip(axes, drawn, strict=False):
             unit = metric_of(row.key).unit
-            line = figures.Line(row.title, STRENGTHS, means)
+            line = charts.Line(row.title, STRENGTHS, means)
             better = (
                 "less is better" if metric_of(row.key).direction == "lower" else "more is better"
             )
             label = row.title.replace("PSNR", "MSE")
-            figures.lines(
+            charts.lines(
                 panel, [line], x="strength", y=unit, title=f"{label} ({better})", legend=False
             )
         for panel in axes[len(drawn) :]:
@@ -667,9 +667,9 @@ def _costs(
         ),
     ]
     on_front: list[str] = []
-    with figures.drawing(path, columns=2, height=4.2, width=11.5) as axes:
+    with charts.drawing(path, columns=2, height=4.2, width=11.5) as axes:
         for panel, (title, some) in zip(axes, apart, strict=True):
-            on_front += figures.cost_front(
+            on_front += charts.cost_front(
                 panel,
                 some,
                 x="seconds a picture",

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from pydantic import Field
 
 from attnwarp.warp import WarpSettings, render_surface, warp_view
-from attnwarp_eval.document import figures
+from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.occlusion import COUNTS, by_yaw
@@ -208,14 +208,14 @@ class Warp(Probe[NoExtra]):
                 " all."
             ),
         ]
-        with figures.drawing(layout.figure("masks-by-yaw.svg"), columns=2) as (left, right):
+        with charts.drawing(layout.figure("masks-by-yaw.svg"), columns=2) as (left, right):
             for axes, metric, title in (
                 (left, "occlusion.false_positive_rate", "unseen surface accepted"),
                 (right, "occlusion.false_negative_rate", "visible surface rejected"),
             ):
-                series = [figures.Line(name, *self._curve(results, name, metric)) for name in names]
+                series = [charts.Line(name, *self._curve(results, name, metric)) for name in names]
                 x, y = "yaw from the source, degrees", "share"
-                figures.lines(axes, series, x=x, y=y, title=title, share=True, legend=axes is right)
+                charts.lines(axes, series, x=x, y=y, title=title, share=True, legend=axes is right)
         drawn = Picture(
             "figures/masks-by-yaw.svg",
             "Both errors of the masks by yaw; means and 95 % intervals over scenes.",

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from attnwarp_eval.document import figures
+from attnwarp_eval.document import charts
 from attnwarp_eval.statistics.intervals import Interval
 
 
@@ -24,8 +24,8 @@ def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
         f"variant {k}": tuple(around(v) for v in (1 + 0.02 * random.random(2))) for k in range(8)
     }
     points["alone"] = (around(10.0), around(10.0))
-    with figures.drawing(tmp_path / "front.svg") as (axes,):
-        figures.cost_front(axes, points, x="seconds", y="error", title="front", log=log)
+    with charts.drawing(tmp_path / "front.svg") as (axes,):
+        charts.cost_front(axes, points, x="seconds", y="error", title="front", log=log)
         axes.figure.draw_without_rendering()
         notes = axes.texts
         assert sorted(note.get_text() for note in notes) == sorted(points)

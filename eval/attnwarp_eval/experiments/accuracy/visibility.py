@@ -1,0 +1,167 @@
+"""What visibility costs: rays against depth maps, with exact visibility as the judge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp_eval.cost import in_turn
+from attnwarp_eval.experiments.accuracy.geometry import every_triangle, triangles
+from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.twoview import Hits
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MAPS = (32, 128, 512)
+"""Sizes of the depth maps whose test of visibility is held against rays."""
+
+
+def visibility(
+    scene: Scene,
+    *,
+    size: int = 512,
+    points: int = 500,
+    rounds: int = 5,
+    maps: Sequence[int] = MAPS,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Panel:
+    """Whether surface points of the middle target are seen by the source: by rays, and by depth
+    maps of the source.
+
+    A point is asked about when it faces the source and falls inside its image. A depth map answers
+    with its nearest pixel (visible when not more than 1 % behind it), or bilinearly in 1 / z (and
+    then not where its four pixels spread by more than 2 %). What a ray from the source meets first,
+    of all triangles in float64, is right.
+
+    Args:
+        size: of the target, whose every pixel is a point.
+        points: how many of them are held against every triangle.
+        rounds: of the timing, which covers all points and the making of the depth map.
+        maps: sizes of the depth maps.
+        tell: told what is at work.
+    """
+    from attnwarp_eval.truth.raycast import Geometry
+
+    meshes = triangles(scene)
+    geometry = Geometry(meshes)
+    target = scene.with_size(size, size).targets[len(scene.targets) // 2]
+    source = scene.with_size(size, size).source
+    hits = geometry.trace(target)
+    asked = _faces_and_falls_in(hits, source)
+    points_asked, normal, primitive = (
+        hits.point[asked],
+        hits.normal[asked],
+        hits.primitive_id[asked],
+    )
+
+    def by_rays(_: int) -> npt.NDArray[np.float64]:
+        return geometry.visible_from(points_asked, normal, primitive, source).astype(np.float64)
+
+    def by_map(pixels: int, bilinear: bool) -> Callable[[int], npt.NDArray[np.float64]]:
+        camera = source.resize(pixels, pixels)
+
+        def work(_: int) -> npt.NDArray[np.float64]:
+            geometry.forget()
+            return _seen_in_map(geometry.trace(camera).depth, camera, points_asked, bilinear)
+
+        return work
+
+    tell(
+        f"{scene.name}: {sum(len(m.faces) for m in meshes)} triangles against {points} points in"
+        " float64"
+    )
+    chosen = np.sort(
+        np.random.default_rng(1).choice(
+            len(points_asked), min(points, len(points_asked)), replace=False
+        )
+    )
+    away = points_asked[chosen] - source.position
+    corners = np.concatenate([(m.vertices - source.position)[m.faces] for m in meshes])
+    # What lies within 1e-7 of the way before the point is its own surface, or one glued to it.
+    first = every_triangle(
+        np.zeros_like(away), np.ascontiguousarray(away), corners, np.full(len(away), 1 - 1e-7)
+    )
+    seen = ~np.isfinite(first)
+
+    works: list[Callable[[int], Any]] = [by_rays]
+    names = ["rays"]
+    for pixels in maps:
+        for bilinear in (False, True):
+            works.append(by_map(pixels, bilinear))
+            names.append(
+                f"depth map {pixels}, {'bilinear in 1/z, 2 %' if bilinear else 'nearest, 1 %'}"
+            )
+    tell(f"{scene.name}: visibility of {len(points_asked)} points, {rounds} rounds")
+    turns = in_turn(works, rounds)
+    out = []
+    for name, got, took in zip(names, turns.results, turns.seconds, strict=True):
+        answer = got[0][chosen]
+        right, answered = int((answer == seen).sum()), np.isfinite(answer)
+        wrong = int((answer[answered] != seen[answered]).sum())
+        more = {
+            "wrong": wrong / len(seen),
+            "unanswered": float(1 - answered.mean()),
+            "points": float(len(seen)),
+        }
+        out.append(Contestant(name, _share(len(seen) - right, len(seen)), tuple(took), more))
+    return Panel(
+        "visibility",
+        scene.name,
+        "share of points not labelled rightly",
+        tuple(out),
+        tuple(turns.again),
+    )
+
+
+def _share(count: int, total: int) -> tuple[float, float, float]:
+    """A share with the 95 % interval of Clopper & Pearson (1934)."""
+    from scipy import stats
+
+    low = float(stats.beta.ppf(0.025, count, total - count + 1)) if count else 0.0
+    high = float(stats.beta.ppf(0.975, count + 1, total - count)) if count < total else 1.0
+    return count / total, low, high
+
+
+def _faces_and_falls_in(hits: Hits, source: Camera) -> Mask:
+    point = np.nan_to_num(hits.point)
+    local = (point - source.position) @ source.rotation.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = local @ source.K.T
+        xy = xy[..., :2] / xy[..., 2:]
+    inside = (
+        (local[..., 2] > 0)
+        & (xy > 0).all(-1)
+        & (xy[..., 0] < source.width)
+        & (xy[..., 1] < source.height)
+    )
+    facing = np.einsum("hwi,hwi->hw", np.nan_to_num(hits.normal), source.position - point) > 0
+    return hits.valid & inside & facing
+
+
+def _seen_in_map(depth: Array, camera: Camera, points: Array, bilinear: bool) -> Array:
+    """1 where a point is not behind the depth map, 0 where it is, NaN where the map has no
+    answer."""
+    local = (points - camera.position) @ camera.rotation.T
+    z = local[:, 2]
+    x, y = ((local @ camera.K.T)[:, k] / z for k in (0, 1))
+    height, width = depth.shape
+    if not bilinear:
+        surface = depth[np.clip(y.astype(int), 0, height - 1), np.clip(x.astype(int), 0, width - 1)]
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(surface), (z <= 1.01 * surface).astype(float), 1.0)
+    x, y = np.clip(x - 0.5, 0, width - 1.001), np.clip(y - 0.5, 0, height - 1.001)
+    left, top = x.astype(int), y.astype(int)
+    a, b = x - left, y - top
+    taps = np.stack([depth[top + j, left + i] for j in (0, 1) for i in (0, 1)])
+    weights = np.stack([(b if j else 1 - b) * (a if i else 1 - a) for j in (0, 1) for i in (0, 1)])
+    with np.errstate(invalid="ignore"):
+        surface = 1 / (weights / taps).sum(0)
+        steady = taps.max(0) <= 1.02 * taps.min(0)
+        # A threshold of 1 % again; interpolated depth needs less, but then slants decide.
+        return np.where(steady, (z <= 1.01 * surface).astype(float), np.nan)
