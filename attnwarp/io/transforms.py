@@ -61,6 +61,9 @@ PINHOLE_MODELS = (
 )
 """Values of ``camera_model`` that are a pinhole as long as every distortion coefficient is zero."""
 
+INTRINSICS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "cx", "cy", "w", "h")
+"""Keys that may stand in the frame and at the top of the file."""
+
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 CHANGES_THE_PICTURE = {
@@ -137,7 +140,9 @@ def read_transforms(
             a split that names no frame; the message names the frame and the key.
 
     Warns:
-        InputWarning: keys that are not understood; frames that no split names.
+        InputWarning: keys that are not understood; frames that no split names; a frame whose
+            intrinsics differ from those at the top.
+
 
     Example:
         >>> import json
@@ -321,6 +326,7 @@ def _read_file(
             InputWarning,
             stacklevel=2,
         )
+    _warn_of_own_intrinsics(path, data, frames)
     splits = _splits(path, data, names, paths, split)
     cameras, available = with_images(
         path, cameras, paths, missing_images=missing_images, resize_cameras=resize_cameras
@@ -384,6 +390,34 @@ def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
             f"got {brief(value)}: {effect}, which is not supported; prepare the images without it,"
             f" or pass ignore_keys=[{key!r}] (--ignore-key {key})",
         )
+
+
+def _warn_of_own_intrinsics(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> None:
+    """Say that frames replace intrinsics of the top, since programs disagree on which holds."""
+    other = {
+        i: keys
+        for i, frame in enumerate(frames)
+        if (keys := [key for key in INTRINSICS if _replaces(frame, data, key)])
+    }
+    if other:
+        first, keys = next(iter(other.items()))
+        warnings.warn(
+            f"{path}: {len(other)} of {len(frames)} frames have intrinsics other than the top of"
+            f" the file (first: frames[{first}], {', '.join(keys)}); the frame's are used, while"
+            " nerfstudio uses those of the top",
+            InputWarning,
+            stacklevel=3,
+        )
+
+
+def _replaces(frame: dict[str, Any], data: dict[str, Any], key: str) -> bool:
+    """Whether a frame's value of ``key`` puts another value out of use."""
+    if key not in frame:
+        return False
+    if key in data:
+        return bool(frame[key] != data[key])
+    length = key.replace("camera_angle", "fl")
+    return length not in frame and length in data
 
 
 def _splits(

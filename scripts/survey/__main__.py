@@ -23,7 +23,7 @@ from scripts.survey.outcome import FAILURES, Outcome, Row
 
 PROGRAMS = ("trimesh", "pyvista", "vtk", "pycolmap")
 
-CELL = 160
+CELL = 90
 """Longest message in a table."""
 
 

@@ -39,7 +39,7 @@ def write(folder: Path, model: str, seed: int, *, zero: bool, text: bool) -> Any
 
     rng = np.random.default_rng(seed)
     camera = pycolmap.Camera.create_from_model_name(1, model, 50.0, *SIZE)
-    params = np.array(camera.params)
+    params = np.array(camera.params, dtype=np.float64)
     center = list(camera.principal_point_idxs())
     params[center] += rng.uniform(-2, 2, len(center))
     focal = list(camera.focal_length_idxs())
@@ -47,7 +47,7 @@ def write(folder: Path, model: str, seed: int, *, zero: bool, text: bool) -> Any
     if not zero:
         extra = list(camera.extra_params_idxs())
         params[extra] += rng.uniform(0.002, 0.03, len(extra)) * rng.choice([-1, 1], len(extra))
-    camera.params = params
+    camera.params = params.tolist()
     reconstruction = pycolmap.Reconstruction()
     reconstruction.add_camera_with_trivial_rig(camera)
     for k in (1, 2):

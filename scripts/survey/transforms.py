@@ -111,13 +111,15 @@ def _pixels(both: Data, K: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     still = np.zeros(3)
     if "FISHEYE" in model or both.get("is_fisheye"):
         D = np.array([c["k1"], c["k2"], c["k3"], c["k4"]])
-        return np.asarray(cv2.fisheye.projectPoints(points, still, still, K, D)[0]).reshape(-1, 2)
+        pixels = cv2.fisheye.projectPoints(points, still, still, K, D)[0]
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "FULL_OPENCV"):
         raise ValueError(model)
     if c["k4"] and model != "FULL_OPENCV":
         raise ValueError("k4 of no known formula")
     D = np.array([c.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
-    return np.asarray(cv2.projectPoints(points, still, still, K, D)[0]).reshape(-1, 2)
+    pixels = cv2.projectPoints(points, still, still, K, D)[0]
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 
 def _with_splits(file: Path, data: Data, views: list[View]) -> list[View]:

@@ -113,7 +113,9 @@ def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
             "cx": 8,
         },
     ]
-    a, b = read_transforms(write(tmp_path, frames, **LENS)).cameras
+    message = r"1 of 2 frames.*frames\[1\], camera_angle_x, cx, w, h\).*nerfstudio"
+    with pytest.warns(InputWarning, match=message):
+        a, b = read_transforms(write(tmp_path, frames, **LENS)).cameras
     assert a.K.tolist() == [[10, 0, 3.5], [0, 11, 3.25], [0, 0, 1]]
     f = 8 / math.tan(0.5)
     np.testing.assert_allclose(b.K, [[f, 0, 8], [0, f, 3.25], [0, 0, 1]])
