@@ -76,16 +76,17 @@ class Slots(NamedTuple):
     inverse_depth: int = 6
     variance: int = 7
     alpha: int = 8
-    d_alpha: int = 9
-    d_depth: int = 10
-    d_l2: int = 11
-    d_l1: int = 12
-    d_median: int = 13
-    behind_alpha: int = 14
-    behind_depth: int = 15
-    behind_loss: int = 16
-    d_normal: int = 17  # (3)
-    d_color: int = 20  # (channels)
+    d_depth: int = 9
+    d_l2: int = 10
+    d_l1: int = 11
+    d_median: int = 12
+    behind_alpha: int = 13
+    behind_depth: int = 14
+    # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
+    # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
+    behind_loss: int = 15
+    d_normal: int = 16  # (3)
+    d_color: int = 19  # (channels)
 
 
 SLOT = Slots()
@@ -201,7 +202,7 @@ def _select_drawn(buffer, p, background, scale):
     drawn = load(buffer, SLOT.last_step * PIXELS + p) > zero
     A = select(drawn, load(buffer, SLOT.alpha * PIXELS + p), f32(1.0))
     d_l2 = load(buffer, SLOT.d_l2 * PIXELS + p) * scale
-    d_alpha = load(buffer, SLOT.d_alpha * PIXELS + p)
+    d_alpha = load(buffer, SLOT.behind_loss * PIXELS + p)
     d_alpha = d_alpha + d_l2 * load(buffer, SLOT.variance * PIXELS + p)
     for c in range(3):
         at = (SLOT.d_color + c) * PIXELS + p
@@ -209,7 +210,8 @@ def _select_drawn(buffer, p, background, scale):
         store(buffer, at, select(drawn, load(buffer, at), zero))
         at = (SLOT.d_normal + c) * PIXELS + p
         store(buffer, at, select(drawn, load(buffer, at), zero))
-    store(buffer, SLOT.d_alpha * PIXELS + p, select(drawn, d_alpha, zero))
+    d_alpha = d_alpha * load(buffer, SLOT.transmittance * PIXELS + p)
+    store(buffer, SLOT.behind_loss * PIXELS + p, select(drawn, zero - d_alpha, zero))
     at = SLOT.d_depth * PIXELS + p
     store(buffer, at, select(drawn, load(buffer, at) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
@@ -238,7 +240,7 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.variance * PIXELS + p, state, at + STATE.variance * plane)
         copy4(buffer, SLOT.depth * PIXELS + p, pictures.depth, at)
         copy4(buffer, SLOT.alpha * PIXELS + p, pictures.alpha, at)
-        copy4(buffer, SLOT.d_alpha * PIXELS + p, upstream.alpha, at)
+        copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, at)
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, at)
         copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, at)
         copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, at)
@@ -273,7 +275,7 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
                 buffer[u64((SLOT.d_color + c) * PIXELS) + p] = upstream.color[y, x, u64(c)]
             for c in range(3):
                 buffer[u64((SLOT.d_normal + c) * PIXELS) + p] = upstream.normal[y, x, u64(c)]
-            buffer[u64(SLOT.d_alpha * PIXELS) + p] = d_alpha
+            buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
             buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
             buffer[u64(SLOT.d_l1 * PIXELS) + p] = f32(2.0) * upstream.l1[y, x]
@@ -302,7 +304,7 @@ def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
     behind_depth = load(buffer, SLOT.behind_depth * PIXELS + s)
     behind_loss = load(buffer, SLOT.behind_loss * PIXELS + s)
     # The gradient in the weight.
-    g = load(buffer, SLOT.d_alpha * PIXELS + s) + d_weight + d_depth * dz + d_inverse * di
+    g = d_depth * dz + d_inverse * di + d_weight
     for c in range(3):
         d_normal = load(buffer, (SLOT.d_normal + c) * PIXELS + s)
         g = g + d_normal * broadcast(work, row + SPLAT.normal + c)
