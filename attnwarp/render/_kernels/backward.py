@@ -15,6 +15,7 @@ from attnwarp.render._kernels.compilation import bare, f32, f64, inlined, jit, p
 from attnwarp.render._kernels.evaluation import (
     depth_from,
     evaluate,
+    footprint_terms,
     lay_out,
     linear_at,
     move_to_quarter,
@@ -28,7 +29,6 @@ from attnwarp.render._kernels.lanes import (
     invert,
     load,
     lowest_bit,
-    maximum,
     reciprocal,
     select,
     separate4,
@@ -40,6 +40,7 @@ from attnwarp.render._kernels.lanes import (
 from attnwarp.render._kernels.layout import (
     DISC,
     ELLIPSOID,
+    ELLIPSOID_GRADIENT,
     GRADIENTS,
     LINEAR,
     PIXELS,
@@ -75,16 +76,17 @@ class Slots(NamedTuple):
     inverse_depth: int = 6
     variance: int = 7
     alpha: int = 8
-    d_alpha: int = 9
-    d_depth: int = 10
-    d_l2: int = 11
-    d_l1: int = 12
-    d_median: int = 13
-    behind_alpha: int = 14
-    behind_depth: int = 15
-    behind_loss: int = 16
-    d_normal: int = 17  # (3)
-    d_color: int = 20  # (channels)
+    d_depth: int = 9
+    d_l2: int = 10
+    d_l1: int = 11
+    d_median: int = 12
+    behind_alpha: int = 13
+    behind_depth: int = 14
+    # Begins with minus the gradient in alpha times the transmittance, which is all that alpha
+    # changes with: where a pixel is opaque, a difference of sums of weights has no digits of it.
+    behind_loss: int = 15
+    d_normal: int = 16  # (3)
+    d_color: int = 19  # (channels)
 
 
 SLOT = Slots()
@@ -134,14 +136,11 @@ class EllipsoidSums(NamedTuple):
 
     features: int = 0  # (6) normal, values
     exponent: int = 6  # in rho / 2
-    x: int = 7  # (2) times offsets
-    xx: int = 9  # (3) times products of offsets
+    uv: int = 7  # (2) in rho / 2, times u and v
+    shape: int = 9  # (3) times u^2, u v, v^2
     d_low: int = 12
     d_high: int = 13
-    d_depth: int = 14
-    d_along: int = 15  # (3) in l, and times offsets
-    d_form: int = 18  # (2) in r, times offsets
-    d_form_xx: int = 20  # (3) times products of offsets
+    peak: int = 14  # (8) see EllipsoidGradients
 
 
 DISC_SUM, ELLIPSOID_SUM = DiscSums(), EllipsoidSums()
@@ -172,6 +171,7 @@ def _write_disc_row(work, row, rows, dx, dy, line):
         - work[b + u64(DISC_SUM.d_center + 1)]
     )
     rows[line, SPLAT.depth] = work[b + u64(DISC_SUM.d_depth)]
+    rows[line, ELLIPSOID_GRADIENT.square_last] = f32(0.0)  # unused by this kind
     rows[line, SPLAT.depth_low] = work[b + u64(DISC_SUM.d_low)]
     rows[line, SPLAT.depth_high] = work[b + u64(DISC_SUM.d_high)]
 
@@ -180,33 +180,14 @@ def _write_disc_row(work, row, rows, dx, dy, line):
 def _write_ellipsoid_row(work, row, rows, line):
     """A 3D splat's row of gradients from its sums; ``row`` is its row of the table, as float64."""
     b = u64(WORK.sums)
-    x, y = f64(work[b + u64(ELLIPSOID_SUM.x)]), f64(work[b + u64(ELLIPSOID_SUM.x + 1)])
-    xx = u64(ELLIPSOID_SUM.xx) + b
-    along = u64(ELLIPSOID_SUM.d_along) + b
-    form, form_xx = u64(ELLIPSOID_SUM.d_form) + b, u64(ELLIPSOID_SUM.d_form_xx) + b
-    dl, rx, ry = f64(work[along]), f64(work[form]), f64(work[form + u64(1)])
-    rows[line, SPLAT.center_x] = (
-        row[ELLIPSOID.conic_xx] * x
-        + row[ELLIPSOID.conic_xy] * y
-        - dl * row[ELLIPSOID.peak_x]
-        - 2 * (row[ELLIPSOID.peak_xx] * rx + row[ELLIPSOID.peak_xy] * ry)
-    )
-    rows[line, SPLAT.center_y] = (
-        row[ELLIPSOID.conic_xy] * x
-        + row[ELLIPSOID.conic_yy] * y
-        - dl * row[ELLIPSOID.peak_y]
-        - 2 * (row[ELLIPSOID.peak_xy] * rx + row[ELLIPSOID.peak_yy] * ry)
-    )
-    rows[line, ELLIPSOID.conic_xx] = f32(-0.5) * work[xx]
-    rows[line, ELLIPSOID.conic_xy] = -work[xx + u64(1)]
-    rows[line, ELLIPSOID.conic_yy] = f32(-0.5) * work[xx + u64(2)]
-    rows[line, ELLIPSOID.peak_x] = work[along + u64(1)]
-    rows[line, ELLIPSOID.peak_y] = work[along + u64(2)]
-    rows[line, ELLIPSOID.peak_xx] = work[form_xx]
-    rows[line, ELLIPSOID.peak_xy] = f32(2.0) * work[form_xx + u64(1)]
-    rows[line, ELLIPSOID.peak_yy] = work[form_xx + u64(2)]
-    rows[line, ELLIPSOID.peak_yy + 1] = f32(0.0)  # unused by this kind
-    rows[line, SPLAT.depth] = work[b + u64(ELLIPSOID_SUM.d_depth)]
+    u, v = f64(work[b + u64(ELLIPSOID_SUM.uv)]), f64(work[b + u64(ELLIPSOID_SUM.uv + 1)])
+    rows[line, SPLAT.center_x] = row[ELLIPSOID.factor_xx] * u
+    rows[line, SPLAT.center_y] = row[ELLIPSOID.factor_xy] * u + row[ELLIPSOID.factor_yy] * v
+    for c in range(3):
+        rows[line, ELLIPSOID_GRADIENT.shape + c] = work[b + u64(ELLIPSOID_SUM.shape + c)]
+    for c in range(7):
+        rows[line, ELLIPSOID_GRADIENT.linear + c] = work[b + u64(ELLIPSOID_SUM.peak + c)]
+    rows[line, ELLIPSOID_GRADIENT.square_last] = work[b + u64(ELLIPSOID_SUM.peak + 7)]
     rows[line, SPLAT.depth_low] = work[b + u64(ELLIPSOID_SUM.d_low)]
     rows[line, SPLAT.depth_high] = work[b + u64(ELLIPSOID_SUM.d_high)]
 
@@ -221,7 +202,7 @@ def _select_drawn(buffer, p, background, scale):
     drawn = load(buffer, SLOT.last_step * PIXELS + p) > zero
     A = select(drawn, load(buffer, SLOT.alpha * PIXELS + p), f32(1.0))
     d_l2 = load(buffer, SLOT.d_l2 * PIXELS + p) * scale
-    d_alpha = load(buffer, SLOT.d_alpha * PIXELS + p)
+    d_alpha = load(buffer, SLOT.behind_loss * PIXELS + p)
     d_alpha = d_alpha + d_l2 * load(buffer, SLOT.variance * PIXELS + p)
     for c in range(3):
         at = (SLOT.d_color + c) * PIXELS + p
@@ -229,7 +210,8 @@ def _select_drawn(buffer, p, background, scale):
         store(buffer, at, select(drawn, load(buffer, at), zero))
         at = (SLOT.d_normal + c) * PIXELS + p
         store(buffer, at, select(drawn, load(buffer, at), zero))
-    store(buffer, SLOT.d_alpha * PIXELS + p, select(drawn, d_alpha, zero))
+    d_alpha = d_alpha * load(buffer, SLOT.transmittance * PIXELS + p)
+    store(buffer, SLOT.behind_loss * PIXELS + p, select(drawn, zero - d_alpha, zero))
     at = SLOT.d_depth * PIXELS + p
     store(buffer, at, select(drawn, load(buffer, at) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
@@ -258,7 +240,7 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
         copy4(buffer, SLOT.variance * PIXELS + p, state, at + STATE.variance * plane)
         copy4(buffer, SLOT.depth * PIXELS + p, pictures.depth, at)
         copy4(buffer, SLOT.alpha * PIXELS + p, pictures.alpha, at)
-        copy4(buffer, SLOT.d_alpha * PIXELS + p, upstream.alpha, at)
+        copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, at)
         copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, at)
         copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, at)
         copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, at)
@@ -293,7 +275,7 @@ def _load_tile(buffer, tile, background, scale, pictures, upstream):
                 buffer[u64((SLOT.d_color + c) * PIXELS) + p] = upstream.color[y, x, u64(c)]
             for c in range(3):
                 buffer[u64((SLOT.d_normal + c) * PIXELS) + p] = upstream.normal[y, x, u64(c)]
-            buffer[u64(SLOT.d_alpha * PIXELS) + p] = d_alpha
+            buffer[u64(SLOT.behind_loss * PIXELS) + p] = -d_alpha * state[STATE.transmittance, y, x]
             buffer[u64(SLOT.d_depth * PIXELS) + p] = d_depth
             buffer[u64(SLOT.d_l2 * PIXELS) + p] = d_l2 * A
             buffer[u64(SLOT.d_l1 * PIXELS) + p] = f32(2.0) * upstream.l1[y, x]
@@ -322,7 +304,7 @@ def _blame(space, s, row, hit, alpha, z, inverse_z, step, d_weight, k, channels,
     behind_depth = load(buffer, SLOT.behind_depth * PIXELS + s)
     behind_loss = load(buffer, SLOT.behind_loss * PIXELS + s)
     # The gradient in the weight.
-    g = load(buffer, SLOT.d_alpha * PIXELS + s) + d_weight + d_depth * dz + d_inverse * di
+    g = d_depth * dz + d_inverse * di + d_weight
     for c in range(3):
         d_normal = load(buffer, (SLOT.d_normal + c) * PIXELS + s)
         g = g + d_normal * broadcast(work, row + SPLAT.normal + c)
@@ -423,35 +405,32 @@ def _add_disc(work, x, y, nx, ny, z, in_alpha, in_z, by_center, zero_lanes, sums
 def _add_ellipsoid(work, nx, ny, in_alpha, in_z, by_center, sums):
     """Add a 3D splat's gradients at 16 pixels, (nx, ny) from the quarter's middle, to ``sums``, in
     the order of :class:`EllipsoidSums`."""
-    zero, one, two = f32(0.0), f32(1.0), f32(2.0)
+    zero = f32(0.0)
     row, linear = WORK.row, WORK.linear
-    exponent, x, y, xx, xy, yy, low, high, depth, l_0, l_x, l_y, r_x, r_y, r_xx, r_xy, r_yy = sums
-    ex = nx + broadcast(work, linear + LINEAR.x)
-    ey = ny + broadcast(work, linear + LINEAR.y)
+    exponent, u_0, v_0, uu, uv, vv, low, high, l_0, p_0, q_0, lp, lq, pp, pq, qq, s16 = sums
+    u, v = footprint_terms(work, row, linear, nx, ny)
     exponent = exponent + in_alpha
-    x, y = x + in_alpha * ex, y + in_alpha * ey
-    xx, xy, yy = xx + in_alpha * ex * ex, xy + in_alpha * ex * ey, yy + in_alpha * ey * ey
+    in_u, in_v = in_alpha * u, in_alpha * v
+    u_0, v_0 = u_0 + in_u, v_0 + in_v
+    uu, uv, vv = uu + in_u * u, uv + in_u * v, vv + in_v * v
     if by_center:
         low = low + in_z
     else:
         z0 = broadcast(work, row + SPLAT.depth)
-        along, across = peak_terms(work, row, ex, ey)
-        inverse = reciprocal(maximum(across, f32(1e-30)))
+        along, p, q, inverse = peak_terms(work, row, linear, nx, ny)
         unbounded = z0 * along * inverse
         under = unbounded <= broadcast(work, row + SPLAT.depth_low)
         over = broadcast(work, row + SPLAT.depth_high) < unbounded
         low = low + select(under, in_z, zero)
         high = high + select(over, in_z, zero)
-        in_z = select(under | over, zero, in_z) * inverse
-        depth = depth + in_z * along
-        in_z = in_z * z0
-        in_l = in_z * (one - two * along * along * inverse)
-        in_r = -(in_z * along * inverse)
-        l_0, l_x, l_y = l_0 + in_l, l_x + in_l * ex, l_y + in_l * ey
-        rx, ry = in_r * ex, in_r * ey
-        r_x, r_y = r_x + rx, r_y + ry
-        r_xx, r_xy, r_yy = r_xx + rx * ex, r_xy + rx * ey, r_yy + ry * ey
-    return exponent, x, y, xx, xy, yy, low, high, depth, l_0, l_x, l_y, r_x, r_y, r_xx, r_xy, r_yy
+        k = select(under | over, zero, in_z) * z0 * inverse
+        in_along = k * along
+        l_0, p_0, q_0 = l_0 + in_along, p_0 + k * p, q_0 + k * q
+        k = in_along * inverse
+        kp, kq = k * p, k * q
+        lp, lq = lp + kp * along, lq + kq * along
+        pp, pq, qq = pp + kp * p, pq + kp * q, qq + kq * q
+    return exponent, u_0, v_0, uu, uv, vv, low, high, l_0, p_0, q_0, lp, lq, pp, pq, qq, s16
 
 
 @inlined
@@ -461,7 +440,7 @@ def _splat_backward(space, table, view, tile, k, step, squares, d_weight, channe
     discs, by_center = view.discs, view.by_center
     zero = load(buffer, SLOT.x * PIXELS) * f32(0.0)
     middle_x, middle_y = tile.left + TILE / 2, tile.top + TILE / 2
-    lay_out(work, WORK.row, moments, 0, table, k, middle_x, middle_y, discs)
+    lay_out(work, WORK.row, moments, 0, table, k, middle_x, middle_y, discs, by_center)
     if channels > 3:
         for c in range(3, channels):
             rows[line, GRADIENTS + 3 + c] = f32(0.0)
@@ -543,7 +522,8 @@ def rasterize_backward(
     """Gradients of the tiles order[first:last], a row of ``target``, ``Rows``, for each entry.
 
     None is written for entries without squares, which are nowhere drawn. A row holds the gradient
-    in the first GRADIENTS columns of the splat's row of the table, then in its normal and values.
+    in the first GRADIENTS columns of the splat's row of the table, or what
+    :class:`EllipsoidGradients` says, then in its normal and values.
     Splats are visited back to front: the transmittance before each is recovered by division from
     what the forward pass left. A splat's sums stay in registers while its squares go by.
     """

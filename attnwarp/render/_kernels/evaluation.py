@@ -38,7 +38,6 @@ from attnwarp.render._kernels.layout import (
     SLOPE_X,
     SLOPE_Y,
     SPLAT,
-    TILE_ROW,
 )
 from attnwarp.render.constants import ALPHA_MAX
 
@@ -82,7 +81,7 @@ def prepare_moments(moments, start):
 
 
 @inlined
-def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs):
+def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs, by_center):
     """Lay out splat k of the table for a tile.
 
     Its row as float32 goes to ``work`` from ``row`` on; what is linear in the pixel's position to
@@ -107,14 +106,24 @@ def lay_out(work, row, moments, start, table, k, middle_x, middle_y, discs):
         moments[m + u64(LINEAR.screen_x)] = ROOT2 * dx if filtered else NO_FILTER
         moments[m + u64(LINEAR.screen_y)] = ROOT2 * dy
     else:
-        xx, xy = doubles[k, ELLIPSOID.factor], doubles[k, ELLIPSOID.factor + 1]
-        yy = doubles[k, ELLIPSOID.factor + 2]
-        work[b + u64(TILE_ROW.factor)], work[b + u64(TILE_ROW.factor + 1)] = xx, xy
-        work[b + u64(TILE_ROW.factor + 2)] = yy
+        xx, xy = doubles[k, ELLIPSOID.factor_xx], doubles[k, ELLIPSOID.factor_xy]
+        yy = doubles[k, ELLIPSOID.factor_yy]
         moments[m + u64(LINEAR.u)], moments[m + u64(LINEAR.v)] = xx * dx + xy * dy, yy * dy
         moments[m + u64(SLOPE_X + LINEAR.u)] = xx
         moments[m + u64(SLOPE_Y + LINEAR.u)] = xy
         moments[m + u64(SLOPE_Y + LINEAR.v)] = yy
+        if not by_center:
+            lx, ly = doubles[k, ELLIPSOID.peak_x], doubles[k, ELLIPSOID.peak_y]
+            xx, xy = doubles[k, ELLIPSOID.peak_xx], doubles[k, ELLIPSOID.peak_xy]
+            yy = doubles[k, ELLIPSOID.peak_yy]
+            moments[m + u64(LINEAR.along)] = 1.0 + lx * dx + ly * dy
+            moments[m + u64(LINEAR.p)], moments[m + u64(LINEAR.q)] = xx * dx + xy * dy, yy * dy
+            moments[m + u64(SLOPE_X + LINEAR.along)], moments[m + u64(SLOPE_Y + LINEAR.along)] = (
+                lx,
+                ly,
+            )
+            moments[m + u64(SLOPE_X + LINEAR.p)], moments[m + u64(SLOPE_Y + LINEAR.p)] = xx, xy
+            moments[m + u64(SLOPE_Y + LINEAR.q)] = yy
 
 
 @inlined
@@ -136,18 +145,21 @@ def linear_at(work, term, row, slope, x, y):
 
 
 @inlined
-def peak_terms(work, row, x, y):
-    """Of a 3D splat at offsets (x, y) from its reference point: l, and l^2 + r; see
+def footprint_terms(work, row, linear, x, y):
+    """u and v of a 3D splat at pixels (x, y); see :class:`EllipsoidColumns`."""
+    u = linear_at(work, linear + LINEAR.u, row, ELLIPSOID.factor_xx, x, y)
+    return u, broadcast(work, linear + LINEAR.v) + broadcast(work, row + ELLIPSOID.factor_yy) * y
+
+
+@inlined
+def peak_terms(work, row, linear, x, y):
+    """l, p, q of a 3D splat at pixels (x, y), and 1 / (l^2 + p^2 + q^2); see
     :class:`EllipsoidColumns`."""
-    along = (
-        broadcast(work, row + ELLIPSOID.peak_x) * x
-        + broadcast(work, row + ELLIPSOID.peak_y) * y
-        + f32(1.0)
-    )
-    xx, xy = broadcast(work, row + ELLIPSOID.peak_xx), broadcast(work, row + ELLIPSOID.peak_xy)
-    form = (xx * x + xy * y * f32(2.0)) * x
-    form = form + broadcast(work, row + ELLIPSOID.peak_yy) * y * y
-    return along, along * along + maximum(form, f32(0.0))
+    along = linear_at(work, linear + LINEAR.along, row, ELLIPSOID.peak_x, x, y)
+    p = linear_at(work, linear + LINEAR.p, row, ELLIPSOID.peak_xx, x, y)
+    q = broadcast(work, linear + LINEAR.q) + broadcast(work, row + ELLIPSOID.peak_yy) * y
+    square = along * along + (p * p + q * q)
+    return along, p, q, reciprocal(maximum(square, f32(1e-30)))
 
 
 @inlined
@@ -185,17 +197,14 @@ def evaluate(work, row, linear, x, y, screen_x, screen_y, discs, by_center):
         meets = w <= broadcast(work, row + DISC.w_most)
         rho = minimum(select(meets, (u * u + v * v) * (z * z), f32(NOWHERE)), sx * sx + sy * sy)
     else:
-        u = linear_at(work, linear + LINEAR.u, row, TILE_ROW.factor, x, y)
-        v = broadcast(work, linear + LINEAR.v) + broadcast(work, row + TILE_ROW.factor + 2) * y
+        u, v = footprint_terms(work, row, linear, x, y)
         rho = u * u + v * v
         z = broadcast(work, row + SPLAT.depth_low)
         inverse_z = broadcast(work, row + SPLAT.inverse_depth_low)
         if not by_center:
             low, high = z, broadcast(work, row + SPLAT.depth_high)
-            ex = x + broadcast(work, linear + LINEAR.x)
-            ey = y + broadcast(work, linear + LINEAR.y)
-            along, across = peak_terms(work, row, ex, ey)
-            z = broadcast(work, row + SPLAT.depth) * along * reciprocal(maximum(across, f32(1e-30)))
+            along, _, _, inverse = peak_terms(work, row, linear, x, y)
+            z = broadcast(work, row + SPLAT.depth) * along * inverse
             z = minimum(maximum(z, low), high)
             inverse_z = reciprocal(z)
     inside = rho <= broadcast(work, row + SPLAT.cut)

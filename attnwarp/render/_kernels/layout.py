@@ -83,7 +83,7 @@ class Table(NamedTuple):
 
 ROW_DOUBLES = 24
 SINGLE = 11
-GRADIENTS = 15  # columns below this one carry gradients
+GRADIENTS = 16  # columns below this one carry gradients
 
 
 class SplatColumns(NamedTuple):
@@ -125,29 +125,44 @@ class DiscColumns(NamedTuple):
 
 
 class EllipsoidColumns(NamedTuple):
-    """Columns of a 3D splat: z = depth l / (l^2 + r), l linear and r a quadratic form."""
+    """Columns of a 3D splat: rho = u^2 + v^2 and z = depth l / (l^2 + p^2 + q^2), each of u, v, l,
+    p and q linear.
 
-    conic_xx: int = 2
-    conic_xy: int = 3
-    conic_yy: int = 4
+    Sums of squares: the quadratic forms that they are equal to lose all digits of a needle.
+    """
+
+    factor_xx: int = 2  # u = factor_xx dx + factor_xy dy
+    factor_xy: int = 3
+    factor_yy: int = 4  # v = factor_yy dy
     peak_x: int = 5  # l = 1 + peak_x dx + peak_y dy
     peak_y: int = 6
-    peak_xx: int = 7  # r = peak_xx dx^2 + 2 peak_xy dx dy + peak_yy dy^2
+    peak_xx: int = 7  # p = peak_xx dx + peak_xy dy
     peak_xy: int = 8
-    peak_yy: int = 9
-    # float64, behind the float32 columns: rho = (factor_xx dx + factor_xy dy)^2 + (factor_yy dy)^2,
-    # the conic without the cancellation in it.
-    factor: int = 20  # (3) xx, xy, yy
+    peak_yy: int = 9  # q = peak_yy dy
+
+
+class EllipsoidGradients(NamedTuple):
+    """Columns of a 3D splat's row of gradients that are not gradients in the table's columns.
+
+    With k the gradient in z times z / l, moments of it in the numbers that z is made of, and of the
+    gradient in -rho / 2 in u and v. They are free of the pixel's position, which may be far from
+    the centre.
+    """
+
+    shape: int = 2  # (3) in u^2, u v, v^2
+    linear: int = 5  # (3) k l, k p, k q
+    square: int = 8  # (4) k l z / depth times p l, q l, p^2, p q
+    square_last: int = 15  # times q^2
 
 
 SPLAT, DISC, ELLIPSOID = SplatColumns(), DiscColumns(), EllipsoidColumns()
+ELLIPSOID_GRADIENT = EllipsoidGradients()
 
 
 class RowColumns(NamedTuple):
     """A splat laid out for a tile: ROW float32, the table's columns and these."""
 
     step: int = 28  # 1 + its place in the tile's list
-    factor: int = 29  # (3) of a 3D splat: xx, xy, yy
 
 
 ROW = 32
@@ -155,13 +170,17 @@ TILE_ROW = RowColumns()
 
 
 class LinearTerms(NamedTuple):
-    """What is linear in a pixel's position. For 3D splats rho = u^2 + v^2."""
+    """What is linear in a pixel's position: of 2D splats u, v, w and the screen's, of 3D splats u,
+    v, l (along), p and q; see :class:`EllipsoidColumns`."""
 
     u: int = 0
     v: int = 1
     w: int = 2
+    along: int = 2
     screen_x: int = 3  # x and y times the root of 2, or NO_FILTER
+    p: int = 3
     screen_y: int = 4
+    q: int = 4
     x: int = 5  # offset from the reference point
     y: int = 6
 

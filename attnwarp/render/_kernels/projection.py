@@ -58,11 +58,10 @@ class BatchRows(NamedTuple):
     center: int = 11  # (3) camera axes
     direction: int = 14  # (3) unit vector to the splat, world axes
     doubles: int = 17  # (SINGLE) the table's float64 columns
-    factor: int = 28  # (3)
 
 
 BATCH = BatchRows()
-BATCH_DOUBLES = 8 * (BATCH.factor + 3)
+BATCH_DOUBLES = 8 * (BATCH.doubles + SINGLE)
 # Rows of eight float32: the table's columns from SINGLE up to the values, then the outline's.
 OUTLINE_ROWS = SPLAT.values - SINGLE
 BATCH_SINGLES = 8 * (OUTLINE_ROWS + OUTLINE_SIZE)
@@ -363,66 +362,83 @@ def _disc(batch, singles, view, a, c, s, ahead, length, spread, cut, step):
 
 
 @inlined
-def _add_side(xx, xy, yy, a0, a1, a2, px, py, scale, view):
-    """Add a side of a 3D splat to its projected covariance."""
-    gx = ((a0 - px * a2) * view.fx + (a1 - py * a2) * view.skew) * scale
-    gy = (a1 - py * a2) * view.fy * scale
-    return xx + gx * gx, xy + gx * gy, yy + gy * gy
+def _side(a0, a1, a2, px, py, scale, view):
+    """An axis of a 3D splat in the picture, in pixels."""
+    across, down = a0 - px * a2, a1 - py * a2
+    return (across * view.fx + down * view.skew) * scale, down * view.fy * scale
 
 
 @inlined
 def _ellipsoid(batch, view, a, c, ic, s):
-    """The projected covariance of a 3D splat (EWA), its conic, and the factor of its opacity."""
+    """The projection of a 3D splat (EWA): its factor, to the batch.
+
+    Sigma = M M^T + BLUR_3D I with the columns of M from :func:`_side`. Its determinant is taken
+    from the minors of M (Cauchy-Binet), as a sum of squares: of a needle that is 1e6 pixels long,
+    the difference of products would leave nothing.
+
+    Returns:
+        The conic Sigma^-1 as xx, xy, yy; the determinant of Sigma; that of M M^T over it.
+    """
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     width, height = f64(view.width), f64(view.height)
     limit = JACOBIAN_MARGIN * width / 2 / fx
     px = minimum(maximum(c.x * ic, -cx / fx - limit), (width - cx) / fx + limit)
     limit = JACOBIAN_MARGIN * height / 2 / fy
     py = minimum(maximum(c.y * ic, -cy / fy - limit), (height - cy) / fy + limit)
-    scale = s.x * ic
-    gx = ((a.m00 - px * a.m20) * fx + (a.m10 - py * a.m20) * view.skew) * scale
-    gy = (a.m10 - py * a.m20) * fy * scale
-    xx, xy, yy = gx * gx, gx * gy, gy * gy
-    xx, xy, yy = _add_side(xx, xy, yy, a.m01, a.m11, a.m21, px, py, s.y * ic, view)
-    xx, xy, yy = _add_side(xx, xy, yy, a.m02, a.m12, a.m22, px, py, s.z * ic, view)
-    sharp = xx * yy - xy * xy
-    xx, yy = xx + BLUR_3D, yy + BLUR_3D
-    inverse = reciprocal(xx * yy - xy * xy)
+    x0, y0 = _side(a.m00, a.m10, a.m20, px, py, s.x * ic, view)
+    x1, y1 = _side(a.m01, a.m11, a.m21, px, py, s.y * ic, view)
+    x2, y2 = _side(a.m02, a.m12, a.m22, px, py, s.z * ic, view)
+    m01, m02, m12 = x0 * y1 - x1 * y0, x0 * y2 - x2 * y0, x1 * y2 - x2 * y1
+    sharp = m01 * m01 + m02 * m02 + m12 * m12
+    xx = x0 * x0 + x1 * x1 + x2 * x2 + BLUR_3D
+    xy = x0 * y0 + x1 * y1 + x2 * y2
+    square = y0 * y0 + y1 * y1 + y2 * y2
+    yy = square + BLUR_3D
+    det = sharp + (xx + square) * BLUR_3D
+    inverse = reciprocal(det)
     A, B, C = yy * inverse, -xy * inverse, xx * inverse
-    _put(batch, ELLIPSOID.conic_xx, A)
-    _put(batch, ELLIPSOID.conic_xy, B)
-    _put(batch, ELLIPSOID.conic_yy, C)
     edge = reciprocal_sqrt(A)
-    _store3(batch, BATCH.factor, A * edge, B * edge, reciprocal_sqrt(yy))
-    return A, B, C, sharp * inverse
+    _put(batch, ELLIPSOID.factor_xx, A * edge)
+    _put(batch, ELLIPSOID.factor_xy, B * edge)
+    _put(batch, ELLIPSOID.factor_yy, reciprocal_sqrt(yy))
+    return A, B, C, det, sharp * inverse
 
 
 @inlined
-def _peak(batch, a, c, s, step):
-    """The depth at which a 3D splat is largest along a ray; see :class:`EllipsoidColumns`."""
-    i0, i1, i2 = reciprocal(s.x * s.x), reciprocal(s.y * s.y), reciprocal(s.z * s.z)
-    S00 = a.m00 * a.m00 * i0 + a.m01 * a.m01 * i1 + a.m02 * a.m02 * i2
-    S01 = a.m00 * a.m10 * i0 + a.m01 * a.m11 * i1 + a.m02 * a.m12 * i2
-    S02 = a.m00 * a.m20 * i0 + a.m01 * a.m21 * i1 + a.m02 * a.m22 * i2
-    S11 = a.m10 * a.m10 * i0 + a.m11 * a.m11 * i1 + a.m12 * a.m12 * i2
-    S12 = a.m10 * a.m20 * i0 + a.m11 * a.m21 * i1 + a.m12 * a.m22 * i2
-    S22 = a.m20 * a.m20 * i0 + a.m21 * a.m21 * i1 + a.m22 * a.m22 * i2
-    f0 = S00 * c.x + S01 * c.y + S02 * c.z
-    f1 = S01 * c.x + S11 * c.y + S12 * c.z
-    f2 = S02 * c.x + S12 * c.y + S22 * c.z
-    scale = c.z * reciprocal(f0 * c.x + f1 * c.y + f2 * c.z)
-    gx, gy = scale * f0, scale * f1
-    # Denominator minus l^2: positive semidefinite, so the difference of large numbers is taken
-    # here in float64.
-    xx = scale * c.z * S00 - gx * gx
-    xy = scale * c.z * S01 - gx * gy
-    yy = scale * c.z * S11 - gy * gy
+def _peak(batch, a, c, ic, s, step):
+    """The depth at which a 3D splat is largest along a ray; see :class:`EllipsoidColumns`.
+
+    In the splat's own axes and scales the ray through its centre is g, with z = 1, and that of
+    a pixel r = g + X dx + Y dy. Where it is nearest to the centre, z = depth (g.r) / (r.r). With
+    l = g.r / g.g that is depth l / (l^2 + |g x r|^2 / (g.g)^2) (Lagrange). The columns of the cross
+    product, g x X and g x Y, need no difference of products: their part along axis k is s_k times
+    the axis in the picture. Its QR factor gives p and q.
+    """
+    px, py = c.x * ic, c.y * ic
     kx, ky, kxy = step.x, step.y, step.xy
-    _put(batch, ELLIPSOID.peak_x, gx * kx)
-    _put(batch, ELLIPSOID.peak_y, gy * ky + gx * kxy)
-    _put(batch, ELLIPSOID.peak_xx, xx * (kx * kx))
-    _put(batch, ELLIPSOID.peak_xy, (xx * kxy + xy * ky) * kx)
-    _put(batch, ELLIPSOID.peak_yy, xx * (kxy * kxy) + xy * (2 * kxy * ky) + yy * (ky * ky))
+    i0, i1, i2 = reciprocal(s.x), reciprocal(s.y), reciprocal(s.z)
+    g0 = (a.m00 * px + a.m10 * py + a.m20) * i0
+    g1 = (a.m01 * px + a.m11 * py + a.m21) * i1
+    g2 = (a.m02 * px + a.m12 * py + a.m22) * i2
+    square = g0 * g0 + g1 * g1 + g2 * g2
+    over = reciprocal(square)
+    f0, f1, f2 = g0 * i0 * over, g1 * i1 * over, g2 * i2 * over
+    x = f0 * a.m00 + f1 * a.m01 + f2 * a.m02
+    y = f0 * a.m10 + f1 * a.m11 + f2 * a.m12
+    _put(batch, ELLIPSOID.peak_x, x * kx)
+    _put(batch, ELLIPSOID.peak_y, y * ky + x * kxy)
+    over = over * i0 * i1 * i2
+    across0, across1, across2 = a.m00 - px * a.m20, a.m01 - px * a.m21, a.m02 - px * a.m22
+    down0, down1, down2 = a.m10 - py * a.m20, a.m11 - py * a.m21, a.m12 - py * a.m22
+    x0, x1, x2 = down0 * s.x * (over * kx), down1 * s.y * (over * kx), down2 * s.z * (over * kx)
+    y0 = (down0 * kxy - across0 * ky) * s.x * over
+    y1 = (down1 * kxy - across1 * ky) * s.y * over
+    y2 = (down2 * kxy - across2 * ky) * s.z * over
+    xx = x0 * x0 + x1 * x1 + x2 * x2
+    edge = reciprocal_sqrt(xx)
+    _put(batch, ELLIPSOID.peak_xx, xx * edge)
+    _put(batch, ELLIPSOID.peak_xy, (x0 * y0 + x1 * y1 + x2 * y2) * edge)
+    _put(batch, ELLIPSOID.peak_yy, over * (kx * ky) * reciprocal_sqrt(square) * edge)
 
 
 @inlined
@@ -491,11 +507,11 @@ def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
     _put(batch, SPLAT.center_y, y0)
     length = _sqrt(c.x * c.x + c.y * c.y + c.z * c.z)
     if not discs:
-        A, B, C, ratio = _ellipsoid(batch, view, a, c, ic, s)
+        A, B, C, det, ratio = _ellipsoid(batch, view, a, c, ic, s)
         if view.antialiased:
             opacity = opacity * _sqrt(maximum(ratio, COMPENSATION_MIN))
         if not by_center:
-            _peak(batch, a, c, s, step)
+            _peak(batch, a, c, ic, s, step)
     drawn = opacity >= ALPHA_MIN
     cut = select(drawn, _log(maximum(opacity, ALPHA_MIN) * (1 / ALPHA_MIN)) * 2.0, -1.0)
     # The outline takes a little more, for the roundings of what follows.
@@ -510,7 +526,7 @@ def _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step):
         p0, p1, p2 = _shortest_axis(s, q)
         depth, h, is_ellipse = c.z, wider, drawn
         ex = ey = radius_squared = wider * 0.0
-        scale = h * reciprocal(A * C - B * B)
+        scale = h * det
     reach = spread * EXTENT_SIGMAS
     low, high = maximum(c.z - reach, near), maximum(c.z + reach, near)
     if by_center:
@@ -554,14 +570,10 @@ def _write_values(table, to, splats, i, view, channels, degree, batch, column, b
 
 
 @inlined
-def _write_row(table, outlines, to, local, discs, batch, singles, column):
+def _write_row(table, outlines, to, local, batch, singles, column):
     """A splat of the batch to row ``to`` of the table, its outline to row ``local``."""
     for k in range(SINGLE):
         table.doubles[to, u64(k)] = batch[column + u64(8 * (BATCH.doubles + k))]
-    if not discs:
-        for k in range(3):
-            value = batch[column + u64(8 * (BATCH.factor + k))]
-            table.doubles[to, u64(ELLIPSOID.factor + k)] = value
     for k in range(SINGLE, SPLAT.values):
         table.singles[to, u64(SINGLE + k)] = singles[column + u64(8 * (k - SINGLE))]
     for k in range(OUTLINE_SIZE):
@@ -639,5 +651,5 @@ def project(
                 continue
             to, column = u64(begin + lane), u64(lane)
             local, i = to - u64(first), u64(order[to])
-            _write_row(table, outlines, to, local, view.discs, batch, singles, column)
+            _write_row(table, outlines, to, local, batch, singles, column)
             _write_values(table, to, splats, i, view, channels, degree, batch, column, basis)

@@ -13,7 +13,14 @@ from typing import NamedTuple
 import numpy as np
 
 from attnwarp.render._kernels.compilation import f64, inlined, jit, prefetch
-from attnwarp.render._kernels.layout import DISC, ELLIPSOID, GRADIENTS, SPLAT, View
+from attnwarp.render._kernels.layout import (
+    DISC,
+    ELLIPSOID,
+    ELLIPSOID_GRADIENT,
+    GRADIENTS,
+    SPLAT,
+    View,
+)
 from attnwarp.render._kernels.projection import harmonics
 from attnwarp.render.constants import (
     BLUR_3D,
@@ -105,14 +112,16 @@ def project_backward(
     degree = round(math.sqrt(values.shape[1] / 3)) - 1
     Q = np.empty((3, 3))
     a = np.empty((3, 3))
-    S = np.empty((3, 3))
-    PC = np.empty(3)
+    T = np.empty((3, 3))
+    H = np.empty((3, 3))
+    D = np.empty((3, 3))
+    wide = np.empty(3)
+    tall = np.empty(3)
+    in_sharp = np.empty((3, 3))
     Y = np.empty(16)
     c = np.empty(3)
     ga = np.empty((3, 3))
     gQ = np.empty((3, 3))
-    gS = np.empty((3, 3))
-    gPC = np.empty(3)
     gc = np.empty(3)
     gY = np.empty(16)
     s = np.empty(3)
@@ -212,7 +221,6 @@ def project_backward(
             else:
                 g_length += g_depth
         else:
-            gc[2] += g[SPLAT.depth]
             limit = JACOBIAN_MARGIN * view[VIEW.width] / 2 / fx
             low, high = -cx / fx - limit, (view[VIEW.width] - cx) / fx + limit
             free_x = low <= c[0] / c[2] <= high
@@ -221,53 +229,64 @@ def project_backward(
             low, high = -cy / fy - limit, (view[VIEW.height] - cy) / fy + limit
             free_y = low <= c[1] / c[2] <= high
             py = min(max(c[1] / c[2], low), high)
-            sxx, sxy, syy = 0.0, 0.0, 0.0
+            # As _ellipsoid has it, by the axes in the picture.
+            xx, yy, square = BLUR_3D, BLUR_3D, 0.0
+            sxy = 0.0
             for k in range(3):
-                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * s[k] / c[2]
-                gy = fy * (a[1, k] - py * a[2, k]) * s[k] / c[2]
-                sxx += gx * gx
-                sxy += gx * gy
-                syy += gy * gy
-            sharp = sxx * syy - sxy * sxy
-            bxx, byy = sxx + BLUR_3D, syy + BLUR_3D
-            det = bxx * byy - sxy * sxy
-            # d conic = -conic d Sigma conic
-            A, B, C = byy / det, -sxy / det, bxx / det
-            p11, p12 = (
-                A * g[ELLIPSOID.conic_xx] + B * g[ELLIPSOID.conic_xy] / 2,
-                A * g[ELLIPSOID.conic_xy] / 2 + B * g[ELLIPSOID.conic_yy],
-            )
-            p21, p22 = (
-                B * g[ELLIPSOID.conic_xx] + C * g[ELLIPSOID.conic_xy] / 2,
-                B * g[ELLIPSOID.conic_xy] / 2 + C * g[ELLIPSOID.conic_yy],
-            )
-            g_xx = -(p11 * A + p12 * B)
-            g_xy = -(p11 * B + p12 * C) - (p21 * A + p22 * B)
-            g_yy = -(p21 * B + p22 * C)
+                f = s[k] / c[2]
+                wide[k] = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * f
+                tall[k] = fy * (a[1, k] - py * a[2, k]) * f
+                xx += wide[k] * wide[k]
+                sxy += wide[k] * tall[k]
+                square += tall[k] * tall[k]
+            yy += square
+            sharp = 0.0
+            for k in range(3):
+                # Half of what sharp changes by with both of axis k, and what is left of its minors.
+                in_sharp[k, 0], in_sharp[k, 1], in_sharp[k, 2] = 0.0, 0.0, 0.0
+                for j in range(3):
+                    minor = wide[k] * tall[j] - tall[k] * wide[j]
+                    in_sharp[k, 0] += minor * tall[j]
+                    in_sharp[k, 1] -= minor * wide[j]
+                    in_sharp[k, 2] += minor * minor
+                sharp += 0.5 * in_sharp[k, 2]
+            det = sharp + BLUR_3D * (xx + square)
+            factor_xx = table[place, ELLIPSOID.factor_xx]
+            factor_xy = table[place, ELLIPSOID.factor_xy]
+            factor_yy = table[place, ELLIPSOID.factor_yy]
+            uu, uv = g[ELLIPSOID_GRADIENT.shape], g[ELLIPSOID_GRADIENT.shape + 1]
+            vv = g[ELLIPSOID_GRADIENT.shape + 2]
+            blurring, sharpening = 0.0, 0.0
             if view[VIEW.antialiased] > 0:
                 ratio = sharp / det
                 factor = math.sqrt(max(ratio, COMPENSATION_MIN))
                 if ratio >= COMPENSATION_MIN:
-                    g_ratio = g_opacity * o[i] / (2 * factor)
-                    g_sharp, g_det = g_ratio / det, -g_ratio * ratio / det
-                    g_xx += g_sharp * syy + g_det * byy
-                    g_yy += g_sharp * sxx + g_det * bxx
-                    g_xy -= 2 * sxy * (g_sharp + g_det)
+                    # Of log(sharp / det), with det / sharp - 1 in place of a difference of logs.
+                    g_ratio = g_opacity * o[i] * factor / det
+                    blurring = -g_ratio * BLUR_3D
+                    sharpening = g_ratio * BLUR_3D * (xx + square) / sharp
                 g_opacity *= factor
             g_px, g_py = 0.0, 0.0
             for k in range(3):
                 f = s[k] / c[2]
-                gx = (fx * (a[0, k] - px * a[2, k]) + skew * (a[1, k] - py * a[2, k])) * f
-                gy = fy * (a[1, k] - py * a[2, k]) * f
-                ux = 2 * g_xx * gx + g_xy * gy
-                uy = 2 * g_yy * gy + g_xy * gx
+                # The axis in units of the footprint, F M. Its gradient is F^T (sums of w w^T) F M,
+                # since Sigma^-1 = F^T F and rho = w.w.
+                u = factor_xx / yy * (in_sharp[k, 0] + BLUR_3D * wide[k])
+                v = factor_yy * tall[k]
+                gu, gv = uu * u + uv * v, uv * u + vv * v
+                ux, uy = factor_xx * gu, factor_xy * gu + factor_yy * gv
+                ux += blurring * wide[k] + sharpening * in_sharp[k, 0]
+                uy += blurring * tall[k] + sharpening * in_sharp[k, 1]
+                # By the length alone; ux wide + uy tall, without the cancellation.
+                along = gu * u + gv * v + sharpening * in_sharp[k, 2]
+                along += blurring * (wide[k] * wide[k] + tall[k] * tall[k])
                 ga[0, k] += ux * fx * f
                 ga[1, k] += (ux * skew + uy * fy) * f
                 ga[2, k] -= (ux * (fx * px + skew * py) + uy * fy * py) * f
                 g_px -= ux * fx * a[2, k] * f
                 g_py -= (ux * skew + uy * fy) * a[2, k] * f
-                g_s[k] += (ux * gx + uy * gy) / s[k]
-                gc[2] -= (ux * gx + uy * gy) / c[2]
+                g_s[k] += along / s[k]
+                gc[2] -= along / c[2]
             if free_x:
                 gc[0] += g_px / c[2]
                 gc[2] -= g_px * c[0] / (c[2] * c[2])
@@ -275,50 +294,48 @@ def project_backward(
                 gc[1] += g_py / c[2]
                 gc[2] -= g_py * c[1] / (c[2] * c[2])
             if not by_center:
-                for r in range(3):
-                    for k in range(3):
-                        S[r, k] = 0.0
-                        for j in range(3):
-                            S[r, k] += a[r, j] * a[k, j] / (s[j] * s[j])
-                for r in range(3):
-                    PC[r] = S[r, 0] * c[0] + S[r, 1] * c[1] + S[r, 2] * c[2]
-                q0 = PC[0] * c[0] + PC[1] * c[1] + PC[2] * c[2]
-                lx, ly = c[2] * PC[0] / q0, c[2] * PC[1] / q0
-                g_lx = g[ELLIPSOID.peak_x] * kx + g[ELLIPSOID.peak_y] * kxy
-                g_ly = g[ELLIPSOID.peak_y] * ky
-                g_rxx = (
-                    g[ELLIPSOID.peak_xx] * kx * kx
-                    + g[ELLIPSOID.peak_xy] * kx * kxy
-                    + g[ELLIPSOID.peak_yy] * kxy * kxy
-                )
-                g_rxy = g[ELLIPSOID.peak_xy] * kx * ky + 2 * g[ELLIPSOID.peak_yy] * kxy * ky
-                g_ryy = g[ELLIPSOID.peak_yy] * ky * ky
-                square = c[2] * c[2] / q0
-                gS[:] = 0.0
-                gS[0, 0], gS[0, 1], gS[1, 1] = g_rxx * square, g_rxy * square, g_ryy * square
-                quadratic = g_rxx * S[0, 0] + g_rxy * S[0, 1] + g_ryy * S[1, 1]
-                g_q0 = -quadratic * square / q0
-                gc[2] += 2 * c[2] / q0 * quadratic
-                g_lx -= 2 * lx * g_rxx + ly * g_rxy
-                g_ly -= 2 * ly * g_ryy + lx * g_rxy
-                g_q0 -= (g_lx * lx + g_ly * ly) / q0
-                gc[2] += (g_lx * PC[0] + g_ly * PC[1]) / q0
-                gPC[0], gPC[1], gPC[2] = g_lx * c[2] / q0, g_ly * c[2] / q0, 0.0
-                for r in range(3):
-                    gPC[r] += g_q0 * c[r]
-                    gc[r] += g_q0 * PC[r]
-                for r in range(3):
-                    for k in range(3):
-                        gS[r, k] += gPC[r] * c[k]
-                        gc[r] += S[r, k] * gPC[k]
+                # As _peak has it: z = depth (g.r) / (r.r), and r = |g| (l, p, q) in the frame T of
+                # g, of what is left of X, and of g x X. A pixel's ray does not change, so z depends
+                # on the axes, the scales and the centre through g and r alone.
+                length_g, across = 0.0, 0.0
                 for k in range(3):
-                    inverse = 1 / (s[k] * s[k])
-                    along = 0.0
+                    down = a[1, k] - a[2, k] * c[1] / c[2]
+                    T[k, 0] = (a[0, k] * c[0] + a[1, k] * c[1] + a[2, k] * c[2]) / (c[2] * s[k])
+                    T[k, 2] = down * s[k]
+                    length_g += T[k, 0] ** 2
+                    across += T[k, 2] ** 2
+                length_g, across = math.sqrt(length_g), math.copysign(math.sqrt(across), kx)
+                for k in range(3):
+                    T[k, 0] /= length_g
+                    T[k, 2] /= across
+                for k in range(3):
+                    j, r = (k + 1) % 3, (k + 2) % 3
+                    T[k, 1] = T[j, 2] * T[r, 0] - T[r, 2] * T[j, 0]
+                column = ELLIPSOID_GRADIENT.linear
+                gl, gp, gq = g[column], g[column + 1], g[column + 2]
+                column = ELLIPSOID_GRADIENT.square
+                lp, lq, pp, pq = g[column], g[column + 1], g[column + 2], g[column + 3]
+                qq = g[ELLIPSOID_GRADIENT.square_last]
+                # Gradients in what scales and turns the ray and g together, symmetric.
+                H[0, 0] = 2 * (pp + qq)
+                H[0, 1] = H[1, 0] = gp - 2 * lp
+                H[0, 2] = H[2, 0] = gq - 2 * lq
+                H[1, 1], H[2, 2] = -2 * pp, -2 * qq
+                H[1, 2] = H[2, 1] = -2 * pq
+                for k in range(3):
+                    for j in range(3):
+                        D[k, j] = 0.0
+                        for r in range(3):
+                            turned = H[r, 0] * T[j, 0] + H[r, 1] * T[j, 1] + H[r, 2] * T[j, 2]
+                            D[k, j] += T[k, r] * turned
+                for k in range(3):
+                    g_s[k] -= D[k, k] / s[k]
+                    in_center = T[k, 0] * gl + T[k, 1] * gp + T[k, 2] * gq
+                    in_center /= c[2] * length_g * s[k]
                     for r in range(3):
+                        gc[r] += in_center * a[r, k]
                         for j in range(3):
-                            ga[r, k] += (gS[r, j] + gS[j, r]) * a[j, k] * inverse
-                            along += a[r, k] * gS[r, j] * a[j, k]
-                    g_s[k] -= 2 * along * inverse / s[k]
+                            ga[r, k] += a[r, j] * D[k, j] * (s[j] / s[k])
         spread = (s[0] * a[2, 0]) ** 2 + (s[1] * a[2, 1]) ** 2
         if not discs:
             spread += (s[2] * a[2, 2]) ** 2

@@ -221,7 +221,7 @@ def _lay_out_block(space, table, lists, weights, view, tile, begin, e, end, ende
             row = BLOCK_WORK.rows + size * ROW
             lay_out(
                 space.block, row, space.moments, size * MOMENTS, table, entry & PLACE, middle_x,
-                middle_y, view.discs,
+                middle_y, view.discs, view.by_center,
             )  # fmt: skip
             space.block[u64(row + TILE_ROW.step)] = f32(e - begin + 1)
             store(space.block, BLOCK_WORK.weights + size * 16, f32(0.0))
