@@ -131,7 +131,10 @@ def test_examples_of_the_docstrings_give_what_they_print(name, folder):
 
 
 NAMES = {
-    "README.md": "features = torch.rand(8, 64, 64)",
+    "README.md": """
+features = torch.rand(8, 64, 64)
+source_tokens, new_tokens = torch.rand(2, 1, 64 * 64, 8)
+""",
     "docs/edits.md": """
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import Geometry
@@ -156,11 +159,16 @@ image_srgb, truth_srgb, original = np.random.default_rng(0).uniform(size=(3, 32,
 mask = np.zeros((32, 32), bool)
 mask[8:24, 8:24] = True
 """,
+    "docs/editing.md": """
+source_picture = target_picture = np.random.default_rng(0).random((64, 64, 3), np.float32)
+view = None
+""",
     "docs/warping.md": """
 from attnwarp.io import read_dataset, read_ply
 gaussians = read_ply("scene.ply")
 source, target = read_dataset("my_capture").cameras[:2]
-source_features, own_features = torch.rand(2, 8, 64, 64)
+source_features = torch.rand(8, 64, 64)
+source_tokens, own_tokens = torch.rand(2, 1, 64 * 64, 8)
 """,
 }
 """What a page's blocks take for granted. Blocks of pages that are not here run as they are."""
