@@ -4,12 +4,16 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
+from skimage.color import deltaE_ciede2000, rgb2lab
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import flow, flow_report
 from attnwarp_eval.metrics.registry import metric
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.truth import appearance, to_srgb, two_view
+from attnwarp_eval.truth.edits import edit_mask
 
 
 def test_a_turned_camera_keeps_the_point_it_looks_at_and_its_distance():
@@ -104,6 +108,35 @@ def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_p
 def test_wrong_options_are_one_clear_line(tmp_path, arguments, words):
     result = CliRunner().invoke(app, ["scenes", "flow", "--out", str(tmp_path), *arguments])
     assert result.exit_code == 2 and words in result.stderr and "Traceback" not in result.stderr
+
+
+def linear(srgb):
+    """IEC 61966-2-1."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def test_the_exact_figures_are_those_of_scipys_sampling_at_the_true_positions(tmp_path):
+    """The disagreement of each pair again: SciPy samples, in linear light, at the positions of
+    truth; scikit-image measures the colours."""
+    options = flow.Options(size=48, spp=4)
+    figures = flow.measure_pair("bear", "some_colour", 5, options).figures
+    scenes, (first, last), geometry = flow._edited("bear", "some_colour", 48)
+    source, target = scenes["truth"].source, flow.turned(scenes["truth"], 5)
+    pair = two_view(geometry, source, target)
+    mask = edit_mask(scenes["truth"], "some_colour", pair.hits, first)
+    x, y = (np.nan_to_num(pair.xy[..., k] - 0.5, nan=-1.0) for k in (0, 1))
+    taps = (x >= 0) & (x <= 47) & (y >= 0) & (y <= 47)
+    counted = mask & pair.visible & ~pair.edge & taps
+    one = linear(to_srgb(appearance(scenes[first], source, spp=4)))
+    sampled = np.stack([map_coordinates(one[..., c], [y, x], order=1) for c in range(3)], axis=-1)
+    sampled = np.where(sampled <= 0.0031308, sampled * 12.92, 1.055 * sampled ** (1 / 2.4) - 0.055)
+    right = to_srgb(appearance(scenes[first], target, spp=4))
+    wrong = to_srgb(appearance(scenes[last], target, spp=4))
+    others = {"one_answer": right, "slip": np.roll(right, flow.SLIP, axis=1), "two_answers": wrong}
+    for kind, other in others.items():
+        difference = deltaE_ciede2000(rgb2lab(other), rgb2lab(sampled))[counted]
+        assert len(difference) > 50
+        assert figures[kind]["consistency.delta_e"] == pytest.approx(difference.mean(), rel=1e-6)
 
 
 def test_an_edit_with_one_result_is_refused():
