@@ -61,8 +61,9 @@ def _embedder(root: Path):  # type: ignore[no-untyped-def]
 def plain(text: str) -> str:
     """Markdown text in which names cannot begin a tag, and code stays as it is.
 
-    >>> plain("fog < 2 px, `a<b`, <b>")
-    'fog < 2 px, `a<b`, &lt;b>'
+    Example:
+        >>> plain("fog < 2 px, `a<b`, <b>")
+        'fog < 2 px, `a<b`, &lt;b>'
     """
     return _TAG.sub(lambda match: match[1] or "&lt;", text)
 

@@ -210,7 +210,9 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
             gradients["reference", name], gradients["cpu", name], strict=True
         ):
             scale = float(expected.abs().max())
-            assert float((actual - expected).abs().max()) <= 1e-4 * scale + 1e-9, (name, scale)
+            # The distortion is a difference of sums over depths of 1e3, taken in float32.
+            bound = 4e-4 if name == "distortion_l1" else 1e-4
+            assert float((actual - expected).abs().max()) <= bound * scale + 1e-9, (name, scale)
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import accuracy, suite
-from attnwarp_eval.experiments.accuracy import geometry, visibility
+from attnwarp_eval.experiments.accuracy import geometry, point_visibility
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
 from attnwarp_eval.scene.file import load_scene
@@ -67,7 +67,7 @@ def test_refinement_takes_the_error_of_float32_away_and_the_worlds_offset_does_n
 
 
 def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent():
-    panel = visibility.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
+    panel = point_visibility.visibility(load_scene("far"), size=64, points=150, rounds=3, maps=(8,))
     rays, nearest, bilinear = panel.contestants
     # Clopper & Pearson: none of 150 excludes a share above 1 - 0.025^(1 / 150).
     assert (
@@ -87,7 +87,7 @@ def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():
     for bilinear in (False, True):
         for stretch, expected in ((1.0, 1.0), (0.97, 1.0), (1.05, 0.0)):
             points = (stretch * local) @ camera.rotation + camera.position
-            answer = visibility._seen_in_map(depth, camera, points, bilinear)
+            answer = point_visibility._seen_in_map(depth, camera, points, bilinear)
             assert (answer == expected).all()
 
 
@@ -159,7 +159,7 @@ def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monk
     asked = []
 
     def short(name, failing=False):
-        real = getattr(geometry, name)
+        real = getattr(accuracy, name)
 
         def question(scene, *, rounds, tell):
             asked.append(name)

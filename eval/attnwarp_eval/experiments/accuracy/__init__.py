@@ -18,7 +18,7 @@ from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import Panel
-from attnwarp_eval.experiments.accuracy.visibility import visibility
+from attnwarp_eval.experiments.accuracy.point_visibility import visibility
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.store import Store
