@@ -2,7 +2,7 @@
 hand."""
 
 import pytest
-import runs
+import written_runs
 
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
@@ -30,10 +30,10 @@ def study(**changes):
     }
 
 
-def record(values, environment=runs.ENVIRONMENT):
+def record(values, environment=written_runs.ENVIRONMENT):
     """A warp cell whose views show ``values`` of the slip's metric (None: undefined)."""
     counts = {f"occlusion.{name}": 0 for name in COUNTS}
-    return runs.record(
+    return written_runs.record(
         [(f"v{i}", 30.0 * i, {SLIP: value, **counts}) for i, value in enumerate(values)],
         cost={"seconds": {"steady": 0.1}, "counters": {"pairs": 2_000_000}},
         environment=environment,
@@ -45,7 +45,7 @@ def results(table, more=(), **changes):
     measured.
     """
     cells = [
-        runs.outcome(
+        written_runs.outcome(
             "warp",
             scene,
             [variant],
@@ -55,7 +55,7 @@ def results(table, more=(), **changes):
         for variant, rows in table.items()
         for scene, values in zip(SCENES, rows, strict=True)
     ]
-    return runs.results(study(**changes), [*cells, *more])
+    return written_runs.results(study(**changes), [*cells, *more])
 
 
 CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]]}
@@ -177,8 +177,8 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees():
 
 
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
-    other = {**runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
-    changed = runs.outcome("warp", "one", ["good"], record([0.1], other))
+    other = {**written_runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
+    changed = written_runs.outcome("warp", "one", ["good"], record([0.1], other))
     mixed = results(CLEAR, [changed], ablations=[])
     text = markdown(build(mixed, tmp_path))
     assert "more than one state of code" in text
@@ -193,8 +193,10 @@ def calibrated(**changes):
         "calibration.mitsuba_agrees": 0.999,
         **changes,
     }
-    data = runs.record([("v", 0.0, figures)])
-    return runs.results(study(), [runs.outcome("calibration", "one", ["calibration"], data)])
+    data = written_runs.record([("v", 0.0, figures)])
+    return written_runs.results(
+        study(), [written_runs.outcome("calibration", "one", ["calibration"], data)]
+    )
 
 
 @pytest.mark.parametrize(
@@ -218,8 +220,8 @@ def test_an_instrument_that_is_off_is_reported(tmp_path, changes, says):
 def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     front = [{"title": "Cost", "metric": SLIP, "variants": ["good", "slipped"]}]
     rounds = {"render": [[1.0] * 3] * 2, "pair": [[1.0, 2.0, 4.0], [1.0, 2.0, 4.0]]}
-    data = runs.record([], spec={"rounds": 3, "views": ["v0"]}, cost={"rounds": rounds})
-    timed = results(CLEAR, [runs.outcome("timing", "one", ["good"], data)], fronts=front)
+    data = written_runs.record([], spec={"rounds": 3, "views": ["v0"]}, cost={"rounds": rounds})
+    timed = results(CLEAR, [written_runs.outcome("timing", "one", ["good"], data)], fronts=front)
     (section,) = fronts(timed, Layout(tmp_path))
     rows = {row[0]: row for row in section.tables[0].rows}
     assert rows["good"][2:] == ["2000", "1", "baseline", "yes"]

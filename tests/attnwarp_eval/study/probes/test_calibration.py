@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
-import runs
 import torch
+import written_runs
 
 from attnwarp.warp.depth import TAP_SPREAD
 from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
@@ -164,10 +164,12 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
     def sections(**scenes):
         study = {"name": "s", "scenes": list(scenes), "probes": {"calibration": []}}
         cells = [
-            runs.outcome("calibration", name, ["calibration"], runs.record([], **extra))
+            written_runs.outcome(
+                "calibration", name, ["calibration"], written_runs.record([], **extra)
+            )
             for name, extra in scenes.items()
         ]
-        made = probe("calibration").sections(runs.results(study, cells), Layout(tmp_path))
+        made = probe("calibration").sections(written_runs.results(study, cells), Layout(tmp_path))
         return [section for place, section in made if place == Place.APPENDIX]
 
     (section,) = sections(fog={"effects": said_by(load_scene("fog"))}, old={})

@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-import runs
+import written_runs
 
 from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.build import build
@@ -25,7 +25,7 @@ def record(views, key=MSE, rounds=None):
     """A cell whose views have ``key`` in each condition: a dict of condition -> value, 1 where none
     is given.
     """
-    return runs.record(
+    return written_runs.record(
         [
             (f"e/v{i}", 0.0, {f"{key}.{c.name}": v.get(c.name, 1.0) for c in CONDITIONS})
             for i, v in enumerate(views)
@@ -42,9 +42,12 @@ def results(records):
         "encoders": {"clip": "clip-small"},
         "probes": {"sensitivity": []},
     }
-    return runs.results(
+    return written_runs.results(
         study,
-        [runs.outcome("sensitivity", scene, ["metrics"], one) for scene, one in records.items()],
+        [
+            written_runs.outcome("sensitivity", scene, ["metrics"], one)
+            for scene, one in records.items()
+        ],
     )
 
 
