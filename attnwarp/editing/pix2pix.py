@@ -65,15 +65,34 @@ class InstructPix2Pix(Latent):
                 f"unet: takes {self.unet.config.in_channels} channels, expected {channels}: noisy"
                 " latents and the picture's; is it an InstructPix2Pix model?"
             )
-        guided = self.text_guidance != 1 or self.image_guidance != 1
-        texts = self.embed([prompt, ""] if guided else [prompt])
+        shares = branch_shares(self.text_guidance, self.image_guidance)
         views = len(before)
-        if guided:
-            text = texts[[0, 1, 1]].repeat_interleave(views, dim=0)
-            source = torch.cat([before, before, torch.zeros_like(before)])
-        else:
-            text, source = texts.expand(views, -1, -1), before
-        return Pix2PixTask(self, text, source.to(self.unet.dtype), views, guided)
+        texts = self.embed([prompt, ""])
+        text = {"text": texts[0], "image": texts[1], "uncond": texts[1]}
+        nothing = torch.zeros_like(before)
+        source = {"text": before, "image": before, "uncond": nothing}
+        return Pix2PixTask(
+            self,
+            torch.stack([text[name] for name in shares]).repeat_interleave(views, dim=0),
+            torch.cat([source[name] for name in shares]).to(self.unet.dtype),
+            views,
+            shares,
+        )
+
+
+def branch_shares(text_guidance: float, image_guidance: float) -> dict[str, float]:
+    """The share that each guidance branch has in the output, without those that have none.
+
+    e_un + s_T (e_txt - e_img) + s_I (e_img - e_un), sorted by branch (Brooks et al. 2023, Eq. 3).
+
+    Example:
+        >>> branch_shares(7.5, 1.5)
+        {'text': 7.5, 'image': -6.0, 'uncond': -0.5}
+        >>> branch_shares(1.5, 1.0)  # the unconditional branch cancels, so it need not run
+        {'text': 1.5, 'image': -0.5}
+    """
+    shares = (text_guidance, image_guidance - text_guidance, 1 - image_guidance)
+    return {name: s for name, s in zip(PIX2PIX_BRANCHES, shares, strict=True) if s != 0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,19 +104,19 @@ class Pix2PixTask:
         text: (branches x B, L, D).
         before: (branches x B, C, h, w).
         views: B.
-        guided: whether there are three branches or one.
+        shares: of the branches in the output, in the order of the UNet's batch.
     """
 
     editor: InstructPix2Pix
     text: Tensor
     before: Tensor
     views: int
-    guided: bool
+    shares: dict[str, float]
 
     @property
     def branches(self) -> tuple[str, ...]:
         """The guidance branches in the order of the UNet's batch."""
-        return PIX2PIX_BRANCHES if self.guided else ("text",)
+        return tuple(self.shares)
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -116,8 +135,5 @@ class Pix2PixTask:
             encoder_hidden_states=self.text,
             return_dict=False,
         )[0]
-        if not self.guided:
-            return output
-        text, image, uncond = output.chunk(3)
-        by_text, by_image = editor.text_guidance, editor.image_guidance
-        return uncond + by_text * (text - image) + by_image * (image - uncond)
+        parts = output.chunk(len(self.branches))
+        return sum(share * part for share, part in zip(self.shares.values(), parts, strict=True))
