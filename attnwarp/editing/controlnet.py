@@ -90,12 +90,18 @@ class DepthControlNet(Latent):
             **parts, controlnet=load_controlnet(place, device=device, dtype=dtype), **settings
         )
 
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """The guidance branches in the order of the UNet's batch."""
+        return CONTROLNET_BRANCHES if self.guidance != 1 else ("text",)
+
     def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> ControlTask:
         """A picture for each (H, W) depth map, by one prompt."""
         control = tensor_of([control_image(depth) for depth in guides], "guides", self.factor)
         control = control.to(self.unet.device, self.controlnet.dtype)
-        views, guided = len(control), self.guidance != 1
-        texts = self.embed([self.negative_prompt, prompt] if guided else [prompt])
+        views = len(control)
+        prompts = {"uncond": self.negative_prompt, "text": prompt}
+        texts = self.embed([prompts[name] for name in self.branches])
         size = (control.shape[2] // self.factor, control.shape[3] // self.factor)
         return ControlTask(
             self,
@@ -124,7 +130,7 @@ class ControlTask:
     @property
     def branches(self) -> tuple[str, ...]:
         """The guidance branches in the order of the UNet's batch."""
-        return CONTROLNET_BRANCHES if len(self.text) > self.shape[0] else ("text",)
+        return self.editor.branches
 
     def predict(self, latents: Tensor, timestep: int) -> Tensor:
         """The guided output for (B, C, h, w) latents at a step."""

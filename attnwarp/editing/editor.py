@@ -44,6 +44,11 @@ class Editor(Protocol):
     unet: Any
     schedule: Schedule
 
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """The guidance branches in the order of the UNet's batch."""
+        ...
+
     def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Task:
         """An edit of views. What a guide is, the editor says: a picture or a depth map."""
         ...

@@ -55,6 +55,11 @@ class InstructPix2Pix(Latent):
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
         return cls(**load_parts(folder, device=device, dtype=dtype), **settings)
 
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """The guidance branches that run, in the order of the UNet's batch."""
+        return tuple(branch_shares(self.text_guidance, self.image_guidance))
+
     def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Pix2PixTask:
         """An edit of (H, W, 3) pictures in [0, 1] by one instruction."""
         pictures = tensor_of(guides, "guides", self.factor)
