@@ -18,6 +18,15 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from training.assemblies import (
+    KINDS,
+    PART_NOUNS,
+    USUAL,
+    WHOLE,
+    WHOLE_NOUNS,
+    Assembly,
+    draw_assembly,
+)
 from training.worlds import (
     COLORS,
     FINISHES,
@@ -69,12 +78,47 @@ class PairSplit:
     first: int
     worlds: int
     test: bool = False
+    parts: bool = False
 
 
 PAIR_SPLITS = {
     "edit-train": PairSplit(10_000_000, 600),
     "edit-test": PairSplit(11_000_000, 40, test=True),
+    "parts-train": PairSplit(12_000_000, 595, parts=True),
+    "parts-test": PairSplit(13_000_000, 51, test=True, parts=True),
 }
+
+PARTS = (WHOLE, *PART_NOUNS)
+"""Names of parts. A thing with parts counts from ``len(OBJECTS)``, by what it is and the part that is edited."""
+
+
+def thing_of(world: World) -> int:
+    """The number of what a world's edits change: an object, or a part of a thing."""
+    if isinstance(world, Assembly):
+        return len(OBJECTS) + world.thing * len(PARTS) + PARTS.index(world.part)
+    return world.thing
+
+
+def noun_of(thing: int, kind: str, rng: np.random.Generator) -> str:
+    """What a sentence calls it: "it", "the mug", "the jacket", "the jacket of the person".
+
+    Of a thing with parts, an edit of the ground or the light names the whole.
+    """
+    if thing < len(OBJECTS):
+        return "it" if rng.uniform() < 0.5 else f"the {_one(NOUNS[OBJECTS[thing]], rng)}"
+    number, index = divmod(thing - len(OBJECTS), len(PARTS))
+    whole, part = WHOLE_NOUNS[KINDS[number]], PARTS[index]
+    if part == WHOLE or kind in ("ground", "time"):
+        return "it" if rng.uniform() < 0.3 else f"the {_one(whole, rng)}"
+    noun = _one(PART_NOUNS[part], rng)
+    if rng.uniform() < 0.2 and " of " not in noun:
+        return f"the {noun} of the {min(whole, key=len)}"
+    return f"the {noun}"
+
+
+def is_part(thing: int) -> bool:
+    """Whether an edit changes a part of something, which no sentence calls a statue."""
+    return thing >= len(OBJECTS) and (thing - len(OBJECTS)) % len(PARTS) != PARTS.index(WHOLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +128,7 @@ class Worlds:
     Attributes:
         images: (N, 2, LOOKS, S, S, 3) uint8 sRGB.
         valid: (N, LOOKS) bool; a colour kept from training for a thing has no picture.
-        things: (N,) indices into :data:`training.worlds.OBJECTS`.
+        things: (N,) what edits change, see :func:`thing_of`.
         looks: (N, LOOKS, 5): finish, color, second, ground, time of each look.
         base: (N,) which of the surfaces the grounds and times of the world are shown with.
         ids: (N, 2, 128, 128) uint8, what each pixel shows.
@@ -106,10 +150,24 @@ class Worlds:
     def __len__(self) -> int:
         return len(self.images)
 
+    def sources(self, world: int, kind: str) -> npt.NDArray[np.int64]:
+        """Looks that an edit of a kind may start from: those that share everything else with its results.
+
+        A thing with parts that is edited as a whole has no look of its own surface; the one where each part looks
+        as usual stands among its grounds.
+        """
+        own = sources(kind, self.valid[world])
+        looks, grounds = self.looks[world], list(GROUPS["ground"])
+        if looks[grounds[0], 0] >= 0 or kind not in ("color", "material", "pattern"):
+            return own
+        return np.append(own, grounds[int(looks[0, 3])])
+
 
 def edit_world(index: int, split: PairSplit) -> World:
     """The world of that number; things come in turn, so that every one is seen as often."""
     seed = split.first + index
+    if split.parts:
+        return draw_assembly(seed, index % len(KINDS), new_shapes=split.test)
     world = draw_world(seed, new_shapes=split.test, thing=index % len(OBJECTS), views=VIEWS)
     return world if split.test else replace(world, instance=TRAIN_SHAPES + index)
 
@@ -117,24 +175,35 @@ def edit_world(index: int, split: PairSplit) -> World:
 def edit_looks(index: int, split: PairSplit) -> tuple[list[Look], npt.NDArray[np.bool_], int]:
     """The looks of a world, which of them may be shown, and which surface the grounds and times have."""
     world = edit_world(index, split)
+    thing = thing_of(world)
     rng = np.random.default_rng([split.first + index, 8])
-    first = draw_look(world.thing, rng, pairs="any")
+    first = draw_look(thing, rng, pairs="any")
     kind = FINISHES.index("shiny" if rng.uniform() < 0.25 else "plain")
     looks = [replace(first, finish=kind, color=k, second=-1) for k in range(len(COLORS))]
     looks += [replace(first, finish=FINISHES.index(m), color=-1, second=-1) for m in STATUES]
     for pattern in ("striped", "checked"):
         while True:
-            drawn = draw_look(world.thing, rng, pairs="any")
+            drawn = draw_look(thing, rng, pairs="any")
             if FINISHES[drawn.finish] == pattern:
                 break
         looks.append(replace(first, finish=drawn.finish, color=drawn.color, second=drawn.second))
     unseen = [
-        not split.test and any(held_out(world.thing, c) for c in (k.color, k.second) if c >= 0)
+        not split.test and any(held_out(thing, c) for c in (k.color, k.second) if c >= 0)
         for k in looks
     ]
     base = int(rng.choice(np.flatnonzero(~np.array(unseen))))
-    looks += [replace(looks[base], ground=k) for k in range(len(GROUNDS))]
-    looks += [replace(looks[base], time=k) for k in range(len(TIMES))]
+    before = looks[base]
+    if isinstance(world, Assembly):
+        if world.part == WHOLE:
+            before = replace(before, finish=-1, color=-1, second=-1)
+        else:
+            usual = [
+                COLORS.index(c) for c in USUAL.get(world.part, ()) if not unseen[COLORS.index(c)]
+            ]
+            base = int(rng.choice(usual)) if usual and rng.uniform() < 0.6 else base
+            before = looks[base]
+    looks += [replace(before, ground=k) for k in range(len(GROUNDS))]
+    looks += [replace(before, time=k) for k in range(len(TIMES))]
     valid = ~np.array([*unseen, *[False] * (LOOKS - SURFACES)])
     return looks, valid, base
 
@@ -152,16 +221,24 @@ def render_edit_world(index: int, split: PairSplit) -> dict[str, Any]:
     for view in range(VIEWS):
         made, hits = pictures(world, [looks[k] for k in valid_looks], SIZE, view=view)
         images[view, valid_looks] = np.stack(made)
-        objects = np.where(hits.object_id < 0, SKY, np.minimum(hits.object_id, OTHER))
+        objects = shown_things(hits.object_id, world)
         ids.append(np.where(hits.valid, objects, SKY).astype(np.uint8))
         depth.append(hits.depth.astype(np.float32))
     return {
-        "images": images, "valid": valid, "things": np.int64(world.thing), "base": np.int64(base),
+        "images": images, "valid": valid, "things": np.int64(thing_of(world)), "base": np.int64(base),
         "looks": np.array([(k.finish, k.color, k.second, k.ground, k.time) for k in looks]),
         "ids": np.stack(ids), "depth": np.stack(depth),
         "K": np.stack([cameras[v].K for v in range(VIEWS)]),
         "world_to_camera": np.stack([cameras[v].world_to_camera for v in range(VIEWS)]),
     }  # fmt: skip
+
+
+def shown_things(objects: npt.NDArray[np.integer[Any]], world: World) -> npt.NDArray[np.int64]:
+    """What each pixel shows, of the numbers of a scene's objects: the edited ones, the ground, others, the sky."""
+    edited = world.edited() if isinstance(world, Assembly) else (0,)
+    ground = len(world.pieces()) if isinstance(world, Assembly) else 1
+    shown = np.where(objects == ground, GROUND, OTHER)
+    return np.where(objects < 0, SKY, np.where(np.isin(objects, edited), THING, shown))
 
 
 def _path(folder: Path, name: str, index: int) -> Path:
@@ -249,7 +326,7 @@ def _draw_instruction(
     kind: str, thing: int, look: npt.NDArray[np.int64], rng: np.random.Generator
 ) -> str:
     finish, color, second, ground, time = (int(v) for v in look)
-    it = "it" if rng.uniform() < 0.5 else f"the {_one(NOUNS[OBJECTS[thing]], rng)}"
+    it = noun_of(thing, kind, rng)
     match kind:
         case "color":
             hue = _one(HUES[COLORS[color]], rng)
@@ -270,9 +347,12 @@ def _draw_instruction(
             choices = [f"make {it} {words}", f"turn {it} {words}", f"{it} should be {words}"]
             if noun:
                 choices += [
-                    f"make {it} out of {noun}", f"turn {it} into {noun}", f"make {it} of {noun}",
-                    f"turn {it} into a {words} statue", f"make {it} a {words} statue",
-                ]  # fmt: skip
+                    f"make {it} out of {noun}",
+                    f"turn {it} into {noun}",
+                    f"make {it} of {noun}",
+                ]
+                if not is_part(thing):
+                    choices += [f"turn {it} into a {words} statue", f"make {it} a {words} statue"]
             else:
                 choices += [f"give {it} a {words} pattern", f"paint {it} {words}"]
             return _one(tuple(choices), rng)
@@ -322,8 +402,13 @@ AMBIGUOUS: dict[str, tuple[str, ...]] = {
 def ambiguous_instruction(kind: str, thing: int, rng: np.random.Generator) -> str:
     """A sentence that asks for a change of a kind and leaves open which; kinds are those of :data:`AMBIGUOUS`."""
     while True:
-        it = "it" if rng.uniform() < 0.5 else f"the {_one(NOUNS[OBJECTS[thing]], rng)}"
-        text = _one(AMBIGUOUS[kind], rng).format(it)
+        it = noun_of(thing, kind, rng)
+        text = _one(AMBIGUOUS[kind], rng)
+        # Which part "its colour" means, no one could tell.
+        open_ended = "{}" not in text or "statue" in text
+        if is_part(thing) and kind in ("color", "material") and open_ended:
+            continue
+        text = text.format(it)
         if text not in reserved():
             return text
 

@@ -43,7 +43,6 @@ from training.editing_pairs import (
     edit_looks,
     instruction,
     load_pairs,
-    sources,
 )
 
 Tensor = torch.Tensor
@@ -316,7 +315,7 @@ class Pairs:
             valid = worlds.valid[world]
             targets = [k for k in GROUPS[kind] if valid[k]]
             open_ended = kind in AMBIGUOUS and rng.uniform() < unclear
-            source = int(rng.choice(sources(kind, valid)))
+            source = int(rng.choice(worlds.sources(world, kind)))
             targets = [
                 k
                 for k in targets

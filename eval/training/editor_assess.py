@@ -20,7 +20,6 @@ from training.editing_pairs import (
     ambiguous_instruction,
     instruction,
     load_pairs,
-    sources,
 )
 from training.editor import Pairs, Row
 from training.worlds import COLORS
@@ -150,7 +149,7 @@ def _row(pairs: Pairs, world: int, kind: str, rng: np.random.Generator) -> Row:
     valid = worlds.valid[world]
     view = int(rng.integers(worlds.ids.shape[1]))
     while True:
-        source = int(rng.choice(sources(kind, valid)))
+        source = int(rng.choice(worlds.sources(world, kind)))
         target = int(rng.choice([k for k in GROUPS[kind] if valid[k]]))
         row = Row(world, view, source, target, kind, False, pairs.corner(world, view, rng), False)
         if (

@@ -223,10 +223,10 @@ def injected_loss(
 
 def _answered(pairs: Pairs, row: Row, noise: Tensor) -> Row:
     """The row with the answer that its own noise picks."""
-    from training.editing_pairs import GROUPS, sources
+    from training.editing_pairs import GROUPS
 
     valid = pairs.worlds.valid[row.world]
-    allowed = sources(row.kind, valid)
+    allowed = pairs.worlds.sources(row.world, row.kind)
     source = row.source if row.source in allowed else int(allowed[0])
     looks = pairs.worlds.looks[row.world]
     targets = [

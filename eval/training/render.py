@@ -53,20 +53,22 @@ def pictures(world: World, looks: Sequence[Look], size: int, *, view: int = 0) -
     directions = camera.directions() @ camera.rotation
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     sky_rays = [(d, geometry.reached(points + 2 * geometry.extent * d, points, ids)) for d in hemisphere(normals, SKY_RAYS)]
-    mirrored = _mirrored(geometry, points, normals, directions[hit], ids)
+    count = len(world.surfaces(looks[0]))
+    mirrored = _mirrored(geometry, points, normals, directions[hit], ids, count)
     out = []
     for scene, look in zip(scenes, looks, strict=True):
         radiance = _sky(scene, directions.reshape(-1, 3)).reshape(*hit.shape, 3)
-        radiance[hit] = _radiance(scene, look, geometry, points, normals, ids, directions[hit], sky_rays, mirrored)
+        surfaces = world.surfaces(look)
+        radiance[hit] = _radiance(scene, surfaces, geometry, points, normals, ids, directions[hit], sky_rays, mirrored)
         out.append(np.rint(255 * to_srgb(radiance)).astype(np.uint8))
     return out, hits
 
 
 def _mirrored(
-    geometry: Geometry, points: Array, normals: Array, directions: Array, ids: npt.NDArray[np.int64]
+    geometry: Geometry, points: Array, normals: Array, directions: Array, ids: npt.NDArray[np.int64], count: int
 ) -> tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]]:
-    """Mirror rays of the object: direction, index of the point, and the point and normal that each hits."""
-    on_object = np.flatnonzero(geometry.object_of(ids) == 0)
+    """Mirror rays of the first ``count`` objects: direction, index of the point, and the point and normal that each hits."""
+    on_object = np.flatnonzero(geometry.object_of(ids) < count)
     d, n = directions[on_object], normals[on_object]
     away = d - 2 * np.einsum("ij,ij->i", d, n)[:, None] * n
     reflected_hits = geometry.trace_rays(points[on_object] + 1e-4 * geometry.extent * n, away)
@@ -75,11 +77,11 @@ def _mirrored(
 
 
 def _radiance(
-    scene: Scene, look: Look, geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
+    scene: Scene, surfaces: tuple[Look, ...], geometry: Geometry, points: Array, normals: Array, ids: npt.NDArray[np.int64],
     directions: Array, sky_rays: list[tuple[Array, npt.NDArray[np.bool_]]],
     mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
 ) -> Array:  # fmt: skip
-    color = _albedo(scene, look, geometry, points, ids)
+    color = _albedo(scene, surfaces, geometry, points, ids)
     light = np.zeros((len(points), 3))
     for spec in scene.spec.lights:
         if isinstance(spec, SunSpec):
@@ -91,32 +93,42 @@ def _radiance(
     for direction, reached in sky_rays:
         light += np.where(reached[:, None], _sky(scene, direction), 0) * (np.pi / len(sky_rays))
     radiance = color * light / np.pi
-    finish = FINISHES[look.finish]
-    if finish != "shiny" and finish not in REFLECTANCE:
-        return radiance
-    away, on_object, reflected_points, _, index = mirrored
-    # Surfaces in a reflection get an even light: their shadows are not traced.
-    ambient = _sky(scene, np.array([[0.0, 0.0, 1.0]]))[0] * 0.6 + _sun(scene) * 0.25
-    reflected = _sky(scene, away) + _glint(scene, away, look)
-    hit = index >= 0
-    if hit.any():
-        ground = np.array([linear_rgb(c) for c in scene.spec.objects[1].texture.colors]).mean(axis=0)  # type: ignore[union-attr]
-        low = reflected_points[index[hit]][:, 2:3] < 1e-3
-        reflected[hit] = np.where(low, ground, 0.25) * ambient
-    cosine = np.clip(-np.einsum("ij,ij->i", directions[on_object], normals[on_object]), 0, 1)[:, None]
-    if finish == "shiny":
-        base = np.full(3, 0.04)
-        fresnel = base + (1 - base) * (1 - cosine) ** 5
-        radiance[on_object] = (1 - fresnel) * radiance[on_object] + fresnel * reflected
-        return radiance
-    base = np.array(REFLECTANCE[finish])
-    fresnel = base + (1 - base) * (1 - cosine) ** 5
-    # A rough metal scatters some of the light about it, which the mirror ray alone would miss.
-    radiance[on_object] = fresnel * (0.65 * reflected + 0.35 * light[on_object] / np.pi)
+    for k, surface in enumerate(surfaces):
+        if FINISHES[surface.finish] == "shiny" or FINISHES[surface.finish] in REFLECTANCE:
+            _reflect(radiance, k, len(surfaces), surface, scene, geometry, normals, ids, directions, light, mirrored)
     return radiance
 
 
-def _albedo(scene: Scene, look: Look, geometry: Geometry, points: Array, ids: npt.NDArray[np.int64]) -> Array:
+def _reflect(
+    radiance: Array, which: int, count: int, surface: Look, scene: Scene, geometry: Geometry, normals: Array,
+    ids: npt.NDArray[np.int64], directions: Array, light: Array,
+    mirrored: tuple[Array, npt.NDArray[np.int64], Array, Array, npt.NDArray[np.int64]],
+) -> None:  # fmt: skip
+    """Add one reflection to an object's radiance, in place; ``count`` objects come before the ground."""
+    away, on_objects, reflected_points, _, index = mirrored
+    chosen = geometry.object_of(ids[on_objects]) == which
+    away, on_object, index = away[chosen], on_objects[chosen], index[chosen]
+    # Surfaces in a reflection get an even light: their shadows are not traced.
+    ambient = _sky(scene, np.array([[0.0, 0.0, 1.0]]))[0] * 0.6 + _sun(scene) * 0.25
+    reflected = _sky(scene, away) + _glint(scene, away, surface)
+    hit = index >= 0
+    if hit.any():
+        ground = np.array([linear_rgb(c) for c in scene.spec.objects[count].texture.colors]).mean(axis=0)  # type: ignore[union-attr]
+        low = reflected_points[index[hit]][:, 2:3] < 1e-3
+        reflected[hit] = np.where(low, ground, 0.25) * ambient
+    cosine = np.clip(-np.einsum("ij,ij->i", directions[on_object], normals[on_object]), 0, 1)[:, None]
+    if FINISHES[surface.finish] == "shiny":
+        base = np.full(3, 0.04)
+        fresnel = base + (1 - base) * (1 - cosine) ** 5
+        radiance[on_object] = (1 - fresnel) * radiance[on_object] + fresnel * reflected
+        return
+    base = np.array(REFLECTANCE[FINISHES[surface.finish]])
+    fresnel = base + (1 - base) * (1 - cosine) ** 5
+    # A rough metal scatters some of the light about it, which the mirror ray alone would miss.
+    radiance[on_object] = fresnel * (0.65 * reflected + 0.35 * light[on_object] / np.pi)
+
+
+def _albedo(scene: Scene, surfaces: tuple[Look, ...], geometry: Geometry, points: Array, ids: npt.NDArray[np.int64]) -> Array:
     objects = geometry.object_of(ids)
     color = np.zeros((len(points), 3))
     for k, item in enumerate(scene.spec.objects):
@@ -124,7 +136,8 @@ def _albedo(scene: Scene, look: Look, geometry: Geometry, points: Array, ids: np
         if on_object.any():
             color[on_object] = albedo(item.texture, points[on_object])
     tint = geometry.tint(points, ids)
-    return color if look.statue else color * tint
+    # Details have colours of their own; of a thing in one piece, a statue's have none.
+    return color if len(surfaces) == 1 and surfaces[0].statue else color * tint
 
 
 def _sky(scene: Scene, directions: Array) -> Array:

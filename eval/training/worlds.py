@@ -261,6 +261,10 @@ class World:
     views: int = 2
     bare: bool = False
 
+    def surfaces(self, look: Look) -> tuple[Look, ...]:
+        """The looks of the objects before the ground: here of the one object."""
+        return (look,)
+
     def spec(self, look: Look, size: int, *, statue: bool | None = None) -> dict[str, Any]:
         """The scene, as a file would say it; the object is object 0, the ground object 1."""
         rng = np.random.default_rng([self.seed, 4])
