@@ -33,7 +33,7 @@ def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
 
 @app.command()
 def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
-    """Train a stage: plain-64, plain-128, features-64, control-64, features-128, control-128."""
+    """Train a stage: plain-64, parts-64, parts-128, features-64, control-64, features-128, control-128."""
     from training.editor import STAGES, train_stage
 
     if stage not in STAGES:
@@ -56,12 +56,13 @@ def assess(
     stage: str, name: str, out: Out = CACHE, data: Data = CACHE / "data",
     weights: Annotated[Path, typer.Option()] = WEIGHTS,
     worlds: Annotated[int | None, typer.Option(help="Test worlds; all if left out.")] = None,
+    rounds: Annotated[int, typer.Option(min=0, help="Of swapped features; 0 for none.")] = 0,
 ) -> None:  # fmt: skip
     """Measure an exported editor on what it has never seen, and write its card."""
     from training.editor_assess import assess_editor
     from training.editor_export import facts_of
 
-    card = assess_editor(weights / name, data, facts_of(stage, out), worlds=worlds)
+    card = assess_editor(weights / name, data, facts_of(stage, out), worlds=worlds, rounds=rounds)
     (weights / name / "card.md").write_text(card)
     typer.echo(card)
 

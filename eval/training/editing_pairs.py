@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import os
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -275,7 +276,16 @@ def make_pairs(
 
 def load_pairs(folder: Path, name: str, *, count: int | None = None, workers: int = 1) -> Worlds:
     """The first ``count`` worlds of a split (all if left out), rendered where they are missing."""
-    paths = make_pairs(folder, name, workers, count=count)
+    return load_mixed(folder, {name: count}, workers=workers)
+
+
+def load_mixed(folder: Path, counts: Mapping[str, int | None], *, workers: int = 1) -> Worlds:
+    """The first worlds of several splits, one split after the other; None takes all of one."""
+    paths = [
+        path
+        for name, count in counts.items()
+        for path in make_pairs(folder, name, workers, count=count)
+    ]
     table: dict[str, npt.NDArray[Any]] = {}
     for index, path in enumerate(paths):
         with np.load(path) as stored:

@@ -42,7 +42,7 @@ from training.editing_pairs import (
     ambiguous_instruction,
     edit_looks,
     instruction,
-    load_pairs,
+    load_mixed,
 )
 
 Tensor = torch.Tensor
@@ -91,7 +91,8 @@ class Stage:
         size: of the pictures in px; latents have a quarter of it.
         steps: of ``batch`` pairs each.
         peak: learning rate, which falls over the last 30 %.
-        worlds: how many of the training worlds are used.
+        worlds: how many of the training worlds of one thing each are used.
+        parts: how many of those of things with parts (:mod:`training.assemblies`).
         start: the stage whose networks this one starts from.
         inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
             "control" (the same pairs and steps without the injection).
@@ -106,17 +107,19 @@ class Stage:
     inject: str = "none"
     batch: int = 8
     seed: int = 0
+    parts: int = 0
 
 
 STAGES = {
     "plain-64": Stage(64, 24_000, 1e-3, 200),
-    "plain-128": Stage(128, 16_000, 6e-4, 600, start="plain-64", seed=1),
-    "features-64": Stage(64, 8_000, 4e-4, 200, start="plain-64", inject="features", seed=2),
-    "control-64": Stage(64, 8_000, 4e-4, 200, start="plain-64", inject="control", seed=2),
-    "features-128": Stage(128, 6_000, 4e-4, 600, start="plain-128", inject="features", seed=3),
-    "control-128": Stage(128, 6_000, 4e-4, 600, start="plain-128", inject="control", seed=3),
-}
-"""Trained in this order: ``small-plain`` is the last "plain" stage, ``small`` the last "features" stage."""
+    "parts-64": Stage(64, 16_000, 6e-4, 200, start="plain-64", seed=4, parts=595),
+    "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
+    "features-64": Stage(64, 8_000, 4e-4, 200, start="parts-64", inject="features", seed=2, parts=595),
+    "control-64": Stage(64, 8_000, 4e-4, 200, start="parts-64", inject="control", seed=2, parts=595),
+    "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
+    "control-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="control", seed=3, parts=595),
+}  # fmt: skip
+"""Trained in this order: ``small-plain`` is the last stage without injection, ``small`` the last "features" stage."""
 
 
 class EditorNet(torch.nn.Module):
@@ -417,7 +420,10 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         names = ("LEAST_WEIGHT", "MOST_ALPHA", "WAYS", "INJECTED_KINDS")
         constants |= {key: getattr(injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
-    return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
+    fields = asdict(stage)
+    if not stage.parts:  # checkpoints from before there were parts name none
+        del fields["parts"]
+    return {"stage": name, **fields, "constants": constants, "pairs": PAIRS_PROTOCOL}
 
 
 def train_stage(
@@ -442,7 +448,10 @@ def train_stage(
     if not words.exists():
         make_tokenizer().save(str(words))
     tokenizer = Tokenizer.from_file(str(words))
-    pairs = Pairs(load_pairs(data, "edit-train", count=stage.worlds), stage.size, tokenizer)
+    counts: dict[str, int | None] = {"edit-train": stage.worlds}
+    if stage.parts:
+        counts["parts-train"] = stage.parts
+    pairs = Pairs(load_mixed(data, counts), stage.size, tokenizer)
     net = EditorNet(tokenizer.get_vocab_size(), stage.size)
     if stage.start is not None:
         stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -168,9 +169,16 @@ def _mask(pairs: Pairs, row: Row, what: int) -> npt.NDArray[np.bool_]:
 
 
 def editor_card(
-    name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any]
-) -> str:
-    """A bundled editor's card in Markdown."""
+    name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any],
+    carried: Sequence[Figure] = (),
+) -> str:  # fmt: skip
+    """A bundled editor's card in Markdown; ``carried`` are figures of :mod:`training.editor_carries`."""
+    known, unknown = "", "parts of things (a jacket, a pot), "
+    if facts["parts"]:
+        known, unknown = (
+            ", and on the parts of those of `training/assemblies.py` (a jacket, a pot)",
+            "",
+        )
     lines = [
         f"# {name}", "",
         f"A picture and an instruction give the edited picture: a small InstructPix2Pix in diffusers' format. UNet of {facts['unet']:.1f} million"
@@ -178,9 +186,9 @@ def editor_card(
         f" blocks. Trained on pictures of {facts['size']} x {facts['size']} px.", "",
         f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pairs, {facts['minutes']:.0f} minutes on one shared core. {facts['state']}",
         "", "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of"
-        " `training/worlds.py`. **Does not know**: parts of things (a jacket, a pot), other words, photographs of the world.", "",
+        f" `training/worlds.py`{known}. **Does not know**: {unknown}other words, photographs of the world.", "",
         f"**Injection**: {facts['injection']}", "",
-        f"**Data**: {facts['worlds']} random worlds by ray casting, two views and up to 30 looks each"
+        f"**Data**: {facts['worlds'] + facts['parts']} random worlds by ray casting, two views and up to 30 looks each"
         " (`training/editing_pairs.py`); no scene of the package, none of its instructions. **Recipe**: `training/editor.py`.", "",
         "## Figures on what it has never seen", "",
         f"{facts['tested']} worlds with new shapes and all colours, 20 steps, text guidance {facts['text_guidance']:g}, image guidance {facts['image_guidance']:g}."
@@ -194,29 +202,61 @@ def editor_card(
             f"| {own.what} | **{100 * own.value:.0f} %** ({100 * own.low:.0f} to {100 * own.high:.0f})"
             f" | {100 * other.value:.0f} % | {chance} | {asked} | {own.count} |"
         )
-    short = [f.what for f in figures if f.asked is not None and f.value < f.asked]
+    if carried:
+        lines += [
+            "", "## Whether its attention carries the answer, and where", "",
+            "Features of a run that answered one colour go into a run from other noise that alone answers another, by the paper's decay"
+            " (`training/editor_carries.py`).", "", "| question | share | asked for | answers |", "|---|---|---|---|",
+        ]  # fmt: skip
+        for f in carried:
+            asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
+            lines.append(
+                f"| {f.what} | **{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f}) | {asked} | {f.count} |"
+            )
+    short = [f.what for f in (*figures, *carried) if f.asked is not None and f.value < f.asked]
     if short:
         lines += ["", "Short of what was asked for: " + "; ".join(short) + "."]
     return "\n".join([*lines, ""])
 
 
 def assess_editor(
-    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None
+    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, rounds: int = 0
 ) -> str:
-    """The card of an exported editor."""
+    """The card of an exported editor.
+
+    Args:
+        folder: of the editor.
+        data: of the pictures.
+        facts: of its training.
+        worlds: of each test split; all if left out.
+        rounds: pairs of noises a picture for the figures of swapped features; 0 leaves these out.
+    """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
+    from training.editor_carries import carries
 
     torch.set_num_threads(1)
     editor = load_editor(str(folder), text_guidance=TEXT_GUIDANCE, image_guidance=IMAGE_GUIDANCE)
-    tests = load_pairs(data, "edit-test", count=worlds)
     size = editor.unet.config.sample_size * editor.factor
-    own, control = (assess(a, tests, size=size) for a in (answers_of(editor), unedited))
+    own: list[Figure] = []
+    control: list[Figure] = []
+    tested = 0
+    splits = {"edit-test": "", "parts-test": "of a part: "}
+    for name, label in splits.items() if facts["parts"] else [("edit-test", "")]:
+        tests = load_pairs(data, name, count=worlds)
+        tested += len(tests)
+        for results, answer in ((own, answers_of(editor)), (control, unedited)):
+            figures = assess(answer, tests, size=size)
+            results += [replace(f, what=label + f.what) for f in figures]
+    carried = []
+    if rounds:
+        tests = load_pairs(data, "edit-test", count=worlds)
+        carried = carries(editor, tests, size=size, rounds=rounds)
 
     def millions(net: Any) -> float:
         return float(sum(p.numel() for p in net.parameters()) / 1e6)
 
     given = {
-        "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": len(tests),
+        "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": tested,
         "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
     }  # fmt: skip
-    return editor_card(folder.name, own, control, {**given, **facts})
+    return editor_card(folder.name, own, control, {**given, **facts}, carried)

@@ -68,7 +68,7 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
         start = STAGES[start].start
     done = steps >= plan.steps
     return {
-        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds,
+        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds, "parts": plan.parts,
         "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
         "injection": {
             "none": "none; what its attention features carry, it learned from editing alone.",

@@ -34,7 +34,6 @@ from training.objects import plain_numbers
 from training.render import pictures
 from training.worlds import COLORS, FINISHES, NOUNS, OBJECTS, Look
 
-
 SHAPE = ("center", "radii", "start", "end", "points", "radius", "height", "size")
 
 

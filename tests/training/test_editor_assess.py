@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from training import editing_pairs, editor_assess
+from training.assess import figure
 from training.editing_pairs import GROUPS, load_pairs
 from training.editor_assess import assess, editor_card, nearest, outside_psnr, unedited
 
@@ -69,9 +70,17 @@ def test_an_editor_that_knows_every_answer_gets_all_and_one_that_changes_nothing
     assert [v.value for k, v in control.items() if k.startswith("another colour")] == [0]
     facts = {
         "unet": 3.2, "text": 0.4, "size": 64, "steps": 10, "planned": 100, "batch": 8, "minutes": 5.0, "state": "Unfinished.",
-        "injection": "none", "worlds": 2, "tested": 2, "text_guidance": 1.5, "image_guidance": 1.0,
+        "injection": "none", "worlds": 2, "parts": 0, "tested": 2, "text_guidance": 1.5, "image_guidance": 1.0,
     }  # fmt: skip
     card = editor_card("small-plain", list(control.values()), list(control.values()), facts)
     assert "10 of 100 planned steps" in card
+    swapped = figure("features make it their colour", [1, 0, 0, 0], [0, 0, 1, 1], asked=0.8)
+    both = editor_card(
+        "small", list(figures.values()), list(control.values()), facts | {"parts": 3}, [swapped]
+    )
+    assert "| features make it their colour | **25 %**" in both
+    assert "Short of what was asked for: features make it their colour" in both.replace("\n", " ")
+    assert "parts of those of" in both
+    assert "parts of those of" not in card
     assert "Short of what was asked for: nearest true color" in card
     assert set(GROUPS) >= {"color", "material", "ground", "time"}
