@@ -1,6 +1,6 @@
 """Read meshes, transforms.json and COLMAP models, each by two readers, and report differences.
 
-python -m scripts.survey --meshes FOLDER --rounds 3 --out report.md
+python -m scripts.survey --packages downloads --rounds 3 --out report.md
 
 The exit code is 1 if a file was read differently without a word, or failed without a message.
 """
@@ -18,7 +18,7 @@ from pathlib import Path
 
 import cv2
 
-from scripts.survey import meshes, models, transforms
+from scripts.survey import meshes, models, packages, transforms
 from scripts.survey.outcome import FAILURES, Outcome, Row
 
 PROGRAMS = ("trimesh", "pyvista", "vtk", "pycolmap")
@@ -34,6 +34,8 @@ def survey(folder: Path, options: argparse.Namespace, seed: int) -> Iterator[Row
         if seed == options.seed:
             cases += [*meshes.by_libraries(folder), *meshes.shipped()]
             cases += meshes.in_folders(options.meshes)
+            if options.packages:
+                cases += published(options.packages)
         yield from (meshes.compare(case) for case in cases[: options.limit])
     if "transforms" in options.parts:
         for name in [*transforms.VARIANTS][: options.limit]:
@@ -43,6 +45,15 @@ def survey(folder: Path, options: argparse.Namespace, seed: int) -> Iterator[Row
             print("pycolmap is not installed: no camera models are compared", file=sys.stderr)
         else:
             yield from models.rows(folder / "colmap", models.model_names()[: options.limit], seed)
+
+
+def published(folder: Path) -> Iterator[meshes.Case]:
+    """The meshes of every package that can be had; the others are named on standard error."""
+    for package in packages.PACKAGES:
+        try:
+            yield from packages.meshes_of(package, folder)
+        except OSError as error:
+            print(f"{package}: its meshes are left out: {error}", file=sys.stderr)
 
 
 def report(rounds: Sequence[Sequence[Row]]) -> str:
@@ -56,9 +67,10 @@ def report(rounds: Sequence[Sequence[Row]]) -> str:
         "",
         f"{len(rows)} files in {len(rounds)} rounds, each read by this package and by a second"
         " reader. Rounds differ in the seed of",
-        "shapes, poses and coefficients. Second readers: trimesh and closed forms for meshes; a"
-        " reader of its own with OpenCV's lenses for",
-        "transforms.json; pycolmap's projection for COLMAP.",
+        "shapes, poses and coefficients. Second readers: trimesh and closed forms for meshes (of"
+        " planar polygons, Newell's formula); a",
+        "reader of its own with OpenCV's lenses for transforms.json; pycolmap's projection for"
+        " COLMAP.",
         "",
         f"**{len(failures)} silent differences or errors without a message.**",
         "",
@@ -70,6 +82,7 @@ def report(rounds: Sequence[Sequence[Row]]) -> str:
         lines.append(f"| {part} | {' | '.join(map(str, numbers))} | {sum(numbers)} |")
     versions = ", ".join(f"{name} {version}" for name, version in _versions())
     lines += ["", f"Versions: {versions}."]
+    lines += _origins([row for row in rounds[0] if row.part == meshes.PART])
     if failures:
         lines += ["", "## Failures", "", *_table(failures)]
     first = [row for row in rounds[0] if row.outcome not in (Outcome.SAME, *FAILURES)]
@@ -87,6 +100,23 @@ def report(rounds: Sequence[Sequence[Row]]) -> str:
         lines += ["|---|---|"]
         lines += [f"| {_cell(remark)} | {count} |" for remark, count in noted.most_common()]
     return "\n".join(lines) + "\n"
+
+
+def _origins(rows: Sequence[Row]) -> list[str]:
+    """The meshes of the first round by who made them."""
+    if not rows:
+        return []
+    counts = Counter((row.name.partition(": ")[0], row.outcome) for row in rows)
+    outcomes = [outcome for outcome in Outcome if any(key[1] is outcome for key in counts)]
+    lines = ["", "## Meshes by origin, first round", ""]
+    lines += [f"| origin | {' | '.join(outcomes)} | all |", "|---" * (len(outcomes) + 2) + "|"]
+    for origin in dict.fromkeys(key[0] for key in counts):
+        numbers = [counts[origin, outcome] for outcome in outcomes]
+        lines.append(f"| {origin} | {' | '.join(map(str, numbers))} | {sum(numbers)} |")
+    theirs = sum(row.name.partition(": ")[0] not in meshes.WRITTEN_HERE for row in rows)
+    made = "`made`, `trimesh` and `VTK` are written by the survey"
+    lines += ["", f"{theirs} files are other people's; {made} with closed forms."]
+    return lines
 
 
 def _table(rows: Sequence[Row]) -> list[str]:
@@ -128,6 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="write the report here instead of printing it")
     parser.add_argument("--meshes", type=Path, nargs="+", default=[], metavar="DIR",
                         help="folders with meshes of your own")  # fmt: skip
+    parser.add_argument("--packages", type=Path, metavar="DIR",
+                        help="also meshes of published packages, downloaded to DIR")  # fmt: skip
     parser.add_argument("--rounds", type=int, default=1, help="repeat with other seeds (1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first round (0)")
     parser.add_argument("--limit", type=int, help="only so many of each part")

@@ -156,6 +156,34 @@ def test_a_lens_model_with_distortion_is_named_with_the_remedy(tmp_path, write, 
         read_colmap(tmp_path, missing_images="none")
 
 
+@pytest.mark.parametrize("write", ["write_text", "write_binary"])
+def test_no_coefficient_of_full_opencv_is_lost(tmp_path, write):
+    """Each of the eight alone, in files that pycolmap writes, against its own projection."""
+    pycolmap = pytest.importorskip("pycolmap")
+    rays = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2))
+    for k in range(9):
+        distortion = [0.02 if k == j else 0.0 for j in range(8)]
+        camera = pycolmap.Camera(
+            camera_id=1, model="FULL_OPENCV", width=64, height=48,
+            params=[50, 52, 31, 25, *distortion],
+        )  # fmt: skip
+        reconstruction = pycolmap.Reconstruction()
+        reconstruction.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(image_id=1, camera_id=1, name="a.png")
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        getattr(reconstruction, write)(str(tmp_path))
+        if k == 8:  # without any, it is a pinhole
+            assert read_colmap(tmp_path, missing_images="none").lenses == [None]
+            continue
+        with pytest.raises(FileFormatError, match="FULL_OPENCV"):
+            read_colmap(tmp_path, missing_images="none")
+        data = read_colmap(tmp_path, missing_images="none", distorted="keep")
+        ours = data.lenses[0].distort(rays) * (50, 52) + (31, 25)
+        theirs = camera.img_from_cam(np.column_stack([rays, np.ones(20)]))
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
+        assert np.abs(ours - (rays * (50, 52) + (31, 25))).max() > 1e-3
+
+
 def test_a_distorted_camera_that_no_image_uses_does_not_matter(tmp_path):
     write_binary(tmp_path, cameras=[*CAMERAS, (1, "OPENCV", 8, 6, (1.0,) * 8)])
     assert len(read_colmap(tmp_path, missing_images="none")) == 3

@@ -187,7 +187,7 @@ p 1
     [
         ("a.obj", "v 0 0\n", "line 1: a vertex has 2 numbers"),
         ("a.obj", "v 0 0 0\nf 1 2\n", "line 2: a face has 2 corners"),
-        ("a.obj", "v 0 0 0\nf 1 2 3\n", "a face names vertex 1, but there are 1"),
+        ("a.obj", "v 0 0 0\nf 1 2 3\n", "a face names vertex 2, but there are 1"),
         ("a.obj", "v 0 0 0\nf 0 1 1\n", "line 2: a face names vertex '0'"),
         ("a.obj", "v 0 0 1_0\n", "line 1: got '1_0', expected a finite number"),
         ("a.obj", "v 0 0 nan\n", "line 1: got 'nan', expected a finite number"),
@@ -280,9 +280,18 @@ def test_a_coff_has_colours_and_colours_of_faces_are_told(tmp_path):
         assert read_text(tmp_path, "c.off", text).tint.tolist() == np.eye(3).tolist()
 
 
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
+def test_an_obj_in_utf_16_is_refused_by_name(tmp_path, encoding):
+    """As assimp's box_UTF16BE.obj is, which begins with a byte order mark."""
+    text = "\ufeffv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    (tmp_path / "box.obj").write_bytes(text.encode(encoding))
+    with pytest.raises(ValueError, match=r"box.obj: is text in UTF-16.*save it as UTF-8"):
+        read_mesh(tmp_path / "box.obj")
+
+
 def test_a_mesh_at_the_end_of_the_world_is_refused_by_name(tmp_path):
     with pytest.raises(
-        ValueError, match=r"vertex 1 lies 1e\+30 from the origin, expected at most 1e\+09"
+        ValueError, match=r"vertex 2 lies 1e\+30 from the origin, expected at most 1e\+09"
     ):
         read_text(tmp_path, "far.obj", "v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")
 

@@ -58,9 +58,11 @@ def read_obj(data: bytes) -> Surface:
     """The polygons of an OBJ file (Wavefront's Advanced Visualizer manual, appendix B).
 
     Raises:
-        ValueError: a line that cannot be read, a vertex that is not there, or fewer vertices or
-            faces than the file's own comment states.
+        ValueError: text in UTF-16, a line that cannot be read, a vertex that is not there, or
+            fewer vertices or faces than the file's own comment states.
     """
+    if data[:2] in (b"\xfe\xff", b"\xff\xfe"):
+        raise ValueError("is text in UTF-16, expected ASCII or UTF-8; save it as UTF-8")
     text = data.decode("latin-1")  # names and comments come in any encoding
     vertices: list[list[float]] = []
     colors: list[list[float]] = []
@@ -109,9 +111,8 @@ def read_obj(data: bytes) -> Surface:
         words_ignored.append(f"colours of {len(colors)} of {len(vertices)} vertices")
     corners, sizes = polygons(faces)
     cut_off = None if text.endswith(("\n", "\r")) else "its last line has no end"
-    return Surface(
-        np.array(vertices).reshape(-1, 3), corners, sizes, tint, tuple(words_ignored), cut_off
-    )
+    points = np.array(vertices).reshape(-1, 3)
+    return Surface(points, corners, sizes, tint, tuple(words_ignored), cut_off, first=1)
 
 
 def _face(words: list[str], vertices: int, line: int) -> list[int]:

@@ -104,19 +104,20 @@ def read_mesh_file(path: Path) -> MeshFile:
         outside = (surface.corners < 0) | (surface.corners >= len(surface.vertices))
         if outside.any():
             raise ValueError(
-                f"a face names vertex {int(surface.corners[outside][0])}, but there are"
-                f" {len(surface.vertices)}"
+                f"a face names vertex {int(surface.corners[outside][0]) + surface.first}, but"
+                f" there are {len(surface.vertices)}"
             )
         named = np.zeros(len(surface.vertices), dtype=bool)
         named[surface.corners] = True
         bad = np.flatnonzero(named & ~np.isfinite(surface.vertices).all(axis=1))
         if bad.size:
-            raise ValueError(f"vertex {int(bad[0])} is not finite")
+            raise ValueError(f"vertex {int(bad[0]) + surface.first} is not finite")
         reach = np.abs(surface.vertices[named]).max(axis=1)
         if reach.max() > FARTHEST:
+            farthest = int(np.flatnonzero(named)[reach.argmax()]) + surface.first
             raise ValueError(
-                f"vertex {int(np.flatnonzero(named)[reach.argmax()])} lies {reach.max():.3g} from"
-                f" the origin, expected at most {FARTHEST:g}"
+                f"vertex {farthest} lies {reach.max():.3g} from the origin, expected at most"
+                f" {FARTHEST:g}"
             )
         unused = int((~named).sum())
         if surface.cut_off and unused:

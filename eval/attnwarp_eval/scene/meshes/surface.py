@@ -23,6 +23,7 @@ class Surface:
         tint: (V, 3) linear RGB, or None.
         ignored: what the file holds and nobody uses, with its number, such as "3 lines".
         cut_off: why the file may lack its end although its syntax is right, or None.
+        first: number of the first vertex in the file's own counting, for messages.
     """
 
     vertices: Array
@@ -31,6 +32,7 @@ class Surface:
     tint: Array | None = None
     ignored: tuple[str, ...] = ()
     cut_off: str | None = None
+    first: int = 0
 
 
 def polygons(faces: Sequence[Sequence[int]]) -> tuple[Indices, Indices]:
