@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +60,8 @@ def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict
 
     def model(name: str, *kinds: Any) -> Any:
         place = folder / name
-        wanted = json.loads((place / "config.json").read_text()).get("_class_name", "")
+        with _readable(place):
+            wanted = json.loads((place / "config.json").read_text()).get("_class_name", "")
         kind = next((k for k in kinds if k.__name__ == wanted), kinds[0])
         return _load(kind, place, device, dtype)
 
@@ -67,8 +70,12 @@ def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict
         "vae": model("vae", AutoencoderKL, AutoencoderTiny, HaarLatents),
         "text_encoder": model("text_encoder", CLIPTextModel),
     }
-    parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
-    parts["scheduler"] = DDIMScheduler.from_pretrained(folder / "scheduler", local_files_only=True)
+    with _readable(words):
+        parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
+    with _readable(folder / "scheduler"):
+        parts["scheduler"] = DDIMScheduler.from_pretrained(
+            folder / "scheduler", local_files_only=True
+        )
     return parts
 
 
@@ -99,13 +106,11 @@ def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
     # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
     how = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     try:
-        # Quietly filling what a file lacks with random numbers would look like a bad editor.
-        loaded = kind.from_pretrained(
-            folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
-        )
-    except (OSError, ValueError, RuntimeError) as error:
-        first = str(error).strip().splitlines()[0]
-        raise InputError(f"{folder}: cannot be read ({first}); fetch the model again") from None
+        with _readable(folder):
+            # Quietly filling what a file lacks with random numbers would look like a bad editor.
+            loaded = kind.from_pretrained(
+                folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
+            )
     finally:
         if bars:
             logging.enable_progress_bar()
@@ -116,6 +121,18 @@ def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
             f"{folder}: its weights lack {lost[0]} and {len(lost) - 1} more; fetch the model again"
         )
     return network.to(device)
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Turn what transformers, diffusers and tokenizers raise for a damaged file, of many kinds,
+    into one line.
+    """
+    try:
+        yield
+    except Exception as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise InputError(f"{folder}: cannot be read ({lines[0]}); fetch the model again") from None
 
 
 def _missing(folder: Path) -> list[str]:

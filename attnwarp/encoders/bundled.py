@@ -41,7 +41,8 @@ def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | Bundl
             out.
 
     Raises:
-        InputError: no such encoder, or weights that are missing or of another network.
+        InputError: no such encoder, or weights that are missing, of another network, or other
+            than those that the model card beside them names.
     """
     kinds: dict[str, Callable[[str, Path], Any]] = {
         "clip-small": BundledClip, "dino-small": BundledDino, "perceptual-small": BundledPerceptual,
@@ -60,7 +61,15 @@ def _info(
     size: int | None,
     dim: int | None,
 ) -> EncoderInfo:
-    return EncoderInfo(name, kind, "bundled", sha256_of(files), preprocessing, size, dim)
+    sha256 = sha256_of(files)
+    card = files[0].with_name(f"{name}.md")
+    # A changed weight is a number like any other; its card alone tells what was trained.
+    if card.is_file() and sha256 not in card.read_text(encoding="utf-8"):
+        raise InputError(
+            f"{files[0]}: not the weights that {card.name} names, or damaged; install the package"
+            " again, or train it (eval/training/README.md)"
+        )
+    return EncoderInfo(name, kind, "bundled", sha256, preprocessing, size, dim)
 
 
 def _read(net: torch.nn.Module, path: Path) -> None:

@@ -65,6 +65,7 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
     (weights / f"{name}.safetensors").chmod(
         0o644
     )  # safetensors makes files that only their owner can read
+    (weights / f"{name}.md").unlink(missing_ok=True)  # a card of other weights would refuse these
     words = out / f"{name}.tokenizer.json"
     if words.exists():
         shutil.copyfile(words, weights / words.name)

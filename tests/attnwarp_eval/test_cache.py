@@ -176,6 +176,11 @@ def test_a_limit_that_is_no_number_of_gigabytes_is_refused(folder, monkeypatch, 
         cache.write_arrays("kind", "key", {"x": np.zeros(3)})
     refused = CliRunner().invoke(app, ["cache", "info"])
     assert refused.exit_code == 2 and "expected a number of gigabytes" in refused.output
+    # A run says so before it begins: every one of its cells would fail.
+    refused = CliRunner().invoke(app, ["run", "quick", "--out", str(folder / "run")])
+    assert refused.exit_code == 2 and refused.stderr.count("\n") == 1
+    assert refused.stderr.startswith(f"attnwarp-eval: ATTNWARP_CACHE_GB: got '{text}'")
+    assert not (folder / "run").exists()
 
 
 def test_many_small_writes_do_not_each_look_at_every_file_and_stay_within_a_hundredth_of_the_limit(

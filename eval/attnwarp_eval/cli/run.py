@@ -38,27 +38,29 @@ def run(
 ) -> None:
     """Run a study and write its report. Killed half-way and started again, it goes on where it
     was."""
+    from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
     from attnwarp_eval.study import run as runner
     from attnwarp_eval.study.store import Store
     from attnwarp_eval.study.study import load_study
 
     with clear_errors():
+        limit_bytes()  # a limit that is no number would make every cell fail
         loaded = load_study(study, scenes=names(scenes), size=size)
         store = Store(out or Path("runs") / loaded.name)
-        planned = runner.plan(loaded, store)
-        with store.lock():
-            if planned.other_code:
-                typer.echo(
-                    f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were"
-                    " computed by other code than this; they are kept, and the report says so."
-                    " Name another folder with --out to start afresh.",
-                    err=True,
-                )
-            with resumable(lambda: f"{len(store.done())} cells are kept"):
+        with resumable(lambda: f"{len(store.done())} cells are kept"):
+            planned = runner.plan(loaded, store)
+            with store.lock():
+                if planned.other_code:
+                    typer.echo(
+                        f"attnwarp-eval: {planned.other_code} of the cells in {store.root} were"
+                        " computed by other code than this; they are kept, and the report says"
+                        " so. Name another folder with --out to start afresh.",
+                        err=True,
+                    )
                 summary = _watch(planned, store, jobs, keep_going)
-            _write_report(store)
-            uncalibrated = problems(read_results(store))
+                _write_report(store)
+                uncalibrated = problems(read_results(store))
     _print_failures(summary)
     if not summary.complete:
         missing = summary.expected - summary.reused - summary.computed
@@ -121,7 +123,10 @@ def report(
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        _write_report(Store(run), timings=timings, pictures=pictures)
+        store = Store(run)
+        _write_report(store, timings=timings, pictures=pictures)
+        if "sha256" not in store.read_study():
+            typer.echo(f"attnwarp-eval: {_unsealed(run)}", err=True)
 
 
 def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:
@@ -149,11 +154,15 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
             TOO_LITTLE,
         )
     if not problems.sealed:
-        typer.echo(
-            f"not sealed: {run / 'study.json'} has no checksum, as former code wrote it; run the"
-            " study again to seal it"
-        )
+        typer.echo(_unsealed(run))
     typer.echo(f"{run}: {problems.checked} cells, every hash fits, none is missing")
+
+
+def _unsealed(run: Path) -> str:
+    return (
+        f"not sealed: {run / 'study.json'} has no checksum: former code wrote it, or the checksum"
+        " was removed; run the study again to seal it"
+    )
 
 
 def studies() -> None:

@@ -12,6 +12,7 @@ from attnwarp_eval.canonical_json import canonical_json
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.run import check_labels
 from attnwarp_eval.study.store import Store, StoreError
 from attnwarp_eval.study.study import explain, parse_study
 
@@ -47,6 +48,8 @@ def read_results(store: Store) -> Results:
                 f" that the study lacks; run the study again with --out {store.root}, which"
                 " writes it anew"
             )
+    if "sha256" not in stored:
+        check_labels(store, stored, study)
     done = store.done()
     failures = [Failure.from_json(failure) for failure in store.failures()]
     cells = []

@@ -53,7 +53,7 @@ def run_on_workers(
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
-        with _without_interrupts():
+        with _signals_wait():
             cluster = stack.enter_context(
                 # No memory limit: near one dask pauses a worker for good, since a world's caches
                 # are never given back.
@@ -99,16 +99,25 @@ def run_on_workers(
 
 
 @contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Worker processes that start inside ignore Ctrl-C: this process receives it and ends them."""
+def _signals_wait() -> Iterator[None]:
+    """Worker processes that start inside ignore Ctrl-C: this process receives it and ends them.
+
+    A polite kill waits until they run: dask cannot end a cluster that has started by half, and
+    would leave its workers behind.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    killed: list[int] = []
+    interrupt = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    terminate = signal.signal(signal.SIGTERM, lambda number, frame: killed.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, interrupt)
+        signal.signal(signal.SIGTERM, terminate)
+        if killed:  # in place of dask's error where the workers received the signal too
+            signal.raise_signal(signal.SIGTERM)
 
 
 class _Queue:

@@ -68,12 +68,7 @@ def plan(study: Study, store: Store) -> Plan:
     Raises:
         InputError: something the study names cannot be used.
     """
-    scenes: dict[str, Scene] = {}
-    for name in study.scenes:
-        scenes[name] = load_scene(name)
-        for other, scene in scenes.items():
-            if other != name and scene.content_hash == scenes[name].content_hash:
-                raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
+    scenes = _scenes(study)
     cells = cells_of(study, scenes)
     done = store.done()
     finished: dict[str, Record[Any]] = {}
@@ -86,6 +81,16 @@ def plan(study: Study, store: Store) -> Plan:
     this = Environment.from_json(environment())
     other_code = sum(not record.environment.same_code(this) for record in finished.values())
     return Plan(study, scenes, cells, [c for c in cells if c.id not in finished], other_code)
+
+
+def _scenes(study: Study) -> dict[str, Scene]:
+    scenes: dict[str, Scene] = {}
+    for name in study.scenes:
+        scenes[name] = load_scene(name)
+        for other, scene in scenes.items():
+            if other != name and scene.content_hash == scenes[name].content_hash:
+                raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
+    return scenes
 
 
 def _has_pictures(cell: Cell, record: Record[Any], store: Store) -> bool:
@@ -113,20 +118,52 @@ def verify(store: Store) -> Problems:
         text = explain(error) if isinstance(error, ValidationError) else error
         problems.damaged.append(f"the study's cells cannot be listed again: {text}")
         return problems
-    listed, today = (_labels(entries) for entries in (stored["cells"], cells))
-    if set(listed) != set(today):
+    if {c["id"] for c in stored["cells"]} != {c["id"] for c in cells}:
         problems.damaged.append(
             "the study names other cells today: a scene or a protocol has changed since; run it"
             " again for the new ones"
         )
-    for cell_id in sorted(set(listed) & set(today)):
-        if listed[cell_id] != today[cell_id]:
-            problems.damaged.append(
-                f"{store.root / 'study.json'}: cell {cell_id} is called {listed[cell_id]}, but the"
-                f" study calls it {today[cell_id]}; run the study again with --out {store.root},"
-                " which writes it anew"
-            )
+    problems.damaged += _wrong_labels(store, stored["cells"], cells)
     return problems
+
+
+def check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
+    """Check under which names figures of an unsealed run would appear.
+
+    A ``study.json`` without a checksum is of former code, or its checksum was removed: the file
+    does not tell which. What the study says of itself decides. Cells that it no longer names, and a
+    study whose scenes are gone, cannot be checked.
+
+    Args:
+        store: the run's folder.
+        stored: the content of its ``study.json``.
+        study: the study in it.
+
+    Raises:
+        StoreError: a cell has another label than the study gives it.
+    """
+    try:
+        scenes = _scenes(study)
+    except InputError:
+        return
+    cells = [_entry(cell) for cell in cells_of(study, scenes)]
+    wrong = _wrong_labels(store, stored["cells"], cells)
+    if wrong:
+        raise StoreError(wrong[0])
+
+
+def _wrong_labels(
+    store: Store, listed: list[dict[str, Any]], today: list[dict[str, Any]]
+) -> list[str]:
+    """A line for each cell that ``study.json`` lists under another name than the study gives it."""
+    names, expected_names = _labels(listed), _labels(today)
+    return [
+        f"{store.root / 'study.json'}: cell {cell_id} is called {names[cell_id]}, but the study"
+        f" calls it {expected_names[cell_id]}; run the study again with --out {store.root}, which"
+        " writes it anew"
+        for cell_id in sorted(names.keys() & expected_names.keys())
+        if names[cell_id] != expected_names[cell_id]
+    ]
 
 
 def _labels(cells: list[dict[str, Any]]) -> dict[str, Any]:
@@ -143,17 +180,19 @@ def expected(plan: Plan) -> dict[str, Any]:
         "scenes": {
             name: {"hash": s.content_hash, "title": s.title} for name, s in plan.scenes.items()
         },
-        "cells": [
-            {
-                "id": c.id,
-                "title": c.title,
-                "scene": c.scene,
-                "variants": list(c.labels),
-                "probe": c.probe,
-                "seed": c.seed,
-            }
-            for c in plan.cells
-        ],
+        "cells": [_entry(cell) for cell in plan.cells],
+    }
+
+
+def _entry(cell: Cell) -> dict[str, Any]:
+    """A cell as ``study.json`` lists it."""
+    return {
+        "id": cell.id,
+        "title": cell.title,
+        "scene": cell.scene,
+        "variants": list(cell.labels),
+        "probe": cell.probe,
+        "seed": cell.seed,
     }
 
 

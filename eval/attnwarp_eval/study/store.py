@@ -331,12 +331,20 @@ _LABELS: dict[str, type] = {
 }
 """What ``study.json`` holds of each expected cell."""
 
+_STUDY_KEYS = {"study", "scenes", "cells", "sha256"}
+"""Of ``study.json``. Another one is what damage made of these; if it was the checksum's, the file
+would pass for one of former code, which wrote none.
+"""
+
 
 def _study_problem(study: dict[str, Any]) -> str | None:
     """What is wrong with the content of ``study.json``."""
     body = {key: value for key, value in study.items() if key != "sha256"}
     if "sha256" in study and _digest(body) != study["sha256"]:
         return "its checksum does not fit its content"
+    unknown = sorted(study.keys() - _STUDY_KEYS)
+    if unknown:
+        return f"damaged (unknown key {unknown[0][:40]!r})"
     cells = study.get("cells")
     if not isinstance(study.get("study"), dict) or not isinstance(cells, list):
         return "damaged (no study, or no list of cells)"

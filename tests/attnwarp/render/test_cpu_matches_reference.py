@@ -12,83 +12,8 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp.render import api, binned, constants, cpu, reference, render
-
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
-MODES = [
-    ("2d", "intersection", False),
-    ("2d", "center", False),
-    ("3d", "center", False),
-    ("3d", "peak", True),
-]
-
-
-def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.Inputs:
-    given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
-    given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
-    return api._prepare(splats, camera, **(given | options), on_cpu=True)
-
-
-def bracket(inputs: reference.Inputs) -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    """Smallest and largest value of each output when every threshold is moved by what float32 may
-    round.
-
-    A pixel whose alpha is 1/255 to seven digits is drawn or not by rounding, in any renderer; what
-    must hold is that the float32 answer is one of the two.
-    """
-    t = reference.Thresholds()
-    versions = [reference.render(inputs)]
-    for sign in (-1, 1):
-        versions += [
-            reference.render(
-                inputs, dataclasses.replace(t, alpha_min=t.alpha_min * (1 + sign * 2e-6))
-            ),
-            # Transmittance is a product of up to 40 factors, each with its own rounding.
-            reference.render(inputs, dataclasses.replace(t, stop=t.stop * (1 + sign * 2e-5))),
-            reference.render(inputs, dataclasses.replace(t, median=t.median * (1 + sign * 5e-6))),
-            reference.render(dataclasses.replace(inputs, near=inputs.near * (1 + sign * 2e-6))),
-        ]
-    result = {}
-    for name in OUTPUTS:
-        stack = torch.stack([getattr(v, name) for v in versions])
-        absent = stack.isnan()
-        low = torch.where(absent, torch.inf, stack).amin(0)
-        high = torch.where(absent, -torch.inf, stack).amax(0)
-        result[name] = (
-            torch.where(absent.any(0), -torch.inf, low),
-            torch.where(absent.any(0), torch.inf, high),
-        )
-        # NaN everywhere is an answer as well.
-        result[name] = tuple(torch.where(absent.all(0), torch.nan, bound) for bound in result[name])
-    return result
-
-
-def excess(inputs: reference.Inputs) -> dict[str, float]:
-    """How far each output of the CPU backend lies outside of what it may be."""
-    expected, actual = bracket(inputs), cpu.render(inputs)
-    worst = {}
-    for name in OUTPUTS:
-        value, (low, high) = getattr(actual, name).double(), expected[name]
-        assert value.dtype == torch.float64
-        assert torch.equal(
-            value.isnan() & torch.isfinite(low), torch.zeros_like(value, dtype=torch.bool)
-        ), name
-        assert bool(value.isnan()[low.isnan()].all()), name
-        # 1e-5 on shares of a pixel; of the value's own size where it has a scale (depth in scene
-        # units, weight in pixels, features of any size).
-        beyond = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
-        beyond = beyond[torch.isfinite(beyond)]
-        worst[name] = max(0.0, float(beyond.max())) if beyond.numel() else 0.0
-    return worst
+from attnwarp.render import binned, constants, cpu, render
+from benchmarks.precision import MODES, OUTPUTS, excess, mixed_scales, prepared
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -141,35 +66,30 @@ def test_pictures_of_many_tiles_agree(
         assert max(int((view.alpha > 0).any(0).sum()) for view in alone) > 15 * constants.TILE
 
 
-def mixed_scales(splats: Gaussians, seed: int, ratio: float) -> Gaussians:
-    """The splats with each scale drawn anew, log-uniform about 1 over a ``ratio``; in float32, as
-    files have them."""
-    rng = np.random.default_rng(seed)
-    reach = math.log(ratio) / 2
-    scales = torch.tensor(np.exp(rng.uniform(-reach, reach, splats.scales.shape)))
-    return dataclasses.replace(splats, scales=scales).to(dtype=torch.float32)
-
-
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("kind", "mode", "antialiased", "seeds"),
     [
         *((*mode, range(2)) for mode in MODES),
-        # A 2D splat's intersection is left out: of seeds 0 to 11, 8 is off by 1.3e-4 in
-        # distortion_l1.
-        *(pytest.param(*mode, range(40), marks=pytest.mark.slow) for mode in MODES[1:]),
+        *(pytest.param(*mode, range(40), marks=pytest.mark.slow) for mode in MODES),
     ],
 )
 def test_scales_of_ratio_1e6_agree_to_1e_4(
     kind, mode, antialiased, seeds, make_camera, make_splats
 ) -> None:
-    """Needles and sheets of 1e-3 to 1e3 units in one picture."""
+    """Needles and sheets of 1e-3 to 1e3 units in one picture.
+
+    A 2D splat that is narrower than a pixel is as sharp as it is narrow where a ray meets it: its
+    alpha may be that of a splat moved by the rounding of a pixel's position. The definition of
+    such splats is part of what may come out. A 3D splat is blurred, and has no such excuse.
+    """
     worst = dict.fromkeys(OUTPUTS, 0.0)
     for seed in seeds:
         camera = make_camera(seed, 40, 30)
         splats = mixed_scales(make_splats(seed, kind, 24, camera, degree=1), seed + 77, 1e6)
         options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
-        for name, beyond in excess(prepared(splats, camera, **options)).items():
+        displacements = 8 if kind == "2d" else 0
+        for name, beyond in excess(prepared(splats, camera, **options), displacements).items():
             worst[name] = max(worst[name], beyond)
     assert max(worst.values()) < 1e-4, worst
 
@@ -183,36 +103,61 @@ def test_gradients_with_scales_of_ratio_1e6_agree_with_autograd(
     start = mixed_scales(make_splats(1, kind, 24, camera, degree=1), 78, 1e6).to(
         dtype=torch.float64
     )
+    options = {"depth": mode, "antialiased": antialiased if kind == "3d" else None}
     gradients = {}
+
+    def weights_of(value):
+        return torch.linspace(-1, 1, value.numel(), dtype=torch.float64).sin().reshape(value.shape)
+
     for backend in ("reference", "cpu"):
         leaves = [
             t.clone().requires_grad_()
             for t in (start.means, start.quats, start.scales, start.opacities, start.sh)
         ]
-        view = render(
-            Gaussians(kind, *leaves),
-            camera,
-            backend=backend,
-            depth=mode,
-            antialiased=antialiased if kind == "3d" else None,
-        )
+        view = render(Gaussians(kind, *leaves), camera, backend=backend, **options)
         for name in OUTPUTS:
             value = getattr(view, name).nan_to_num(0).double()
-            weights = torch.linspace(-1, 1, value.numel(), dtype=torch.float64).sin()
             gradients[backend, name] = torch.autograd.grad(
-                (value * weights.reshape(value.shape)).sum(),
+                (value * weights_of(value)).sum(),
                 leaves,
                 retain_graph=True,
                 materialize_grads=True,
             )
+    # The distortion's gradient in an opacity is a sum over 1200 pixels whose weights have either
+    # sign: the terms' sizes, by central differences in float64, are hundreds of times their sum.
+    # A sum of n terms in float32 keeps sqrt(n) 2^-24 of the terms' sizes (Higham and Mary 2019):
+    # n = 2 x 24, the running sums of alpha and of depth over 24 splats, and 22, those over the 16
+    # rows of lanes and the 6 tiles.
+    rounded = (
+        math.sqrt(70) * 2.0**-24 * largest_terms_in_opacity(start, camera, options, weights_of)
+    )
     for name in OUTPUTS:
-        for expected, actual in zip(
-            gradients["reference", name], gradients["cpu", name], strict=True
+        for leaf, (expected, actual) in enumerate(
+            zip(gradients["reference", name], gradients["cpu", name], strict=True)
         ):
             scale = float(expected.abs().max())
-            # The distortion is a difference of sums over depths of 1e3, taken in float32.
-            bound = 4e-4 if name == "distortion_l1" else 1e-4
-            assert float((actual - expected).abs().max()) <= bound * scale + 1e-9, (name, scale)
+            bound = 1e-4 * scale + 1e-9
+            if name == "distortion_l1" and leaf == 3:
+                bound = max(bound, rounded)
+            assert float((actual - expected).abs().max()) <= bound, (name, leaf, scale)
+
+
+def largest_terms_in_opacity(splats, camera, options, weights_of) -> float:
+    """The largest sum of sizes over pixels of a loss's terms of distortion_l1, as gradients in one
+    opacity."""
+
+    def distortion(opacities):
+        return render(
+            dataclasses.replace(splats, opacities=opacities), camera, backend="reference", **options
+        ).distortion_l1
+
+    step, largest = 1e-6, 0.0
+    for k in range(len(splats.opacities)):
+        low, high = splats.opacities.clone(), splats.opacities.clone()
+        low[k], high[k] = max(0.0, float(low[k]) - step), min(1.0, float(high[k]) + step)
+        change = (distortion(high) - distortion(low)) / float(high[k] - low[k])
+        largest = max(largest, float((change * weights_of(change)).abs().sum()))
+    return largest
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -67,6 +67,9 @@ def test_swapped_labels_are_found_without_a_seal_and_refused_with_one(folder, tm
         problems.damaged, sorted([first, second], key=lambda c: c["id"]), strict=True
     ):
         assert cell["id"] in line and "is called" in line
+    # A checksum that was removed cannot be told from one that former code never wrote.
+    with pytest.raises(StoreError, match="is called .* but the study calls it"):
+        write_report(store)
 
     first["variants"], second["variants"] = second["variants"], first["variants"]
     store.write_study(sealed)

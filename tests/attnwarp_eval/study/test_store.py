@@ -152,6 +152,10 @@ def test_study_json_carries_the_sha256_of_its_content(tmp_path):
     path.write_text(path.read_text().replace("first", "other"))
     with pytest.raises(StoreError, match=r"study\.json: its checksum does not fit.*writes it anew"):
         store.read_study()
+    # A checksum under another key is no file of former code.
+    path.write_text(json.dumps(stored).replace('"sha256"', '"sha257"'))
+    with pytest.raises(StoreError, match=r"damaged \(unknown key 'sha257'\)"):
+        store.read_study()
     # Former code wrote no checksum: its runs are read, and verify says so.
     path.write_text(json.dumps(content))
     assert store.read_study() == content

@@ -1,0 +1,241 @@
+"""How far float32 leads from the renderer's definition where scales are mixed:
+``python -m benchmarks.precision``.
+
+Pictures of 40 x 30 pixels, focal length 40 px, of 24 splats three units away. Each scale is drawn
+log-uniform about 1 over a ratio, so that needles and sheets meet in one picture. An error is the
+distance to what the float64 reference may give when its thresholds move by their rounding, as a
+share of the value where that is above 1. The table has the worst of all pixels, outputs and
+pictures, and how many pictures are off by more than 1e-4.
+
+The last column is the part of the 2D error that conditioning does not explain: the definition is
+also rendered with each splat moved by what float32 may round of a pixel's position,
+:data:`ROUNDED_PIXELS`. What no such move gives is the renderer's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render import api, constants, cpu, reference
+
+OUTPUTS = (
+    "color",
+    "alpha",
+    "depth",
+    "median_depth",
+    "normal",
+    "distortion_l1",
+    "distortion_l2_ndc",
+    "weight",
+)
+"""What is compared: fields of a Render."""
+
+MODES = [
+    ("2d", "intersection", False),
+    ("2d", "center", False),
+    ("3d", "center", False),
+    ("3d", "peak", True),
+]
+"""Kind, depth, antialiased."""
+
+RATIOS = (1e0, 1e2, 1e3, 1e4, 1e6, 1e8, 1e10, 1e12)
+
+LIMIT = 1e-4
+
+ROUNDED_PIXELS = 21 * 2.0**-24
+"""By how much float32 moves a splat in the picture, px.
+
+A splat's u at a pixel is u_0 + u_x x + u_y y in float32, with (x, y) within 3.5 px of the middle of
+8 x 8 pixels. Three coefficients, two products and two sums are rounded, of numbers up to |u_x x| +
+|u_y y|, as u itself is about 1 where the splat is drawn: at most 6 x 2^-24 of that, 6 x 3.5 x 2^-24
+px.
+"""
+
+
+def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.Inputs:
+    """What a backend gets from the door, with the door's defaults."""
+    given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
+    given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
+    return api._prepare(splats, camera, **(given | options), on_cpu=True)  # type: ignore[arg-type]
+
+
+def mixed_scales(splats: Gaussians, seed: int, ratio: float) -> Gaussians:
+    """The splats with each scale drawn anew, log-uniform about 1 over a ``ratio``; in float32, as
+    files have them."""
+    rng = np.random.default_rng(seed)
+    reach = math.log(ratio) / 2
+    scales = torch.tensor(np.exp(rng.uniform(-reach, reach, splats.scales.shape)))
+    return dataclasses.replace(splats, scales=scales).to(dtype=torch.float32)
+
+
+def displaced(inputs: reference.Inputs, seed: int) -> reference.Inputs:
+    """Each splat moved across the picture by :data:`ROUNDED_PIXELS` in x and in y, to a random
+    side."""
+    rng = np.random.default_rng(seed)
+    means, pose = inputs.means.double(), inputs.pose.detach().double()
+    rotation = pose[:3, :3]
+    depth = (means @ rotation.T + rotation @ inputs.origin.double() + pose[:3, 3])[:, 2].abs()
+    signs = torch.tensor(rng.choice((-1.0, 1.0), (len(means), 2)))
+    focal = torch.stack([inputs.K[0, 0], inputs.K[1, 1]]).double()
+    step = ROUNDED_PIXELS * signs * depth[:, None] / focal
+    return dataclasses.replace(inputs, means=means + step @ rotation[:2])
+
+
+def bracket(inputs: reference.Inputs, displacements: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
+    """Smallest and largest value of each output when every threshold is moved by what float32 may
+    round.
+
+    A pixel whose alpha is 1/255 to seven digits is drawn or not by rounding, in any renderer; what
+    must hold is that the float32 answer is one of the two.
+
+    Args:
+        inputs: the scene.
+        displacements: how many times the splats are moved, see :func:`displaced`.
+    """
+    t = reference.Thresholds()
+    versions = [reference.render(inputs)]
+    for sign in (-1, 1):
+        versions += [
+            reference.render(
+                inputs, dataclasses.replace(t, alpha_min=t.alpha_min * (1 + sign * 2e-6))
+            ),
+            # Transmittance is a product of up to 40 factors, each with its own rounding.
+            reference.render(inputs, dataclasses.replace(t, stop=t.stop * (1 + sign * 2e-5))),
+            reference.render(inputs, dataclasses.replace(t, median=t.median * (1 + sign * 5e-6))),
+            reference.render(dataclasses.replace(inputs, near=inputs.near * (1 + sign * 2e-6))),
+        ]
+    versions += [reference.render(displaced(inputs, seed)) for seed in range(displacements)]
+    result = {}
+    for name in OUTPUTS:
+        stack = torch.stack([getattr(v, name) for v in versions])
+        absent = stack.isnan()
+        low = torch.where(absent, torch.inf, stack).amin(0)
+        high = torch.where(absent, -torch.inf, stack).amax(0)
+        low = torch.where(absent.any(0), -torch.inf, low)
+        high = torch.where(absent.any(0), torch.inf, high)
+        # NaN everywhere is an answer as well.
+        result[name] = (
+            torch.where(absent.all(0), torch.nan, low),
+            torch.where(absent.all(0), torch.nan, high),
+        )
+    return result
+
+
+def excess(inputs: reference.Inputs, displacements: int = 0) -> dict[str, float]:
+    """How far each output of the CPU backend lies outside of what it may be.
+
+    Raises:
+        AssertionError: an output is NaN where it is defined, or the other way round.
+    """
+    expected, actual = bracket(inputs, displacements), cpu.render(inputs)
+    worst = {}
+    for name in OUTPUTS:
+        value, (low, high) = getattr(actual, name).double(), expected[name]
+        assert not bool((value.isnan() & torch.isfinite(low)).any()), name
+        assert bool(value.isnan()[low.isnan()].all()), name
+        # Absolute on shares of a pixel; of the value's own size where it has a scale (depth in
+        # scene units, weight in pixels, features of any size).
+        beyond = torch.maximum(low - value, value - high) / value.abs().clamp(min=1)
+        beyond = beyond[torch.isfinite(beyond)]
+        worst[name] = max(0.0, float(beyond.max())) if beyond.numel() else 0.0
+    return worst
+
+
+def scene(seed: int, kind: str, ratio: float) -> tuple[Gaussians, Camera]:
+    """Random splats of mixed scales, three units before a camera."""
+    rng = np.random.default_rng(seed)
+    position = np.array([0.0, -3.0, 0.3]) + rng.uniform(-0.3, 0.3, 3)
+    view = Camera.look_at(position.tolist(), (0, 0, 0), width=40, height=30, fov_y=41)
+    count, axes = 24, 2 if kind == "2d" else 3
+    splats = Gaussians(
+        "2d" if kind == "2d" else "3d",
+        torch.tensor(0.5 * rng.normal(size=(count, 3))),
+        torch.tensor(rng.normal(size=(count, 4))),
+        torch.ones(count, axes, dtype=torch.float64),
+        torch.tensor(rng.uniform(0.02, 1, size=count)),
+        torch.tensor(0.4 * rng.normal(size=(count, 4, 3))),
+    )
+    return mixed_scales(splats, seed + 1_000_000, ratio), view
+
+
+def run(ratios: Sequence[float], pictures: int) -> list[dict[str, Any]]:
+    """A row for each ratio and mode: the worst error, by output, and of how many pictures."""
+    rows = []
+    for ratio in ratios:
+        for kind, depth, antialiased in MODES:
+            worst, own = [], []
+            for seed in range(pictures):
+                splats, camera = scene(seed, kind, ratio)
+                inputs = prepared(
+                    splats, camera, depth=depth, antialiased=antialiased if kind == "3d" else None
+                )
+                worst.append(excess(inputs))
+                if kind == "2d":
+                    own.append(max(excess(inputs, displacements=8).values()))
+            rows.append(
+                {
+                    "ratio": ratio,
+                    "mode": f"{kind} {depth}",
+                    "worst": {name: max(w[name] for w in worst) for name in OUTPUTS},
+                    "beyond": sum(max(w.values()) > LIMIT for w in worst),
+                    "pictures": pictures,
+                    "unexplained": max(own) if own else None,
+                }
+            )
+    return rows
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows for a person, as Markdown."""
+    lines = [
+        "| ratio | mode | colour, alpha | normal | depth | distortion | pictures beyond 1e-4"
+        " | not by conditioning |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    groups = (
+        ("color", "alpha", "weight"),
+        ("normal",),
+        ("depth", "median_depth"),
+        ("distortion_l1", "distortion_l2_ndc"),
+    )
+    for row in rows:
+        cells = [f"{row['ratio']:.0e}", row["mode"]]
+        cells += [f"{max(row['worst'][name] for name in group):.1e}" for group in groups]
+        cells.append(f"{row['beyond']} of {row['pictures']}")
+        cells.append("" if row["unexplained"] is None else f"{row['unexplained']:.1e}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.precision",
+        description="Measure the renderer's error against the ratio of scales.",
+    )
+    parser.add_argument("--quick", action="store_true", help="ratios 1 and 1e6, 2 pictures each")
+    parser.add_argument("--pictures", type=int, default=12, help="of each ratio and mode (12)")
+    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)  # small tensors: threads would only wait for each other
+    rows = run((1e0, 1e6), 2) if options.quick else run(RATIOS, options.pictures)
+    print(table(rows))
+    if options.out:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,99 @@
+"""Damaged folders of diffusion models: the model in the folder, or one line, in 10 s and 1 GiB.
+
+A failure is repeated by its label: the file and the seed of :mod:`mutate`.
+"""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import tiny_editors
+import torch
+from mutate import mutate_bytes, mutate_text, survey
+
+from attnwarp.editing.folder import load_controlnet, load_parts
+from attnwarp.errors import InputError
+
+FAST, SLOW = 4, 40
+
+FILES = (
+    "controlnet/diffusion_pytorch_model.safetensors",
+    "text_encoder/model.safetensors",
+    "text_encoder/config.json",
+    "tokenizer/tokenizer.json",
+    "scheduler/scheduler_config.json",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    tiny_editors.controlnet().save_pretrained(folder)
+    return folder
+
+
+def numbers_in(data):
+    """All numbers of a safetensors file of float32, in order of size: after the length of a header
+    and the header."""
+    (length,) = struct.unpack_from("<Q", data)
+    header = json.loads(data[8 : 8 + length])
+    assert {v["dtype"] for k, v in header.items() if k != "__metadata__"} == {"F32"}
+    return np.sort(np.frombuffer(data[8 + length :], "<f4"))
+
+
+def use(folder, name, data):
+    (folder / name).write_bytes(data)
+    if name.startswith("controlnet"):
+        network = load_controlnet(folder / "controlnet", dtype=torch.float32)
+    else:
+        network = load_parts(folder, dtype=torch.float32)["text_encoder"]
+    if name.endswith(".safetensors"):
+        values = [
+            v.numpy().ravel() for v in network.state_dict().values() if v.dtype.is_floating_point
+        ]
+        assert np.array_equal(np.sort(np.concatenate(values)), numbers_in(data), equal_nan=True)
+
+
+def failures(folder, name, seeds):
+    whole = (folder / name).read_bytes()
+
+    def damaged(seed):
+        if name.endswith(".json") and seed % 2:
+            return mutate_text(whole.decode(), seed).encode("utf-8", "surrogatepass")
+        return mutate_bytes(whole, seed)
+
+    try:
+        use(folder, name, whole)
+        outcomes = survey(
+            [(f"{name} {seed}", damaged(seed)) for seed in seeds],
+            lambda data: use(folder, name, data),
+            refusals=(InputError,),
+        )
+    finally:
+        (folder / name).write_bytes(whole)
+    assert len(outcomes) == len(seeds)
+    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
+    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
+@pytest.mark.parametrize("name", FILES)
+def test_a_damaged_model_is_refused_in_one_line_or_is_that_of_its_files(folder, name):
+    assert not (failed := failures(folder, name, range(FAST))), "\n".join(failed)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("name", FILES)
+def test_many_damaged_models_are_refused_or_are_those_of_their_files(folder, name):
+    failed = failures(folder, name, range(FAST, FAST + SLOW))
+    assert not failed, "\n".join(failed)

@@ -1,0 +1,94 @@
+"""A polite kill of a run on worker processes. Oracles: the process table, a run that was never
+disturbed."""
+
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+from attnwarp_eval.report.results import lines, read_results
+from attnwarp_eval.study import load_study
+from attnwarp_eval.study import run as runner
+from attnwarp_eval.study.store import Store
+
+STUDY = {
+    "name": "small",
+    "size": 16,
+    "scenes": ["spheres"],
+    "views": ["yaw030"],
+    "feature_sizes": [16],
+    "spp": 1,
+    "splats": {"count": 200},
+    "variants": {f"splats {n}": {"splats": {"count": n}} for n in (200, 300, 400)},
+    "probes": {"depth": ["splats 200", "splats 300", "splats 400"]},
+}
+
+# A commit made while the test runs would change the revision that reports name.
+WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
+
+
+def command(run):
+    program = [sys.executable, "-m", "attnwarp_eval.cli.main", "run", "study.yaml"]
+    return [*program, "--out", str(run), "--jobs", "2"]
+
+
+def workers(pid):
+    """Living worker processes below ``pid``."""
+    pids = []
+    for task in pathlib.Path(f"/proc/{pid}/task").glob("*"):
+        for child in (task / "children").read_text().split():
+            pids += [int(child)] if is_worker(child) else []
+            pids += workers(child)
+    return pids
+
+
+def is_worker(pid):
+    try:
+        return "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()
+    except OSError:
+        return False
+
+
+def finish(folder, run):
+    """The lines of results.jsonl of the run, gone on with in this process."""
+    store = Store(run)
+    with store.lock():
+        summary = runner.execute(runner.plan(load_study(str(folder / "study.yaml")), store), store)
+    assert summary.complete
+    return list(lines(read_results(store), timings=False))
+
+
+@pytest.mark.parametrize(
+    "moment", ["a cell is written", pytest.param("workers start", marks=pytest.mark.slow)]
+)
+def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
+    tmp_path, moment
+):
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    run = tmp_path / "killed"
+    process = subprocess.Popen(
+        command(run), cwd=tmp_path, env=WITHOUT_GIT, text=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    started = set()
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline:
+        started.update(workers(process.pid))
+        if started and (moment == "workers start" or list((run / "cells").glob("*.json"))):
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGTERM)
+    message = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").glob("*.json")}
+    last = f"interrupted; {len(kept)} cells are kept, the same command goes on from here\n"
+    assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
+    assert started and not any(map(is_worker, started))
+    results = finish(tmp_path, run)
+    assert {name: (run / "cells" / name).stat().st_mtime_ns for name in kept} == kept
+    assert results and results == finish(tmp_path, tmp_path / "undisturbed")

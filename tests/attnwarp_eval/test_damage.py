@@ -1,0 +1,209 @@
+"""Damaged studies, runs and derived files: a right result or one line, in 10 s and 1 GiB.
+
+The run is one that former code computed (``data/runs.tar.xz``), reduced to one scene and sealed. A
+failure is repeated by its label: the name of the format and the seed of :mod:`mutate`.
+"""
+
+import contextlib
+import json
+import pathlib
+import tarfile
+
+import numpy as np
+import pytest
+import yaml
+from mutate import mutate_bytes, mutate_text, survey
+
+from attnwarp.errors import InputError
+from attnwarp_eval import cache
+from attnwarp_eval.report.results import read_results
+from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study.probes import probe
+
+DATA = pathlib.Path(__file__).parent / "data" / "runs.tar.xz"
+
+FAST, SLOW = 12, 150
+
+STUDY = """\
+name: small
+title: Presets on two scenes
+size: 64
+scenes: [spheres, bear]
+views: [yaw030, yaw150]
+feature_sizes: [64, 16]
+seeds: [0, 1]
+spp: 1
+splats: {count: 2000}
+variants:
+  corrected: {preset: corrected}
+  slipped: {preset: corrected, set: {pixel_centers: integer}}
+  sparse: {preset: corrected, splats: {count: 500}}
+probes:
+  depth: [corrected, sparse]
+  warp: [corrected, slipped]
+  timing: [corrected, slipped]
+timing_rounds: 3
+ablations:
+  - {title: Presets, baseline: corrected, variants: [slipped]}
+yaw: {variants: [corrected]}
+fronts:
+  - {title: Cost, metric: warp.epe_median.16, variants: [corrected, slipped]}
+pictures: {variants: [corrected], views: [yaw030]}
+"""
+
+
+def entries(cells):
+    """Under which names the figures of each cell appear."""
+    return {c["id"]: (c["scene"], c["probe"], c["seed"], sorted(c["variants"])) for c in cells}
+
+
+class StudyFile:
+    def __init__(self, folder):
+        self.path = folder / "study.yaml"
+        self.whole = STUDY.encode()
+
+    def use(self, data):
+        self.path.write_bytes(data)
+        study = load_study(str(self.path))
+        with contextlib.suppress(yaml.YAMLError):  # YAML 1.2 has texts that PyYAML does not read
+            content = yaml.safe_load(data)
+            for key in ("name", "scenes", "views", "seeds", "size", "spp", "timing_rounds"):
+                assert key not in content or getattr(study, key) == content[key], key
+            assert study.variants.keys() == content["variants"].keys()
+
+
+class StudyJson:
+    """study.json, with its checksum: either its content or an error."""
+
+    sealed = True
+
+    def __init__(self, folder):
+        self.store = run_in(folder, self.sealed)
+        self.path = self.store.root / "study.json"
+        self.whole = self.path.read_bytes()
+        self.content = json.loads(self.whole)
+
+    def use(self, data):
+        self.path.write_bytes(data)
+        assert self.store.read_study() == self.content
+
+
+class FormerStudyJson(StudyJson):
+    """Without its checksum, as former code wrote it: no figure appears under another name."""
+
+    sealed = False
+
+    def use(self, data):
+        self.path.write_bytes(data)
+        names = entries(self.content["cells"])
+        for cell in read_results(self.store).cells:
+            label = (cell.scene, cell.probe, cell.seed, sorted(cell.variants))
+            assert cell.record is None or names[cell.id] == label
+
+
+class Cell:
+    """A record: either its content or an error; and the results hold the other records, and a
+    failure in one line for this."""
+
+    def __init__(self, folder):
+        self.store = run_in(folder)
+        cells = self.store.read_study()["cells"]
+        self.cell = next(c for c in cells if c["probe"] == "depth")
+        self.path = self.store.path(self.cell["id"])
+        self.whole = self.path.read_bytes()
+        self.content = json.loads(self.whole)
+        self.others = len(cells) - 1
+
+    def use(self, data):
+        self.path.write_bytes(data)
+        results = read_results(self.store)
+        broken = [cell.id for cell in results.cells if cell.record is None]
+        if broken:
+            assert broken == [self.cell["id"]]
+            (failure,) = results.failures
+            assert str(self.path) in failure.error and "\n" not in failure.error
+        else:
+            assert len(results.cells) == self.others + 1 and not results.failures
+        record = self.store.read_as(self.cell["id"], probe("depth").read)
+        assert record.to_json() == {k: self.content[k] for k in record.to_json()}
+
+
+class CacheFile:
+    """A derived file: either its arrays or none, which are then computed anew."""
+
+    def __init__(self, folder):
+        rng = np.random.default_rng(0)
+        self.arrays = {
+            "vertices": rng.normal(size=(40, 3)),
+            "faces": rng.integers(0, 40, (70, 3), dtype=np.int32),
+            "valid": rng.random(9) < 0.5,
+        }
+        cache.write_arrays("damage", "key", self.arrays)
+        self.path = cache.cache_dir() / "damage" / "key.npz"
+        self.whole = self.path.read_bytes()
+
+    def use(self, data):
+        self.path.write_bytes(data)
+        stored = cache.read_arrays("damage", "key")
+        if stored is None:
+            raise InputError("computed again")
+        assert stored.keys() == self.arrays.keys()
+        for name, value in self.arrays.items():
+            assert stored[name].dtype == value.dtype and np.array_equal(stored[name], value)
+
+
+FORMATS = {
+    "study": StudyFile,
+    "study.json": StudyJson,
+    "former study.json": FormerStudyJson,
+    "cell": Cell,
+    "cache": CacheFile,
+}
+
+
+def run_in(folder, sealed=True):
+    """The stored run with one of its scenes, which loads at once."""
+    with tarfile.open(DATA) as archive:
+        archive.extractall(folder, filter="data")
+    store = Store(folder / "variants")
+    study = store.read_study()
+    study["study"]["scenes"] = ["spheres"]
+    del study["scenes"]["bear"]
+    study["cells"] = [cell for cell in study["cells"] if cell["scene"] == "spheres"]
+    if sealed:
+        store.write_study(study)
+    else:
+        (store.root / "study.json").write_text(json.dumps(study, indent=1))
+    return store
+
+
+def failures(name, folder, seeds):
+    form = FORMATS[name](folder)
+    form.use(form.whole)  # the undamaged file is read
+
+    def damaged(seed):
+        if name != "cache" and seed % 2:
+            return mutate_text(form.whole.decode(), seed).encode("utf-8", "surrogatepass")
+        return mutate_bytes(form.whole, seed)
+
+    cases = [(f"{name} {seed}", damaged(seed)) for seed in seeds]
+    outcomes = survey(cases, form.use, refusals=(InputError,))
+    assert len(outcomes) == len(cases)
+    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
+    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_damaged_study_run_or_derived_file_is_refused_in_one_line_or_means_the_same(
+    tmp_path, name
+):
+    assert not (failed := failures(name, tmp_path, range(FAST))), "\n".join(failed)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("name", FORMATS)
+def test_many_damaged_studies_runs_and_derived_files_are_refused_or_mean_the_same(tmp_path, name):
+    failed = failures(name, tmp_path, range(FAST, FAST + SLOW))
+    assert not failed, "\n".join(failed)
