@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -168,7 +169,7 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
             for image, values, view, look in render_world(seed, split)
         ]
     images, values, world, view, look = zip(*rows, strict=True)
-    arrays = {
+    arrays: dict[str, Any] = {
         "images": np.stack(images),
         "attributes": np.array(values),
         "world": world,
