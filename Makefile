@@ -7,7 +7,7 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 
-.PHONY: demo test test-all bench docs lint venv clean
+.PHONY: demo test test-all bench docs lint checks kernels venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
@@ -15,11 +15,11 @@ demo:
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
 ## lint, types, layers, and the tests that fit in a coffee break (docs/testing.md)
-test: lint
+test: checks
 	$(PYTEST) -m "not slow"
 
 ## everything, the thorough checks too
-test-all: lint
+test-all: checks
 	$(PYTEST)
 
 ## every benchmark, one after the other
@@ -37,6 +37,13 @@ lint: venv
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself.
+checks: venv
+	@$(MAKE) --no-print-directory -j2 lint kernels
+
+kernels: venv
+	@$(BIN)/python -m scripts.compile_kernels
 
 venv:
 	@scripts/venv.sh

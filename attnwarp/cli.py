@@ -324,28 +324,28 @@ def _fit(
             "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
         )
 
-    from attnwarp import fit as fitting
+    import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT
     from attnwarp.fit.progress import progress_display
 
-    settings = fitting.FitSettings.from_dict(changes)
+    settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = _read_views(data, **reading)
-    train, test = fitting.hold_out(dataset, every)
-    views = fitting.load_views(train, max_size=max_size)
-    held_out = fitting.load_views(test, max_size=max_size) if test is not None else None
+    train, test = attnwarp.fit.hold_out(dataset, every)
+    views = attnwarp.fit.load_views(train, max_size=max_size)
+    held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
     if dataset.points is not None and len(dataset.points):
         first, colors = dataset.points, dataset.colors
     else:
         typer.echo(f"{data} has no points: beginning with {points} random ones", err=True)
-        first, colors = fitting.random_points(views.cameras, points, seed=seed)
-    start = fitting.from_points(
+        first, colors = attnwarp.fit.random_points(views.cameras, points, seed=seed)
+    start = attnwarp.fit.from_points(
         first, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed
     )
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
     with _asked_to_stop() as stop, progress_display(title=out.name) as watch:
-        result = fitting.fit(
+        result = attnwarp.fit.fit(
             start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
             checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
         )  # fmt: skip
@@ -488,8 +488,8 @@ def render(
         behind = _color(background)
         _check_out(out)
 
+        import attnwarp.render
         from attnwarp.io.file import write_atomically
-        from attnwarp.render import render as draw
 
         _use_threads(threads)
         splats = _read_splats(model, kind, antialiased)
@@ -509,7 +509,7 @@ def render(
                 camera = camera.resize(
                     max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
                 )
-            view = draw(splats, camera, background=behind, near=near)
+            view = attnwarp.render.render(splats, camera, background=behind, near=near)
             _write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
             if depth:
                 buffer = io.BytesIO()
@@ -582,7 +582,7 @@ def undistort(
     """Resample pictures to pinhole cameras, for lens models that OpenCV has."""
     with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
         _check_out(out)
-        from attnwarp.io import undistort as write_undistorted
+        import attnwarp.io
 
         dataset = _read_views(
             data,
@@ -594,7 +594,7 @@ def undistort(
             distorted="keep",
         )
         count = sum(lens is not None for lens in dataset.lenses)
-        result = write_undistorted(dataset, out)
+        result = attnwarp.io.undistort(dataset, out)
         typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")
 
 

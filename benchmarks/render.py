@@ -1,9 +1,9 @@
 """How fast splats are rendered on this machine: ``python -m benchmarks.render`` (``make bench``).
 
-One process. The cases take turns, round after round, so that a slow moment of the machine falls on
-all of them; the median over rounds is reported, with the fastest beside it. The machine's own peak
-is measured in the same rounds: independent fused multiply-adds in registers, on as many threads as
-the renderer uses.
+One process. The cases run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment of
+the machine falls on all of them; the median over rounds is reported, with the fastest beside it.
+The machine's own peak is measured in the same rounds: independent fused multiply-adds in registers,
+on as many threads as the renderer uses.
 
 The share of the peak is that of processor time on both sides, so that a busy machine, which makes
 everything take longer, hardly changes it; on a quiet one it is the share of wall time but for the
@@ -45,6 +45,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.render import _pool
 from attnwarp.render.api import render
 from attnwarp.render.threads import run_jobs, thread_count
+from attnwarp_eval.cost import in_turn
 
 FLOPS_PER_PAIR = 45
 GSPLAT_SECONDS = 90.0
@@ -138,20 +139,52 @@ def _with_leaves(splats: Gaussians) -> Gaussians:
     )
 
 
-def time_once(case: Case, splats: Gaussians, view: Camera) -> None:
+@dataclass(frozen=True)
+class Round:
+    """Seconds of one forward pass and of one forward and backward pass, on the wall and of the
+    processor; the peak beside them, and the renderer's counters.
+    """
+
+    forward: float
+    forward_cpu: float
+    both: float
+    both_cpu: float
+    peak: float
+    counters: dict[str, int]
+
+
+def time_once(splats: Gaussians, view: Camera) -> Round:
     """One forward, one forward with backward, one measure of the peak."""
     start, start_cpu = time.perf_counter(), time.process_time()
     result = render(splats, view, backend="cpu")
-    case.forward.append(time.perf_counter() - start)
-    case.forward_cpu.append(time.process_time() - start_cpu)
-    case.counters = result.counters
+    forward, forward_cpu = time.perf_counter() - start, time.process_time() - start_cpu
+    counters = result.counters
     del result
     again = _with_leaves(splats)
     start, start_cpu = time.perf_counter(), time.process_time()
     _differentiate(again, view)
-    case.both.append(time.perf_counter() - start)
-    case.both_cpu.append(time.process_time() - start_cpu)
-    case.peak.append(measure_peak(thread_count()))
+    both, both_cpu = time.perf_counter() - start, time.process_time() - start_cpu
+    return Round(forward, forward_cpu, both, both_cpu, measure_peak(thread_count()), counters)
+
+
+def _collect_garbage(_: int) -> None:
+    gc.collect()
+
+
+def time_in_turn(built: Sequence[tuple[Case, Gaussians, Camera]], rounds: int) -> None:
+    """Time the cases and write what they took into them."""
+    turns = in_turn(
+        [lambda _, splats=splats, view=view: time_once(splats, view) for _, splats, view in built],
+        rounds,
+        before=_collect_garbage,
+    )
+    for (case, _, _), results in zip(built, turns.results, strict=True):
+        case.forward = [r.forward for r in results]
+        case.forward_cpu = [r.forward_cpu for r in results]
+        case.both = [r.both for r in results]
+        case.both_cpu = [r.both_cpu for r in results]
+        case.peak = [r.peak for r in results]
+        case.counters = results[-1].counters
 
 
 def measure_memory(case: Case, splats: Gaussians, view: Camera) -> None:
@@ -228,13 +261,10 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
     """
     start = time.perf_counter()
     for kind in sorted({case.kind for case in cases}):
-        time_once(Case(kind, 32, 100, 0.1), scene(kind, 100, 0.1), camera(32))
+        time_once(scene(kind, 100, 0.1), camera(32))
     warm_up = time.perf_counter() - start
     built = [(case, scene(case.kind, case.splats, case.sigma), camera(case.size)) for case in cases]
-    for _ in range(rounds):
-        for case, splats, view in built:
-            gc.collect()
-            time_once(case, splats, view)
+    time_in_turn(built, rounds)
     for case, splats, view in built:
         measure_memory(case, splats, view)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -37,7 +37,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.render.api import render
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
-from attnwarp.warp._kernels import sampling as kernels
+from attnwarp.warp._kernels import sampling
 
 SPLATS = 40_000
 YAW = 20.0
@@ -148,7 +148,7 @@ def tokens_case(grid: int, channels: int, dtype: torch.dtype, *, others: bool) -
     begin, end = (t.view(raw).numpy() for t in (tokens, result))
     pieces = ranges(grid * grid, max(1, grid * grid // (4 * thread_count())))
     contestants: dict[str, Callable[[], object]] = {
-        "copy": lambda: run_jobs(kernels.copy_rows, [(*p, begin, end) for p in pieces]),
+        "copy": lambda: run_jobs(sampling.copy_rows, [(*p, begin, end) for p in pieces]),
         "tokens": lambda: layer.warp_tokens(tokens),
         "blend in place": lambda: layer.blend_tokens(tokens, new, ALPHA, in_place=True),
         "blend": lambda: layer.blend_tokens(tokens, new, ALPHA),

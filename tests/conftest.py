@@ -12,8 +12,9 @@ if _WORKERS > 1:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Files whose tests share a fixture run in one worker, so that it is made once, and run first;
-    every other test goes to whichever worker is free.
+    """Files whose tests share a fixture, or scenes and their textures in the memory of a process, run
+    in one worker, so that these are made once, and run first; every other test goes to whichever
+    worker is free.
 
     xdist's own ``--dist loadgroup`` does this with marks, but has no effect with pytest 9.2, where
     a test's id cannot be changed.
@@ -21,13 +22,15 @@ def pytest_xdist_make_scheduler(config, log):
     from xdist.scheduler import LoadScopeScheduling
 
     @functools.cache
-    def shares_a_fixture(path):
+    def shares(path):
+        if path.startswith("tests/attnwarp_eval/"):
+            return True
         return 'scope="module"' in (config.rootpath / path).read_text()
 
     class Scheduler(LoadScopeScheduling):
         def _split_scope(self, nodeid):
             path = nodeid.partition("::")[0]
-            return path if shares_a_fixture(path) else nodeid
+            return path if shares(path) else nodeid
 
     return Scheduler(config, log)
 

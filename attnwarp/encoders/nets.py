@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-import torch.nn.functional as F
 from torch import nn
+from torch.nn import functional
 
 Tensor = torch.Tensor
 
@@ -28,8 +28,8 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, C, h, w)."""
-        y = F.relu(self.first_norm(self.first(x)))
-        return F.relu(x + self.second_norm(self.second(y)))
+        y = functional.relu(self.first_norm(self.first(x)))
+        return functional.relu(x + self.second_norm(self.second(y)))
 
 
 class Stages(nn.Module):
@@ -202,7 +202,7 @@ class DinoSmall(nn.Module):
         x = self.stages(x)[-1]
         y = self.embed(x)
         h, w = y.shape[-2:]
-        y = y + F.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
+        y = y + functional.interpolate(self.position, (h, w), mode="bicubic", align_corners=False)
         tokens = torch.cat([self.cls(x)[:, None], y.flatten(2).transpose(1, 2)], dim=1)
         for block in self.blocks:
             tokens = block(tokens)
@@ -242,8 +242,8 @@ class PerceptualSmall(nn.Module):
         out = []
         for k, layer in enumerate(self.layers):
             if k:
-                x = F.avg_pool2d(x, 2, ceil_mode=True)
-            x = F.relu(layer(x)) if k < len(self.layers) - 1 else layer(x)
+                x = functional.avg_pool2d(x, 2, ceil_mode=True)
+            x = functional.relu(layer(x)) if k < len(self.layers) - 1 else layer(x)
             out.append(x)
         return out
 
@@ -256,7 +256,7 @@ class PerceptualSmall(nn.Module):
         features.
         """
         size = 4 if min(x.shape[-2:]) >= 4 else 1
-        return [F.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
+        return [functional.avg_pool2d(x, size), *(_unit(y) for y in self.features(x))]
 
     def between(self, a: list[Tensor], b: list[Tensor]) -> Tensor:
         """(N,) distances of what :meth:`stack` gave."""

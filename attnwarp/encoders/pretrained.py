@@ -341,17 +341,17 @@ def _load(
 @contextmanager
 def _silent() -> Iterator[None]:
     """Silence transformers' progress bar and advice; the checks here replace them."""
-    from transformers.utils import logging as chatter
+    from transformers import utils
 
-    level, bars = chatter.get_verbosity(), chatter.is_progress_bar_enabled()
-    chatter.set_verbosity(logging.CRITICAL)
-    chatter.disable_progress_bar()
+    level, bars = utils.logging.get_verbosity(), utils.logging.is_progress_bar_enabled()
+    utils.logging.set_verbosity(logging.CRITICAL)
+    utils.logging.disable_progress_bar()
     try:
         yield
     finally:
-        chatter.set_verbosity(level)
+        utils.logging.set_verbosity(level)
         if bars:
-            chatter.enable_progress_bar()
+            utils.logging.enable_progress_bar()
 
 
 def _tokenizer(folder: Path, name: str) -> Any:

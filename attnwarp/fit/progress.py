@@ -42,7 +42,7 @@ def progress_display(
         ...     watch(Step(9, 9, loss=0.02, psnr=28.0, held_out=None, splats=60, seconds=2.0))
         bear [9/9] 2 s: loss 0.0200, PSNR 28.00 dB, 60 splats
     """
-    from rich.console import Console as Terminal
+    import rich.console
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -52,7 +52,7 @@ def progress_display(
     )
     from rich.table import Column
 
-    target = console or Terminal(stderr=True)
+    target = console or rich.console.Console(stderr=True)
     if not target.is_terminal:
         yield _lines(target, title)
         return

@@ -17,8 +17,7 @@ from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.render import _pool
 from attnwarp.render.threads import ranges, run_jobs, thread_count
-from attnwarp.warp._kernels import pair as pairs
-from attnwarp.warp._kernels import sampling as kernels
+from attnwarp.warp._kernels import pair, sampling
 from attnwarp.warp.correspondence import Correspondence
 from attnwarp.warp.depth import Array
 from attnwarp.warp.masks import axis_weights
@@ -60,7 +59,7 @@ def correspond_and_mask(
             names.append(name)
     row = {name: k for k, name in enumerate(names)}
     bounds = source if settings.bounds == "source" else target
-    rules = pairs.Rules(
+    rules = pair.Rules(
         float(bounds.width),
         float(bounds.height),
         _limit(settings.opaque),
@@ -82,11 +81,11 @@ def correspond_and_mask(
         segment = target_segment.to(device="cpu", dtype=torch.bool).contiguous().numpy()
     positions = _positions(size)
     passes, mask = _pool.empty((len(names), *size), np.bool_), _pool.empty(size, np.bool_)
-    pair = _pair(source, target, settings)
+    views = _pair(source, target, settings)
     run_jobs(
-        pairs.rules_of_pair,
+        pair.rules_of_pair,
         [
-            (*piece, pair, rules, seen, other, segment, positions, passes, mask)
+            (*piece, views, rules, seen, other, segment, positions, passes, mask)
             for piece in _rows(size[0])
         ],
     )
@@ -110,13 +109,13 @@ def correspond_layer(
         settings: the choices; ``depth_interpolation`` and ``depth_spread`` among them.
     """
     positions = _positions((target.height, target.width))
-    pair = _pair(source, target, settings)
+    views = _pair(source, target, settings)
     how = _INTERPOLATION[settings.depth_interpolation]
     depth = target_depth.contiguous().numpy()
     run_jobs(
-        pairs.layer,
+        pair.layer,
         [
-            (*piece, pair, depth, how, _limit(settings.depth_spread), positions)
+            (*piece, views, depth, how, _limit(settings.depth_spread), positions)
             for piece in _rows(target.height)
         ],
     )
@@ -128,7 +127,7 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: 
     rows, columns = _axis(size[0], mask.shape[0], mode), _axis(size[1], mask.shape[1], mode)
     result = _pool.empty(size, np.bool_)
     run_jobs(
-        pairs.resize_mask,
+        pair.resize_mask,
         [
             (*piece, mask.contiguous().numpy(), rows, columns, defined.numpy(), result)
             for piece in _rows(size[0])
@@ -166,9 +165,9 @@ class _SampleMaps(torch.autograd.Function):
     def forward(ctx: Any, planes: Tensor, taps: Taps) -> Tensor:
         source, (index, weight) = _values(planes), taps.arrays
         result = _pool.empty((len(source), index.shape[1]), source.dtype)
-        size = max(kernels.PLANES, PIECE // max(1, index.shape[1]))
+        size = max(sampling.PLANES, PIECE // max(1, index.shape[1]))
         run_jobs(
-            kernels.sample_maps,
+            sampling.sample_maps,
             [(*piece, source, index, weight, result) for piece in ranges(len(source), size)],
         )
         ctx.taps, ctx.shape = taps, planes.shape
@@ -181,10 +180,10 @@ class _SampleMaps(torch.autograd.Function):
         gradient = _values(upstream.to(ctx.taps.weight.dtype))
         result = _pool.zeros(tuple(ctx.shape), weight.dtype)
         run_jobs(
-            kernels.scatter_maps,
+            sampling.scatter_maps,
             [
                 (*piece, gradient, index, weight, result)
-                for piece in ranges(len(result), kernels.PLANES)
+                for piece in ranges(len(result), sampling.PLANES)
             ],
         )
         return torch.from_numpy(result).to(upstream.dtype), None
@@ -196,7 +195,7 @@ class _SampleTokens(torch.autograd.Function):
         source, (index, weight) = _values(tokens), taps.arrays
         result = _pool.empty((len(source), index.shape[1], source.shape[2]), source.dtype)
         run_jobs(
-            kernels.sample_rows,
+            sampling.sample_rows,
             [(*piece, source, index, weight, result) for piece in _pieces(result)],
         )
         ctx.taps, ctx.shape = taps, tokens.shape
@@ -216,7 +215,7 @@ class _BlendTokens(torch.autograd.Function):
     ) -> Tensor:
         own = _values(new)
         result = _pool.empty(own.shape, own.dtype)
-        run_jobs(kernels.copy_rows, [(*piece, own, result) for piece in _pieces(result)])
+        run_jobs(sampling.copy_rows, [(*piece, own, result) for piece in _pieces(result)])
         _blend(_values(source), result, taps, mask, alpha)
         ctx.taps, ctx.mask, ctx.alpha, ctx.shape = taps, mask, alpha, source.shape
         return _tensor(result, new.dtype)
@@ -239,7 +238,7 @@ def _blend(source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alp
     index, weight = taps.arrays
     shares = weight.dtype.type(alpha), weight.dtype.type(1 - alpha)
     run_jobs(
-        kernels.blend_rows,
+        sampling.blend_rows,
         [
             (*piece, source, index, weight, mask.numpy(), *shares, result)
             for piece in _pieces(result)
@@ -252,7 +251,7 @@ def _scatter(upstream: Tensor, taps: Taps, share: np.ndarray, shape: torch.Size)
     gradient = _values(upstream.to(taps.weight.dtype))
     result = _pool.zeros(tuple(shape), weight.dtype)
     run_jobs(
-        kernels.scatter_rows,
+        sampling.scatter_rows,
         [(*piece, gradient, index, weight, share, result) for piece in ranges(shape[2], CHANNELS)],
     )
     return torch.from_numpy(result).to(upstream.dtype)
@@ -277,23 +276,23 @@ def _tensor(values: np.ndarray, dtype: torch.dtype) -> Tensor:
 
 
 _INTERPOLATION: dict[DepthInterpolation, int] = {
-    "inverse": pairs.INVERSE,
-    "bilinear": pairs.BILINEAR,
-    "nearest": pairs.NEAREST,
+    "inverse": pair.INVERSE,
+    "bilinear": pair.BILINEAR,
+    "nearest": pair.NEAREST,
 }
 _NORMAL_TEST: dict[NormalTest, int] = {
-    "none": pairs.FACING,  # not asked for
-    "facing": pairs.FACING,
-    "source_incidence": pairs.SOURCE_INCIDENCE,
-    "camera_frame": pairs.CAMERA_FRAME,
+    "none": pair.FACING,  # not asked for
+    "facing": pair.FACING,
+    "source_incidence": pair.SOURCE_INCIDENCE,
+    "camera_frame": pair.CAMERA_FRAME,
 }
 
 
 @functools.lru_cache(maxsize=32)
-def _axis(new: int, old: int, mode: MaskResize) -> pairs.Axis:
+def _axis(new: int, old: int, mode: MaskResize) -> pair.Axis:
     weights = axis_weights(new, old, mode).numpy()
     used = weights > 0
-    return pairs.Axis(weights, used.argmax(axis=1), old - used[:, ::-1].argmax(axis=1))
+    return pair.Axis(weights, used.argmax(axis=1), old - used[:, ::-1].argmax(axis=1))
 
 
 def _rows(height: int) -> list[tuple[int, int]]:
@@ -304,14 +303,14 @@ def _limit(value: float | None) -> float:
     return float("inf") if value is None else value
 
 
-def _lens(camera: Camera) -> pairs.Lens:
+def _lens(camera: Camera) -> pair.Lens:
     K = camera.K
     values = (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2], camera.width, camera.height)
-    return pairs.Lens(*map(float, values))
+    return pair.Lens(*map(float, values))
 
 
-def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pairs.Pair:
-    return pairs.Pair(
+def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pair.Pair:
+    return pair.Pair(
         _lens(source),
         _lens(target),
         np.ascontiguousarray(source.relative_to(target)[:3]),
@@ -323,8 +322,8 @@ def _pair(source: Camera, target: Camera, settings: WarpSettings) -> pairs.Pair:
     )
 
 
-def _positions(size: tuple[int, int]) -> pairs.Positions:
-    return pairs.Positions(
+def _positions(size: tuple[int, int]) -> pair.Positions:
+    return pair.Positions(
         _pool.empty((*size, 2), np.float64),
         _pool.empty((*size, 3), np.float64),
         _pool.empty(size, np.float64),
@@ -332,7 +331,7 @@ def _positions(size: tuple[int, int]) -> pairs.Positions:
 
 
 def _correspondence(
-    source: Camera, target: Camera, positions: pairs.Positions, settings: WarpSettings
+    source: Camera, target: Camera, positions: pair.Positions, settings: WarpSettings
 ) -> Correspondence:
     xy, points, depth = (torch.from_numpy(part) for part in positions)
     return Correspondence(
@@ -342,7 +341,7 @@ def _correspondence(
 
 def _parts(
     target: Surface, source: Surface | None, settings: WarpSettings, size: tuple[int, int]
-) -> tuple[pairs.View, pairs.View]:
+) -> tuple[pair.View, pair.View]:
     """What the rules read of both surfaces: all float32, or all float64."""
     wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {"target_depth": (target.depth, size)}
     if settings.opaque is not None:
@@ -374,13 +373,13 @@ def _parts(
         return np.ascontiguousarray(arrays[name], kind)
 
     return (
-        pairs.View(
+        pair.View(
             part("target_depth", 2),
             part("target_alpha", 2),
             part("target_image", 3),
             part("target_normal", 3),
         ),
-        pairs.View(
+        pair.View(
             part("source_depth", 2),
             part("source_alpha", 2),
             part("source_image", 3),

@@ -21,6 +21,6 @@ def open3d() -> Any:
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    import open3d as module
+    import open3d
 
-    return module
+    return open3d

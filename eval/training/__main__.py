@@ -81,21 +81,21 @@ def assess(
     """
     import torch
 
+    import training.assess
     from attnwarp.encoders.bundled import load
-    from training import assess as questions
     from training.cards import card
 
     torch.set_num_threads(threads)
     encoder: Any = load(name, weights)
-    sets = questions.test_sets(data)
+    sets = training.assess.test_sets(data)
 
     def figures() -> list[dict[str, Any]]:
         if name == "clip-small":
-            results = questions.clip_figures(encoder, sets)
+            results = training.assess.clip_figures(encoder, sets)
         elif name == "dino-small":
-            results = questions.dino_figures(encoder, sets)
+            results = training.assess.dino_figures(encoder, sets)
         else:
-            results = questions.perceptual_figures(encoder, sets["test"].images)
+            results = training.assess.perceptual_figures(encoder, sets["test"].images)
         return [f.to_dict() for f in results]
 
     trained = figures()

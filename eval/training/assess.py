@@ -367,7 +367,7 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
     where it must be the point seen. Only patches of the thing itself count, and only ones that both
     views show.
     """
-    from training.render import pictures as render
+    from training.render import pictures
 
     side = 8  # DinoSmall's patches
     rows: dict[str, list[bool]] = {"patch tokens": [], "raw patches": [], "middle of the thing": []}
@@ -375,8 +375,8 @@ def part_figures(encoder: TokenEncoder, count: int, *, first: int = 5_000_000) -
     for k in range(count):
         world = draw_world(first + k, new_shapes=True, thing=k % len(OBJECTS))
         look = looks_of(world.seed, world.thing, SPLITS["test"])[0]
-        (first_image,), first_hits = render(world, [look], SIZE, view=0)
-        (second_image,), second_hits = render(world, [look], SIZE, view=1)
+        (first_image,), first_hits = pictures(world, [look], SIZE, view=0)
+        (second_image,), second_hits = pictures(world, [look], SIZE, view=1)
         camera = world.scene(look, SIZE).cameras[1]
         place = np.arange(side) * (SIZE // side) + SIZE // side // 2
         y, x = np.meshgrid(place, place, indexing="ij")

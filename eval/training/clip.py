@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
 from tokenizers import (
     Tokenizer,
     decoders,
@@ -22,6 +21,7 @@ from tokenizers import (
     processors,
     trainers,
 )
+from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipSmall
 from training import naming
@@ -181,14 +181,14 @@ def contrast(
     n = len(i)
     with torch.autocast("cpu", torch.bfloat16):
         t = model.texts(texts)
-    t = F.normalize(t.float(), dim=-1)
+    t = functional.normalize(t.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * i @ t.T
     diagonal = torch.arange(n)
     also_true = truth.clone()
     also_true[diagonal, diagonal] = False
     logits = logits.masked_fill(also_true, -torch.inf)
-    by_image = F.cross_entropy(logits, diagonal)
-    by_text = F.cross_entropy(logits[:, :n].T, diagonal)
+    by_image = functional.cross_entropy(logits, diagonal)
+    by_text = functional.cross_entropy(logits[:, :n].T, diagonal)
     return 0.5 * (by_image + by_text)
 
 
@@ -231,7 +231,7 @@ def naming_loss(
             texts.append(sentence(tuple(int(v) for v in caption), rng))
     with torch.autocast("cpu", torch.bfloat16):
         words = model.texts(tokens(tokenizer, texts))
-    words = F.normalize(words.float(), dim=-1)
+    words = functional.normalize(words.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * images @ words.T
     total = torch.zeros(())
     for column, low, high in spans:
@@ -244,7 +244,7 @@ def naming_loss(
             asked &= np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
         if asked.any():
             rows = torch.from_numpy(np.flatnonzero(asked))
-            loss = F.cross_entropy(
+            loss = functional.cross_entropy(
                 logits[rows, low:high], torch.from_numpy(attributes[asked, column])
             )
             total = total + (2 if column == 0 else 1) * loss
@@ -312,7 +312,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 features = model.pool.features(model.vision(images)[-1])
                 embedded = model.pool.project(features)
                 guessed = heads(features, attributes)
-            embedded = F.normalize(embedded.float(), dim=-1)
+            embedded = functional.normalize(embedded.float(), dim=-1)
             apart = contrast(
                 model, embedded[torch.from_numpy(whole)], tokens(tokenizer, texts), truth
             )

@@ -4,15 +4,16 @@ workers.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.io.file import write_atomically
 from training.worlds import (
     FINISHES,
     GROUNDS,
@@ -168,17 +169,14 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
             for image, values, view, look in render_world(seed, split)
         ]
     images, values, world, view, look = zip(*rows, strict=True)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        np.savez(
-            file,
-            images=np.stack(images),
-            attributes=np.array(values),
-            world=world,
-            view=view,
-            look=look,
-        )
-    temporary.replace(path)
+    arrays: dict[str, Any] = {
+        "images": np.stack(images),
+        "attributes": np.array(values),
+        "world": world,
+        "view": view,
+        "look": look,
+    }
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))
     return path
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
 from torch import nn
+from torch.nn import functional
 
 from attnwarp.encoders.nets import DinoSmall
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
@@ -51,7 +51,10 @@ class Head(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., dim) -> (..., count)."""
-        return F.normalize(self.mlp(x), dim=-1) @ F.normalize(self.prototypes, dim=-1).T
+        return (
+            functional.normalize(self.mlp(x), dim=-1)
+            @ functional.normalize(self.prototypes, dim=-1).T
+        )
 
 
 class Distiller(nn.Module):
@@ -98,19 +101,21 @@ def contrast(first: Tensor, second: Tensor) -> Tensor:
         first, second: (N, D) class tokens of the two views.
     """
     logits = (
-        F.normalize(first.float(), dim=-1)
-        @ F.normalize(second.float(), dim=-1).T
+        functional.normalize(first.float(), dim=-1)
+        @ functional.normalize(second.float(), dim=-1).T
         / STUDENT_TEMPERATURE
     )
     diagonal = torch.arange(len(first))
-    return 0.5 * (F.cross_entropy(logits, diagonal) + F.cross_entropy(logits.T, diagonal))
+    return 0.5 * (
+        functional.cross_entropy(logits, diagonal) + functional.cross_entropy(logits.T, diagonal)
+    )
 
 
 def spread(tokens: Tensor) -> Tensor:
     """Minus the mean logarithm of the distance to the nearest neighbour (Sablayrolles et al. 2019,
     KoLeo).
     """
-    unit = F.normalize(tokens.float(), dim=-1)
+    unit = functional.normalize(tokens.float(), dim=-1)
     near = (unit @ unit.T).fill_diagonal_(-1).max(dim=1).values
     return -torch.log((2 - 2 * near).clamp(min=1e-6).sqrt()).mean()
 
@@ -125,7 +130,7 @@ def places(inner: Tensor, outer: Tensor, size: int) -> Tensor:
     Returns:
         (N, size, size, 2) in the outer crop's [-1, 1]; outside of it where it does not reach.
     """
-    grid = F.affine_grid(inner, [len(inner), 1, size, size], align_corners=False)
+    grid = functional.affine_grid(inner, [len(inner), 1, size, size], align_corners=False)
     turn, shift = outer[:, :, :2], outer[:, None, None, :, 2]
     return torch.einsum("nij,nhwj->nhwi", torch.linalg.inv(turn), grid - shift)
 
@@ -189,7 +194,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             flat = balanced(t_patch.float().permute(0, 2, 3, 1).reshape(-1, p))
             dense_target = flat.view(n, h, w, p).permute(0, 3, 1, 2).chunk(2)
             by_crop = [
-                F.log_softmax(s / STUDENT_TEMPERATURE, dim=1)
+                functional.log_softmax(s / STUDENT_TEMPERATURE, dim=1)
                 for s in (*s_large.chunk(2), *s_small.chunk(2))
             ]
             terms = [
@@ -203,8 +208,10 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for side, scores in enumerate(s_small_patch.chunk(2)):
                 positions = places(small[side][1], large[side][1], SMALL // DinoSmall.patch)
                 inside = (positions.abs() <= 1).all(dim=-1)
-                wanted = F.grid_sample(dense_target[side], positions, align_corners=False)
-                loss = -(wanted * F.log_softmax(scores.float() / STUDENT_TEMPERATURE, dim=1)).sum(1)
+                wanted = functional.grid_sample(dense_target[side], positions, align_corners=False)
+                loss = -(
+                    wanted * functional.log_softmax(scores.float() / STUDENT_TEMPERATURE, dim=1)
+                ).sum(1)
                 dense_terms.append((loss * inside).sum() / inside.sum().clamp(min=1))
             dense = torch.stack(dense_terms).mean()
             apart = torch.stack([spread(side) for side in tokens.chunk(2)]).mean()

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
 from torch import nn
+from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipSmall
 from training.common import Run, channels_last, crops, groups, rate, settings
@@ -66,7 +66,9 @@ class Heads(nn.Module):
         for column, scores in self.scores(x).items():
             asked = torch.from_numpy(attributes[:, column])
             if bool((asked >= 0).any()):
-                loss = F.cross_entropy(scores, asked, ignore_index=-1, label_smoothing=SMOOTHING)
+                loss = functional.cross_entropy(
+                    scores, asked, ignore_index=-1, label_smoothing=SMOOTHING
+                )
                 total = total + (2 if column == 0 else 1) * loss
         return total / (len(self.counts) + 1)
 
@@ -187,7 +189,7 @@ def _held_out_accuracy(sets: list[Part], model: ClipSmall, heads: Heads) -> dict
             if not len(rows):
                 continue
             x = torch.from_numpy(part.pictures.images[rows]).permute(0, 3, 1, 2).float().div(255)
-            x = F.interpolate(x, (model.size, model.size), mode="bilinear", antialias=True)
+            x = functional.interpolate(x, (model.size, model.size), mode="bilinear", antialias=True)
             with torch.autocast("cpu", torch.bfloat16):
                 scores = heads.scores(
                     model.pool.features(model.vision(x.to(memory_format=torch.channels_last))[-1])

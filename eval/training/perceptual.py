@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
+from torch.nn import functional
 
 from attnwarp.encoders.nets import PerceptualSmall
 from training.common import Run, channels_last, rate, settings
@@ -140,7 +140,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             seen = [y.chunk(3) for y in model.stack(torch.cat([x, weak, strong]))]
             near, far = (model.between([y[0] for y in seen], [y[k] for y in seen]) for k in (1, 2))
             d = torch.cat([near, far])
-            order = F.softplus(-4 * (torch.log(far + 1e-5) - torch.log(near + 1e-5))).mean()
+            order = functional.softplus(
+                -4 * (torch.log(far + 1e-5) - torch.log(near + 1e-5))
+            ).mean()
             # So that the number itself reads as a strength: 1 is ruined.
             reads = ((d + 1e-6).sqrt() - strengths.T.reshape(-1) / 5).square().mean()
             loss = order + reads

@@ -40,7 +40,7 @@ def run(
     was."""
     from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
-    from attnwarp_eval.study import run as runner
+    from attnwarp_eval.study.run import plan
     from attnwarp_eval.study.store import Store
     from attnwarp_eval.study.study import load_study
 
@@ -49,7 +49,7 @@ def run(
         loaded = load_study(study, scenes=names(scenes), size=size)
         store = Store(out or Path("runs") / loaded.name)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
-            planned = runner.plan(loaded, store)
+            planned = plan(loaded, store)
             with store.lock():
                 if planned.other_code:
                     typer.echo(
@@ -74,7 +74,7 @@ def run(
 
 def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
     """Run with a progress bar on a terminal, or a line a cell where there is none."""
-    from attnwarp_eval.study import run as runner
+    from attnwarp_eval.study.run import execute
 
     total, finished = len(planned.cells), planned.reused
     with progress(total, done=finished, lines=True) as show:
@@ -92,7 +92,7 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
             if error and show.console.is_terminal:
                 show.line(cell.title + error)
 
-        return runner.execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
+        return execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
 
 
 def _print_failures(summary: Summary) -> None:
@@ -133,11 +133,11 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     """Recompute the hashes of a run's cells and pictures and compare with the list of expected
     cells.
     """
-    from attnwarp_eval.study import run as runner
+    from attnwarp_eval.study.run import verify
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        problems = runner.verify(Store(run))
+        problems = verify(Store(run))
     for what, items in (
         ("damaged", problems.damaged),
         ("failed", problems.failed),

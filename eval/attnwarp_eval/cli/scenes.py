@@ -92,12 +92,12 @@ def export(
     read.
     """
     with clear_errors():
+        import attnwarp_eval.splats.export
         from attnwarp_eval.scene.file import load_scene
-        from attnwarp_eval.splats.export import export as write_scene
 
         loaded = load_scene(scene)
         with progress() as show:
-            write_scene(
+            attnwarp_eval.splats.export.export(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
                 progress=lambda text: show.step(f"{loaded.name}: {text}"),
             )  # fmt: skip
@@ -116,12 +116,10 @@ def edits(
 
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
-        from attnwarp_eval.truth import edits as known
+        from attnwarp_eval.truth.edits import describe, to_dict
 
         loaded = load_scene(scene)
-        typer.echo(
-            json.dumps(known.to_dict(loaded), indent=2) if as_json else known.describe(loaded)
-        )
+        typer.echo(json.dumps(to_dict(loaded), indent=2) if as_json else describe(loaded))
 
 
 @app.command()
@@ -157,22 +155,21 @@ def effects(
         _effects_of_all(out, prove, budget)
         return
     with clear_errors():
-        from attnwarp_eval.effects import detect as light
-        from attnwarp_eval.effects.proof import prove as hold
+        from attnwarp_eval.effects import detect, proof
         from attnwarp_eval.effects.saving import measure
         from attnwarp_eval.scene.file import load_scene
 
         loaded = load_scene(str(scene))
-        about = light.report(loaded, cost=measure(loaded))
-        proof = hold(loaded, seconds=budget) if prove else None
-    if proof is not None:
-        about["proof"] = proof.to_dict()
-    lines = [json.dumps(about, indent=2)] if as_json else list(light.describe(loaded, about))
-    if proof is not None and not as_json:
-        lines += ["", *proof.lines()]
+        about = detect.report(loaded, cost=measure(loaded))
+        result = proof.prove(loaded, seconds=budget) if prove else None
+    if result is not None:
+        about["proof"] = result.to_dict()
+    lines = [json.dumps(about, indent=2)] if as_json else list(detect.describe(loaded, about))
+    if result is not None and not as_json:
+        lines += ["", *result.lines()]
     typer.echo("\n".join(lines))
-    if proof is not None and proof.verdict != "certified":
-        raise fail(f"{loaded.name}: the plan is not certified: {proof.words}", TOO_LITTLE)
+    if result is not None and result.verdict != "certified":
+        raise fail(f"{loaded.name}: the plan is not certified: {result.words}", TOO_LITTLE)
 
 
 def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
@@ -237,20 +234,19 @@ def flow(
     """How far consistency along optical flow is from that at exact correspondences."""
     with clear_errors():
         from attnwarp.errors import InputError
-        from attnwarp_eval.experiments import flow as study
-        from attnwarp_eval.experiments import flow_report
+        from attnwarp_eval.experiments import flow, flow_report
 
         try:
             angles = [float(yaw) for yaw in names(yaws) or []]
         except ValueError as error:
             raise InputError(f"--yaws: {error}; expected degrees such as 5,20") from None
-        options = study.Options(size, spp, cast(study.Method, method), pictures)
+        options = flow.Options(size, spp, cast(flow.Method, method), pictures)
         with (
             progress(lines=True) as show,
             resumable(lambda: "finished pairs are kept"),
         ):
-            chosen = scenes or list(study.SCENES)
-            rows = list(study.measure(chosen, angles, out, options, progress=show))
+            chosen = scenes or list(flow.SCENES)
+            rows = list(flow.measure(chosen, angles, out, options, progress=show))
         if not rows:
             raise InputError("--yaws: got none, expected degrees such as 5,20")
         typer.echo(flow_report.table(rows))

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 if TYPE_CHECKING:
+    import rich.progress
     from rich.console import Console
-    from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
 
 PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 3, 70, 130, 141
@@ -96,7 +96,9 @@ class Progress:
         console: stderr.
     """
 
-    def __init__(self, console: Console, bar: RichProgress, task: TaskID, lines: bool) -> None:
+    def __init__(
+        self, console: Console, bar: rich.progress.Progress, task: TaskID, lines: bool
+    ) -> None:
         self.console = console
         self._bar = bar
         self._task = task
@@ -132,6 +134,7 @@ def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[
         done: steps finished before.
         lines: without a terminal, print a line for every call.
     """
+    import rich.progress
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -140,7 +143,6 @@ def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
-    from rich.progress import Progress as RichProgress
 
     console = Console(stderr=True)
     columns = (
@@ -151,7 +153,7 @@ def progress(total: int = 0, *, done: int = 0, lines: bool = False) -> Iterator[
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with RichProgress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with rich.progress.Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield Progress(
             console, bar, bar.add_task("starting", total=total or None, completed=done), lines
         )

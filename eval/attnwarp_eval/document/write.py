@@ -15,7 +15,7 @@ from markupsafe import Markup
 from attnwarp_eval.document.model import Report, Table
 
 if TYPE_CHECKING:
-    from rich.table import Table as RichTable
+    import rich.table
 
 _CLASSES = {
     "seen": "holds",
@@ -72,17 +72,17 @@ _TAG = re.compile(r"(`[^`]*`)|<(?=[A-Za-z/!?])")
 """Code, in which nothing is a tag, or the beginning of one."""
 
 
-def terminal(table: Table) -> RichTable:
+def terminal(table: Table) -> rich.table.Table:
     """A table for a terminal; its cells are plain text, without markup.
 
     Example:
         >>> terminal(Table(["variant", "AbsRel"], [["paper", "0.01"]])).row_count
         1
     """
-    from rich.table import Table as RichTable
+    import rich.table
     from rich.text import Text
 
-    grid = RichTable(*table.columns, caption=table.caption or None)
+    grid = rich.table.Table(*table.columns, caption=table.caption or None)
     for row in table.rows:
         grid.add_row(*map(Text, row))
     return grid

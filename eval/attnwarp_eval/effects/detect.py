@@ -136,7 +136,7 @@ def _in_graphs(
         plugins: (path, plugin name) of the graph as parsed.
         objects: (path, object) of the scene as loaded.
     """
-    import mitsuba as mi
+    import mitsuba
 
     evidence_of: dict[Effect, list[str]] = {}
 
@@ -169,9 +169,9 @@ def _in_graphs(
                 else "medium",
                 f"plugin {name} at {path}",
             )
-    F = mi.BSDFFlags
+    F = mitsuba.BSDFFlags
     for path, thing in objects:
-        if isinstance(thing, mi.BSDF):
+        if isinstance(thing, mitsuba.BSDF):
             if thing.class_name() == "Null":
                 continue  # the walls of the fog
             flags = int(thing.flags())
@@ -183,13 +183,13 @@ def _in_graphs(
                 int(F.DeltaTransmission) | int(F.GlossyTransmission) | int(F.DiffuseTransmission)
             ):
                 note("refraction", f"BSDF flag Transmission of {thing.class_name()} at {path}")
-        elif isinstance(thing, mi.Emitter):
+        elif isinstance(thing, mitsuba.Emitter):
             note("direct", f"emitter {thing.class_name()} at {path}")
             note("shadows", f"emitter {thing.class_name()} at {path}")
             if thing.is_environment():
                 note("environment", f"emitter {thing.class_name()} at {path}")
         elif (
-            isinstance(thing, mi.Texture)
+            isinstance(thing, mitsuba.Texture)
             and thing.class_name().startswith("Bitmap")
             and _varies(thing)
         ):
@@ -203,9 +203,9 @@ def _in_graphs(
 
 
 def _varies(texture: Any) -> bool:
-    import mitsuba as mi
+    import mitsuba
 
-    data = np.array(mi.traverse(texture)["data"])
+    data = np.array(mitsuba.traverse(texture)["data"])
     return bool(np.ptp(data.reshape(-1, data.shape[-1]), axis=0).max() > 1e-6)
 
 

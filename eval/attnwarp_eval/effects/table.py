@@ -245,7 +245,7 @@ def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
         f"{variants}. Made by `attnwarp-eval scenes effects --all --prove --out <this folder>`.",
         (
             f"**Beyond the usual**: effects besides {', '.join(USUAL)}. **Proof**: the ladder of"
-            " docs/effects.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
+            " docs/proof.md at 32 x 32 from the source; **bound** is |d| + 2.33 SE of the"
             " picture's mean, which must stay below 1 %; the **smallest difference** that would"
             " have been seen with 80 % chance is a share of the picture's mean, for the picture,"
             " an 8 x 8 block and a pixel."

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,12 +99,14 @@ class Window:
     def show_coloring(self, name: str) -> None:
         """Colour the surface by one of :data:`COLORINGS`."""
         self.coloring = name
-        self._draw_surface()
+        with self._one_render():
+            self._draw_surface()
 
     def pick(self, column: int, row: int) -> PixelReport:
         """Show a target pixel's rays and numbers."""
         self.picked = report(self.pair, column, row)
-        self._draw_picked()
+        with self._one_render():
+            self._draw_picked()
         return self.picked
 
     def look_from_outside(self) -> None:
@@ -212,9 +215,32 @@ class Window:
         pixel = int(mesh.GetPointData().GetArray("pixel").GetValue(index))
         self.pick(pixel % self.pair.truth.label.shape[1], pixel // self.pair.truth.label.shape[1])
 
+    @contextmanager
+    def _one_render(self) -> Iterator[None]:
+        """PyVista renders after every change; what changes inside is rendered once, at the end."""
+        self.plotter.suppress_rendering = True
+        try:
+            yield
+        finally:
+            self.plotter.suppress_rendering = False
+        self.plotter.render()
+
     def _draw(self) -> None:
-        plotter, pair = self.plotter, self.pair
-        for index, (title, image) in enumerate(pair.insets().items()):
+        with self._one_render():
+            self._draw_insets()
+            self.plotter.subplot(MAIN)
+            self._draw_cameras()
+            self._draw_surface()
+            self._optional(
+                "discs", self.splats_shown and self.pair.model is not None, self._add_discs
+            )
+            self._optional("whole surface", self.surface_shown, self._add_whole_surface)
+            self._draw_help()
+            self._draw_picked()
+
+    def _draw_insets(self) -> None:
+        plotter = self.plotter
+        for index, (title, image) in enumerate(self.pair.insets().items()):
             plotter.subplot(index)
             height, width = image.shape[:2]
             plane = scene.picture_plane(
@@ -225,13 +251,10 @@ class Window:
             plotter.view_xy()
             plotter.camera.parallel_projection = True
             plotter.camera.parallel_scale = height / 1.8
-        plotter.subplot(MAIN)
-        self._draw_cameras()
-        self._draw_surface()
-        self._optional("discs", self.splats_shown and pair.model is not None, self._add_discs)
-        self._optional("whole surface", self.surface_shown, self._add_whole_surface)
+
+    def _draw_help(self) -> None:
         help_text = "\n".join(f"{key:>6}  {what}" for key, what in KEYS.items())
-        plotter.add_text(
+        self.plotter.add_text(
             help_text if self.help_shown else "? for keys",
             position="lower_left",
             font_size=8,
@@ -239,7 +262,6 @@ class Window:
             color="black",
             font="courier",
         )
-        self._draw_picked()
 
     def _draw_cameras(self) -> None:
         world = self.pair.world

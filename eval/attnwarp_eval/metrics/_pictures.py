@@ -1,4 +1,4 @@
-"""What may come in as a picture or a mask, and what is said of anything else."""
+"""Validation of pictures and masks."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from attnwarp import check
+from attnwarp_eval.metrics import arrays
 from attnwarp_eval.metrics.arrays import Array, Mask
-from attnwarp_eval.metrics.arrays import mask as checked_mask
 
 
 def picture(
@@ -52,7 +52,7 @@ def region(value: Any, shape: tuple[int, ...], name: str = "mask") -> Mask:
     """``value`` as an (H, W) bool mask of a picture of ``shape``; all True if None."""
     if value is None:
         return np.ones(shape[:2], dtype=bool)
-    return checked_mask(value, shape[:2], name)
+    return arrays.mask(value, shape[:2], name)
 
 
 def pair(

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import reprlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from attnwarp.camera import Camera
 from attnwarp.errors import suggest
 from attnwarp_eval.scene import edits
+from attnwarp_eval.scene.explain import explain
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES
 from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, view_name
 from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec, SkySpec
@@ -100,7 +99,9 @@ def _read(path: Path) -> Scene:
         first = problems[0]
         more = f" (and {len(problems) - 1} more below it)" if len(problems) > 1 else ""
         loc = (*first["loc"], "type") if first["type"] == "union_tag_invalid" else first["loc"]
-        raise SceneError(_explain(first) + more, path, _line(root, loc)) from error
+        raise SceneError(
+            explain(first, SceneSpec, "docs/scenes.md") + more, path, _line(root, loc)
+        ) from error
     scene = Scene(spec, path)
     _check(scene, root)
     return scene
@@ -123,71 +124,6 @@ def _line(node: yaml.Node, loc: Sequence[int | str]) -> int:
             node = node.value[step]
             line = node.start_mark.line + 1
     return line
-
-
-def _explain(problem: Any) -> str:
-    place, _ = _follow(problem["loc"])
-    kind, came = problem["type"], problem.get("input")
-    if kind == "extra_forbidden":
-        _, owner = _follow(problem["loc"][:-1])
-        allowed = list(owner.model_fields) if owner else []
-        key = str(problem["loc"][-1])
-        return (
-            f"{place}: unknown key {key!r}{suggest(key, allowed)}; allowed here:"
-            f" {', '.join(allowed)}"
-        )
-    if kind == "missing":
-        return f"{place}: is missing; add it (docs/scenes.md says what each key means)"
-    if kind == "union_tag_invalid":
-        came, allowed = (
-            problem["ctx"]["tag"],
-            [tag.strip("' ") for tag in problem["ctx"]["expected_tags"].split(",")],
-        )
-        return (
-            f"{place}.type: got {came!r}{suggest(came, allowed)}; expected one of"
-            f" {', '.join(allowed)}"
-        )
-    if kind == "union_tag_not_found":
-        return f"{place}: says no type; add 'type: ...' (docs/shapes.md lists the types)"
-    message = problem["msg"].removeprefix("Value error, ")
-    if not message.startswith("got "):
-        message = f"got {reprlib.repr(came)}, but {message[0].lower() + message[1:]}"
-    return f"{place or 'the file'}: {message}"
-
-
-def _follow(loc: Sequence[int | str]) -> tuple[str, type[BaseModel] | None]:
-    """A pydantic location as a person would write it, and the model at its end.
-
-    Unions put the tag of the member they chose into the location; it picks the model and is left
-    out of the path.
-    """
-    place = ""
-    annotation: Any = SceneSpec
-    for step in loc:
-        if isinstance(step, int):
-            place += f"[{step}]"
-            continue
-        models = _models(annotation)
-        tagged = [
-            m
-            for m in models
-            if len(models) > 1 and step in get_args(m.model_fields["type"].annotation)
-        ]
-        if tagged:
-            annotation = tagged[0]
-            continue
-        place += f".{step}" if place else step
-        annotation = next(
-            (m.model_fields[step].annotation for m in models if step in m.model_fields), None
-        )
-    models = _models(annotation)
-    return place, models[0] if len(models) == 1 else None
-
-
-def _models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in get_args(annotation) for model in _models(part)]
 
 
 def _check(scene: Scene, root: yaml.Node) -> None:

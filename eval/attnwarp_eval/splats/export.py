@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.fit.views import HELD_OUT_EVERY
 from attnwarp.gaussians import SH_C0
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.scene import Scene, SceneError
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 Progress = Callable[[str], object]
-
-HELD_OUT_EVERY = 8
-"""One view in so many is held out from the fit, as in LLFF and the papers since."""
 
 SKY_SHARE = 0.1
 """Share of the first points that stand for the sky, where a scene has one."""

@@ -9,14 +9,12 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
+from attnwarp_eval.scene.explain import explain as explain_problem
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import YamlError, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
 from attnwarp_eval.study.parts import (
-    Ablation,
     Front,
-    Part,
-    Pictures,
     Splats,
     Study,
     StudyError,
@@ -25,6 +23,9 @@ from attnwarp_eval.study.parts import (
 )
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Probe
+
+KEYS = "study/shipped/quick.yaml"
+"""File of this package that shows the keys of a study, for messages."""
 
 
 class _Joined(Study):
@@ -59,13 +60,13 @@ class _Joined(Study):
             self.check_variants(variants, f"probes.{name}")
         tabled = [name for name, p in available.items() if p.columns]
         for i, ablation in enumerate(self.ablations):
-            _check_probe(ablation.probe, tabled, f"ablations.{i}.probe")
+            _check_probe(ablation.probe, tabled, f"ablations[{i}].probe")
             names = [ablation.baseline, *ablation.variants]
-            self.check_variants(names, f"ablations.{i}", ablation.probe)
+            self.check_variants(names, f"ablations[{i}]", ablation.probe)
         for i, front in enumerate(self.fronts):
-            _check_probe(front.probe, tabled, f"fronts.{i}.probe")
-            self.check_variants(front.variants, f"fronts.{i}", front.probe)
-            _check_metric(front, available[front.probe], f"fronts.{i}.metric")
+            _check_probe(front.probe, tabled, f"fronts[{i}].probe")
+            self.check_variants(front.variants, f"fronts[{i}]", front.probe)
+            _check_metric(front, available[front.probe], f"fronts[{i}].metric")
         self.check_variants(self.pictures.variants, "pictures.variants")
         for p in available.values():
             p.check(self)
@@ -251,37 +252,12 @@ def is_scene_file(name: Any) -> bool:
 
 
 def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
-    """Pydantic's errors in one readable text: the key, what was wrong, and the nearest real key.
+    """Pydantic's errors in one readable text: each key, what came, and what was expected.
 
     Args:
         error: of a study, or
         model: of this part.
     """
     model = model or _models(tuple(probes()))[0]
-    lines = []
-    for item in error.errors():
-        key = ".".join(str(p) for p in item["loc"])
-        message = str(item["msg"]).removeprefix("Value error, ")
-        if item["type"] == "extra_forbidden":
-            keys = _keys_at(model, item["loc"])
-            message = f"unknown key{did_you_mean(str(item['loc'][-1]), keys)}"
-        lines.append(f"{key}: {message}" if key else message)
-    return "; ".join(lines)
-
-
-def _keys_at(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """Keys that are allowed where an unknown one stands."""
-    inner: dict[str, type[BaseModel]] = {
-        "splats": Splats,
-        "variants": _models(tuple(probes()))[1],
-        "ablations": Ablation,
-        "fronts": Front,
-        "pictures": Pictures,
-    }
-    for p in probes():
-        for key, field in p.study_part.model_fields.items() if p.study_part else ():
-            if isinstance(field.annotation, type) and issubclass(field.annotation, Part):
-                inner[key] = field.annotation
-    if len(location) > 1:
-        model = inner.get(str(location[0]), model)
-    return list(model.model_fields)
+    problems = error.errors(include_url=False)
+    return "; ".join(explain_problem(problem, model, KEYS) for problem in problems)

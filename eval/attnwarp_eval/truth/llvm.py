@@ -45,16 +45,16 @@ try:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 except Exception:
     pass
-import mitsuba as mi
+import mitsuba
 import numpy as np
-mi.set_variant("llvm_ad_rgb")
-pose = mi.ScalarTransform4f().look_at(origin=[0, 0, -4], target=[0, 0, 0], up=[0, 1, 0])
-scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3},
+mitsuba.set_variant("llvm_ad_rgb")
+pose = mitsuba.ScalarTransform4f().look_at(origin=[0, 0, -4], target=[0, 0, 0], up=[0, 1, 0])
+scene = mitsuba.load_dict({"type": "scene", "integrator": {"type": "path", "max_depth": 3},
     "ball": {"type": "sphere", "bsdf": {
         "type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
     "sky": {"type": "constant"}, "camera": {"type": "perspective", "fov": 10, "to_world": pose,
     "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}}})
-mean = float(np.array(mi.render(scene, spp=64))[..., :3].mean())
+mean = float(np.array(mitsuba.render(scene, spp=64))[..., :3].mean())
 print("works" if 0.45 < mean < 0.55 else f"wrong picture: {mean}")
 """
 """A white-lit ball of albedo 0.5 fills the picture: its radiance is 0.5 everywhere."""

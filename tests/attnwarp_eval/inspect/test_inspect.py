@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from attnwarp_eval.inspect import subject
 from attnwarp_eval.inspect.pair import COLORINGS, Pair
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.window import MAIN, Window
+from attnwarp_eval.study.parts import Splats
 from attnwarp_eval.twoview import HIDDEN, VISIBLE
 
 SIZE = 64
@@ -37,12 +39,17 @@ def pair(chosen) -> Pair:
 
 @pytest.fixture(scope="module")
 def window(chosen):
-    shown = Window(
-        chosen.pair, list(chosen.variants), list(chosen.targets), target="yaw060",
+    # Without a graphics card, the 40,000 discs of a study take seconds a picture.
+    splats = Splats(count=1000, position_noise=0.1, normal_noise=3.0)
+    few = replace(
+        chosen, variants={name: (variant, splats) for name, (variant, _) in chosen.variants.items()}
+    )
+    opened = Window(
+        few.pair, list(few.variants), list(few.targets), target="yaw060",
         off_screen=True, size=(900, 600),
     )  # fmt: skip
-    yield shown
-    shown.plotter.close()
+    yield opened
+    opened.plotter.close()
 
 
 def pixels(seed: int, count: int = 50) -> np.ndarray:

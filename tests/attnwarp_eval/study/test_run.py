@@ -1,5 +1,5 @@
-"""The run as a user meets it: the command line in processes of its own, on a small study of real
-cells.
+"""The run as a user meets it: its commands, on a small study of real cells. Commands run in processes
+of their own where a process is killed or starts others.
 
 Oracles: the file system (which cells were there before), byte equality of reports, exit codes.
 """
@@ -15,8 +15,13 @@ import sys
 import time
 
 import pytest
+import torch
 import yaml
+from typer.testing import CliRunner
 
+from attnwarp.render.threads import set_thread_count
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.cost import environment
 from attnwarp_eval.study.store import Store
 
 SMALL = {
@@ -56,35 +61,38 @@ SMALL = {
 }
 CELLS = 7
 
-# A commit made while the tests run would change the revision that reports name.
-WITHOUT_GIT = {**os.environ, "GIT_DIR": "/nonexistent"}
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
+    """The working folder of the commands."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "study.yaml").write_text(yaml.safe_dump(SMALL))
-    return folder
+    threads = torch.get_num_threads()
+    environment.cache_clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        # A commit made while the tests run would change the revision that reports name.
+        patch.setenv("GIT_DIR", "/nonexistent")
+        yield folder
+    environment.cache_clear()
+    torch.set_num_threads(threads)
+    set_thread_count(None)
 
 
-def command(*arguments):
-    return [sys.executable, "-m", "attnwarp_eval.cli.main", *map(str, arguments)]
+def call(*arguments):
+    """A command in this process, as starting one costs seconds of imports."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def call(folder, *arguments):
-    return subprocess.run(
-        command(*arguments),
-        cwd=folder,
-        env=WITHOUT_GIT,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
+def start(*arguments, **options):
+    """A command in a process of its own."""
+    command = [sys.executable, "-m", "attnwarp_eval.cli.main", *map(str, arguments)]
+    return subprocess.Popen(command, text=True, **options)
 
 
-def without_timings(run, folder):
-    done = call(folder, "report", run, "--no-timings")
-    assert done.returncode == 0, done.stderr
+def without_timings(run):
+    done = call("report", run, "--no-timings")
+    assert done.exit_code == 0, done.stderr
     return {
         name: (run / name).read_bytes() for name in ("report.md", "report.html", "results.jsonl")
     }
@@ -93,14 +101,22 @@ def without_timings(run, folder):
 @pytest.fixture(scope="module")
 def finished(folder):
     """A run that was never disturbed."""
-    done = call(folder, "run", "study.yaml", "--out", "undisturbed")
-    assert done.returncode == 0, done.stderr
+    done = call("run", "study.yaml", "--out", "undisturbed")
+    assert done.exit_code == 0, done.stderr
     assert done.stderr.count("\n[") == CELLS
     return folder / "undisturbed"
 
 
+@pytest.fixture(scope="module")
+def undisturbed(finished, tmp_path_factory):
+    """The report of that run, without seconds."""
+    run = tmp_path_factory.mktemp("reports") / "undisturbed"
+    shutil.copytree(finished, run)
+    return without_timings(run)
+
+
 def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finished, folder):
-    assert call(folder, "verify", "undisturbed").returncode == 0
+    assert call("verify", "undisturbed").exit_code == 0
     page = (finished / "report.html").read_text()
     assert "data:image/jpeg;base64," in page
     assert "data:image/svg+xml;base64," in page
@@ -111,18 +127,18 @@ def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finishe
     assert {line["probe"] for line in lines} == {"calibration", "depth", "warp"}
 
 
-def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, folder):
+def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, undisturbed, folder):
     run = folder / "damaged"
     shutil.copytree(finished, run)
     victim = next(p for p in (run / "cells").iterdir() if '"depth"' in p.read_text())
     victim.write_bytes(victim.read_bytes()[:100])
-    assert call(folder, "verify", run).returncode == 3
-    assert call(folder, "report", run).returncode == 0
+    assert call("verify", run).exit_code == 3
+    assert call("report", run).exit_code == 0
     assert "not JSON" in (run / "report.md").read_text()
-    mended = call(folder, "run", "study.yaml", "--out", run)
-    assert mended.returncode == 0, mended.stderr
+    mended = call("run", "study.yaml", "--out", run)
+    assert mended.exit_code == 0, mended.stderr
     assert f"{CELLS - 1} already done" in mended.stderr
-    assert without_timings(run, folder) == without_timings(finished, folder)
+    assert without_timings(run) == undisturbed
 
 
 def test_a_damaged_picture_is_refused_by_name_and_made_anew(finished, folder):
@@ -131,45 +147,39 @@ def test_a_damaged_picture_is_refused_by_name_and_made_anew(finished, folder):
     victim = sorted((run / "pictures").rglob("*.jpg"))[0]
     whole = victim.read_bytes()
     victim.write_bytes(whole[:-40] + bytes(40))
-    checked = call(folder, "verify", run)
-    assert checked.returncode == 3
+    checked = call("verify", run)
+    assert checked.exit_code == 3
     assert f"{victim}: changed since it was written; run again with --out {run}" in checked.stdout
-    refused = call(folder, "report", run)
-    assert refused.returncode == 2
+    refused = call("report", run)
+    assert refused.exit_code == 2
     assert f"{victim}: changed since" in refused.stderr and refused.stderr.count("\n") == 1
-    assert call(folder, "report", run, "--no-pictures").returncode == 0
-    mended = call(folder, "run", "study.yaml", "--out", run)
-    assert mended.returncode == 0, mended.stderr
+    assert call("report", run, "--no-pictures").exit_code == 0
+    mended = call("run", "study.yaml", "--out", run)
+    assert mended.exit_code == 0, mended.stderr
     assert f"{CELLS - 1} already done" in mended.stderr
     assert victim.read_bytes() == whole
-    assert call(folder, "verify", run).returncode == 0
+    assert call("verify", run).exit_code == 0
 
 
 def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     # On a busy machine the run may be over before the signal is sent: then once more.
     for attempt in range(5):
         run = folder / f"interrupted{attempt}"
-        arguments = command("run", "study.yaml", "--out", run)
         # A background job of a shell ignores the signal, and so would what it starts.
         listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-        process = subprocess.Popen(
-            arguments,
-            cwd=folder,
-            env=WITHOUT_GIT,
-            stderr=subprocess.PIPE,
-            text=True,
-            preexec_fn=listening,
+        process = start(
+            "run", "study.yaml", "--out", run, stderr=subprocess.PIPE, preexec_fn=listening
         )
         deadline = time.monotonic() + 300
         while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=60)[1]
+        message = process.communicate(timeout=60)[1]
         if process.returncode != 0:
             break
     assert process.returncode == 130
-    assert "the same command goes on from here" in said
-    assert "Traceback" not in said
+    assert "the same command goes on from here" in message
+    assert "Traceback" not in message
 
 
 def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, folder):
@@ -179,8 +189,8 @@ def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, fo
     record = next(r for r in map(store.read, store.done()) if r["spec"]["probe"] == "calibration")
     record["views"][0]["metrics"]["warp.epe_median"] = 0.5
     store.write({k: v for k, v in record.items() if k != "sha256"})
-    done = call(folder, "run", "study.yaml", "--out", run)
-    assert done.returncode == 3
+    done = call("run", "study.yaml", "--out", run)
+    assert done.exit_code == 3
     assert "not calibrated" in done.stderr
     assert "FAILED" in (run / "report.md").read_text()
 
@@ -199,14 +209,9 @@ def test_the_instrument_is_calibrated_in_every_run(finished):
     assert cell["views"][0]["metrics"]["occlusion.f1.exact"] == 1
 
 
-def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder):
+def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, folder):
     run = folder / "killed"
-    process = subprocess.Popen(
-        command("run", "study.yaml", "--out", run),
-        cwd=folder,
-        env=WITHOUT_GIT,
-        stderr=subprocess.DEVNULL,
-    )
+    process = start("run", "study.yaml", "--out", run, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
     while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -214,21 +219,22 @@ def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(finished, folder
     process.wait()
     before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").glob("*.json")}
     assert 2 <= len(before) < CELLS
-    partial = call(folder, "verify", run)
-    assert partial.returncode == 3
+    partial = call("verify", run)
+    assert partial.exit_code == 3
     assert "missing" in partial.stdout
-    again = call(folder, "run", "study.yaml", "--out", run)
-    assert again.returncode == 0, again.stderr
+    again = call("run", "study.yaml", "--out", run)
+    assert again.exit_code == 0, again.stderr
     assert f"{len(before)} already done" in again.stderr
     assert {name: (run / "cells" / name).stat().st_mtime_ns for name in before} == before
-    assert without_timings(run, folder) == without_timings(finished, folder)
+    assert without_timings(run) == undisturbed
 
 
-def test_two_workers_give_the_same_numbers_as_one_process(finished, folder):
+def test_two_workers_give_the_same_numbers_as_one_process(undisturbed, folder):
     run = folder / "parallel"
-    done = call(folder, "run", "study.yaml", "--out", run, "--jobs", "2")
-    assert done.returncode == 0, done.stderr
-    assert without_timings(run, folder) == without_timings(finished, folder)
+    process = start("run", "study.yaml", "--out", run, "--jobs", "2", stderr=subprocess.PIPE)
+    message = process.communicate(timeout=600)[1]
+    assert process.returncode == 0, message
+    assert without_timings(run) == undisturbed
 
 
 def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
@@ -237,27 +243,26 @@ def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
     # A file where the pictures' folder should be: the three cells that keep pictures fail, as on a
     # full disk.
     (run / "pictures").write_text("in the way")
-    done = call(folder, "run", "study.yaml", "--out", run)
-    assert done.returncode == 3
+    done = call("run", "study.yaml", "--out", run)
+    assert done.exit_code == 3
     assert "failed cells" in done.stderr
     assert len(list((run / "cells").iterdir())) == CELLS - 3
     assert len(list((run / "failed").iterdir())) == 3
     assert "Failed cells" in (run / "report.md").read_text()
-    assert call(folder, "verify", run).returncode == 3
-    stopped = call(folder, "run", "study.yaml", "--out", run, "--fail-fast")
-    assert stopped.returncode == 3
+    assert call("verify", run).exit_code == 3
+    stopped = call("run", "study.yaml", "--out", run, "--fail-fast")
+    assert stopped.exit_code == 3
     (run / "pictures").unlink()
-    mended = call(folder, "run", "study.yaml", "--out", run)
-    assert mended.returncode == 0, mended.stderr
+    mended = call("run", "study.yaml", "--out", run)
+    assert mended.exit_code == 0, mended.stderr
     assert "4 already done" in mended.stderr
-    assert call(folder, "verify", run).returncode == 0
+    assert call("verify", run).exit_code == 0
 
 
 @pytest.mark.slow
-def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, folder):
+def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(undisturbed, folder):
     run = folder / "bereft"
-    arguments = command("run", "study.yaml", "--out", run, "--jobs", "2")
-    process = subprocess.Popen(arguments, cwd=folder, env=WITHOUT_GIT, stderr=subprocess.DEVNULL)
+    process = start("run", "study.yaml", "--out", run, "--jobs", "2", stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
     while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -269,7 +274,7 @@ def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(finished, fo
     assert workers
     os.kill(workers[0], signal.SIGKILL)
     assert process.wait(300) == 0
-    assert without_timings(run, folder) == without_timings(finished, folder)
+    assert without_timings(run) == undisturbed
 
 
 def children(pid):
@@ -295,8 +300,8 @@ def children(pid):
     ],
 )
 def test_bad_input_gets_a_clear_line_and_exit_code_2(folder, arguments, message):
-    done = call(folder, *arguments)
-    assert done.returncode == 2
+    done = call(*arguments)
+    assert done.exit_code == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr
 
@@ -327,22 +332,24 @@ def test_help_imports_nothing_heavy():
     }
 
 
-def test_one_broken_scene_does_not_hide_the_others(tmp_path):
+def test_one_broken_scene_does_not_hide_the_others(tmp_path, monkeypatch):
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "aaa.yaml").write_text("nam: x\n")
-    done = call(tmp_path, "scenes", "list")
-    assert done.returncode == 2
+    monkeypatch.chdir(tmp_path)
+    done = call("scenes", "list")
+    assert done.exit_code == 2
     assert "bear " in done.stdout
     assert "aaa.yaml" in done.stderr
 
 
-def test_a_view_whose_name_would_leave_the_folder_is_refused(tmp_path):
+def test_a_view_whose_name_would_leave_the_folder_is_refused(tmp_path, monkeypatch):
     shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
     text = shipped.read_text().replace(
         "{yaw: 10, height: 1.9}", "{name: ../../evil, yaw: 10, height: 1.9}"
     )
     (tmp_path / "evil.yaml").write_text(text)
-    done = call(tmp_path, "scenes", "render", "evil.yaml", "--out", "out")
-    assert done.returncode == 2
+    monkeypatch.chdir(tmp_path)
+    done = call("scenes", "render", "evil.yaml", "--out", "out")
+    assert done.exit_code == 2
     assert "../../evil" in done.stderr
     assert not (tmp_path / "out").exists()

@@ -75,8 +75,8 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sizes": 64}, "sizes: unknown key; did you mean 'size'"),
-        ({"size": "large"}, "size: .*integer"),
+        ({"sizes": 64}, "sizes: unknown key 'sizes'; did you mean 'size'"),
+        ({"size": "large"}, "size: got 'large', but .*integer"),
         ({"scenes": []}, "scenes: .*at least 1"),
         ({"probes": {"warp": ["corected"]}}, "no variant 'corected'; did you mean 'corrected'"),
         ({"variants": {"corrected": {"preset": "correct"}}}, "did you mean 'corrected'"),

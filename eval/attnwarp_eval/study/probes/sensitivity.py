@@ -24,8 +24,8 @@ from attnwarp_eval.cost import in_turn
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics import registry
 from attnwarp_eval.metrics.arrays import Array
-from attnwarp_eval.metrics.registry import metric as metric_of
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.cell import Cell
@@ -461,7 +461,7 @@ def beats(key: str, right: float, flawed: float) -> float:
     """
     if not (math.isfinite(right) and math.isfinite(flawed)):
         return math.nan
-    specification = metric_of(key)
+    specification = registry.metric(key)
     gain = flawed - right if specification.direction == "lower" else right - flawed
     if abs(gain) <= specification.atol + specification.rtol * max(abs(right), abs(flawed)):
         return 0.5
@@ -495,7 +495,7 @@ def curve(values: Values, key: str) -> tuple[float, float]:
     if len(pairs) < 3:
         return math.nan, math.nan
     strengths, measured = np.array(pairs).T
-    sign = -1 if metric_of(key).direction == "lower" else 1
+    sign = -1 if registry.metric(key).direction == "lower" else 1
     rises = [beats(key, high, low) == 1 for low, high in itertools.pairwise(measured)]
     if np.ptp(measured) == 0:
         return 0.0, 0.0
@@ -590,10 +590,12 @@ def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
     lines = -(-len(drawn) // columns)
     with charts.drawing(path, columns, 1.9 * lines, rows=lines, width=3.0 * columns) as axes:
         for panel, (row, means) in zip(axes, drawn, strict=False):
-            unit = metric_of(row.key).unit
+            unit = registry.metric(row.key).unit
             line = charts.Line(row.title, STRENGTHS, means)
             better = (
-                "less is better" if metric_of(row.key).direction == "lower" else "more is better"
+                "less is better"
+                if registry.metric(row.key).direction == "lower"
+                else "more is better"
             )
             label = row.title.replace("PSNR", "MSE")
             charts.lines(

@@ -97,7 +97,10 @@ def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path
     ("changes", "message"),
     [
         ({"camera_unit": -1.0}, "camera_unit: expected a positive number"),
-        ({"camera_units": 1.0}, "camera_units: unknown key; did you mean 'camera_unit'"),
+        (
+            {"camera_units": 1.0},
+            "camera_units: unknown key 'camera_units'; did you mean 'camera_unit'",
+        ),
         ({"variants": {"plain": {"stretch": 0}}}, "variants.plain.stretch: .*greater than 0"),
         ({"probes": {"chor": []}}, "probes: no probe 'chor'; did you mean 'chord'"),
     ],
