@@ -418,6 +418,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     from dataclasses import asdict
 
     from attnwarp.io.file import write_atomically
+    from attnwarp.io.names import file_stems
 
     lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
     settings = json.dumps(
@@ -438,7 +439,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     white = result.settings.background == "white"
     background = torch.full((3,), 1.0 if white else 0.0)
     for index, (camera, name) in enumerate(
-        zip(held_out.cameras, _file_names(held_out.cameras), strict=True)
+        zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
     ):
         color = render(result.gaussians, camera, background=background, near=near).color.clamp(0, 1)
         both = torch.cat([held_out.target(index, background), color], dim=1)
@@ -489,6 +490,7 @@ def render(
         _check_out(out)
 
         from attnwarp.io.file import write_atomically
+        from attnwarp.io.names import file_stems
         from attnwarp.render import render as draw
 
         _use_threads(threads)
@@ -503,7 +505,7 @@ def render(
             points=False,
         ).cameras
         out.mkdir(parents=True, exist_ok=True)
-        for camera, name in zip(views, _file_names(views), strict=True):
+        for camera, name in zip(views, file_stems(views), strict=True):
             if size is not None:
                 factor = size / max(camera.width, camera.height)
                 camera = camera.resize(
@@ -632,15 +634,6 @@ def _color(text: str) -> list[float]:
             " 0.2,0.5,1"
         )
     return values
-
-
-def _file_names(cameras: Any) -> list[str]:
-    """A file name a camera: the last part of its own, numbered where two would be the same."""
-    stems = [Path(camera.name).stem or "view" for camera in cameras]
-    return [
-        stem if stems.count(stem) == 1 else f"{index:04d}-{stem}"
-        for index, stem in enumerate(stems)
-    ]
 
 
 def _write_image(path: Path, rgb: Any) -> None:
