@@ -83,6 +83,8 @@ class PropagateSettings:
             source at every tenth step; of 40 views 4 are then never visited (the released code).
         l1, perceptual, normal, distortion: weights of the losses.
         perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
+        color_rate: factor of the published learning rates of colours. Adam moves a coefficient by
+            at most its rate in a step: at 1, 900 steps change a colour by at most 0.63.
         geometry_rate: factor of the learning rates of centres, scales, rotations and opacities; 0
             tunes colours alone.
         background: behind the splats while tuning.
@@ -135,6 +137,7 @@ class PropagateSettings:
     normal: float = 0.05
     distortion: float = 0.01
     perceptual_encoder: str = "perceptual-small"
+    color_rate: float = 4.0
     geometry_rate: float = 1.0
     background: Background = "black"
     detail: Detail = "change"
@@ -210,6 +213,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "perceptual": (0, math.inf),
     "normal": (0, math.inf),
     "distortion": (0, math.inf),
+    "color_rate": (0, math.inf),
     "geometry_rate": (0, math.inf),
 }
 
@@ -242,6 +246,7 @@ _RELEASED = PropagateSettings(
     depth_from="current",
     composite_blur=1.5,
     training="modulo",
+    color_rate=1.0,
     background="random",
     psnr_views="before_last_stage",
 )
@@ -253,6 +258,7 @@ PRESETS: dict[str, PropagateSettings] = {
         depth_from="current",
         composite="black",
         training="stage",
+        color_rate=1.0,
     ),
     "released": _RELEASED,
     "released-controlnet": replace(
@@ -277,7 +283,7 @@ the stage's views, segments blurred with sigma 1.5. ``released-controlnet``: the
 ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and the targets 12.5.
 
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
-tunes on everything edited so far.
+tunes on everything edited so far, with larger steps of the colours.
 """
 
 

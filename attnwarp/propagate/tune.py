@@ -77,13 +77,15 @@ class Tuning:
     ) -> None:
         self.settings, self.stages, self.backend = settings, stages, backend
         rates = FitSettings(kind=start.kind)
-        g = settings.geometry_rate
+        c, g = settings.color_rate, settings.geometry_rate
         self.fit = FitSettings(
             kind=start.kind,
             sh_degree=start.sh_degree,
             antialiased=start.antialiased,
             lr_means=g * rates.lr_means,
             lr_means_final=g * rates.lr_means_final,
+            lr_dc=c * rates.lr_dc,
+            lr_rest=c * rates.lr_rest,
             lr_opacity=g * rates.lr_opacity,
             lr_scales=g * rates.lr_scales,
             lr_quats=g * rates.lr_quats,

@@ -24,12 +24,11 @@ def splats(count=60, seed=0):
 
 
 def cameras(count=5, size=SIZE):
+    view = {"width": size, "height": size, "fov_y": 40, "up": (0, 1, 0)}
+    steps = [k - count // 2 for k in range(count)]
     return [
-        Camera.look_at(
-            (0.4 * (k - count // 2), 0, 3), (0.2 * (k - count // 2), 0, 0), width=size, height=size, fov_y=40,
-            up=(0, 1, 0), name=f"v{k}.png",
-        )  # fmt: skip
-        for k in range(count)
+        Camera.look_at((0.4 * step, 0, 3), (0.2 * step, 0, 0), name=f"v{k}.png", **view)
+        for k, step in enumerate(steps)
     ]
 
 

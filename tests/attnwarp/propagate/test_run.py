@@ -328,7 +328,7 @@ def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
 
 
 def test_segments_leave_the_original_or_black_outside(scene, editor):
-    model, views, images = scene
+    images = scene[2]
     left = np.zeros((32, 32), dtype=bool)
     left[:, :16] = True
     settings = replace(QUICK, iterations=0)

@@ -21,6 +21,7 @@ TABLE = {
     "composite": ("black", "original", "original"),
     "composite_blur": (0.0, 1.5, 0.0),
     "psnr_views": ("all", "before_last_stage", "all"),
+    "color_rate": (1.0, 1.0, 4.0),
     "background": ("black", "random", "black"),
 }
 

@@ -52,7 +52,7 @@ def test_tuning_recolours_the_scene_to_its_pictures():
         TrainingView(k, camera, picture)
         for k, (camera, picture) in enumerate(zip(views, pictures(goal, views), strict=True))
     ]
-    tuning = Tuning(start, views, replace(SETTINGS, iterations=150), 1)
+    tuning = Tuning(start, views, replace(SETTINGS, iterations=250, color_rate=20.0), 1)
 
     def error():
         return sum(
@@ -61,10 +61,10 @@ def test_tuning_recolours_the_scene_to_its_pictures():
         )  # fmt: skip
 
     before = error()
-    for _ in range(150):
+    for _ in range(250):
         tuning._iterate(0, training, training[0])
     assert error() < 0.3 * before
-    assert sum(tuning.visits.values()) == 150
+    assert sum(tuning.visits.values()) == 250
 
 
 def test_without_a_geometry_rate_only_colours_move():
