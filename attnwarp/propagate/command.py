@@ -143,12 +143,12 @@ def _fitted(
 
 
 def _view_of(cameras: Any, name: str | None) -> int:
-    """The number of a view by its name, its file's name without suffix, or its number."""
+    """The number of a view by its name, its file's name with or without suffix, or its number."""
     if name is None:
         return 0
     names = [camera.name for camera in cameras]
-    stems = [Path(each).stem for each in names]
-    for candidates in (names, stems):
+    files, stems = ([getattr(Path(each), part) for each in names] for part in ("name", "stem"))
+    for candidates in (names, files, stems):
         if candidates.count(name) == 1:
             return candidates.index(name)
     if name.isdigit() and int(name) < len(names):
