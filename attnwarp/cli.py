@@ -37,8 +37,8 @@ CLOSED_PIPE = 141
 app = typer.Typer(
     name="attnwarp",
     help=(
-        "Gaussian splats for consistent 3D scene editing: fit them to pictures, render and convert"
-        " them."
+        "Gaussian splats for consistent 3D scene editing: fit them to pictures, edit, render and"
+        " convert them."
     ),
     epilog=(
         "Exit codes: 0 done, 2 wrong usage or input, 130 stopped by Ctrl-C or kill with everything"
@@ -69,6 +69,23 @@ class MissingImages(StrEnum):
 
     error = "error"
     none = "none"
+
+
+class Preset(StrEnum):
+    """What a person may type for the choices of an edit."""
+
+    corrected = "corrected"
+    paper = "paper"
+    released = "released"
+    released_controlnet = "released-controlnet"
+
+
+class Store(StrEnum):
+    """What a person may type for the place of recorded features."""
+
+    cpu = "cpu"
+    device = "device"
+    disk = "disk"
 
 
 class Coordinates(StrEnum):
@@ -375,15 +392,25 @@ def _read_views(path: Path, **options: Any) -> Dataset:
     return read_dataset(path, **options)
 
 
-def _assignments(changes: list[str]) -> dict[str, Any]:
-    """NAME=VALUE with JSON values; a bare word is text."""
+_FIT_OPTIONS = {
+    name: f"--{name.replace('_', '-')}" for name in ("kind", "seed", "iterations", "max_splats")
+}
+
+
+def _assignments(changes: list[str], options: dict[str, str] = _FIT_OPTIONS) -> dict[str, Any]:
+    """NAME=VALUE with JSON values; a bare word is text.
+
+    Args:
+        changes: as typed.
+        options: names that have an option of their own, and that option.
+    """
     values: dict[str, Any] = {}
     for change in changes:
         name, equals, text = change.partition("=")
         if not equals or not name:
             raise ValueError(f"--set: got {change!r}, expected NAME=VALUE such as --set ssim=0.3")
-        if name in ("kind", "seed", "iterations", "max_splats"):
-            raise ValueError(f"--set: {name} has an option of its own, --{name.replace('_', '-')}")
+        if name in options:
+            raise ValueError(f"--set: {name} has an option of its own, {options[name]}")
         try:
             values[name] = json.loads(text)
         except (ValueError, RecursionError):
@@ -418,6 +445,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     from dataclasses import asdict
 
     from attnwarp.io.file import write_atomically
+    from attnwarp.io.names import file_stems
 
     lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
     settings = json.dumps(
@@ -438,7 +466,7 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
     white = result.settings.background == "white"
     background = torch.full((3,), 1.0 if white else 0.0)
     for index, (camera, name) in enumerate(
-        zip(held_out.cameras, _file_names(held_out.cameras), strict=True)
+        zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
     ):
         color = render(result.gaussians, camera, background=background, near=near).color.clamp(0, 1)
         both = torch.cat([held_out.target(index, background), color], dim=1)
@@ -447,6 +475,114 @@ def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
 
 def _near(settings: FitSettings, extent: float) -> float:
     return settings.near * extent
+
+
+@app.command()
+def edit(
+    data: Annotated[
+        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+    ],
+    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    out: Annotated[Path, typer.Option(help="Folder for the result; an edit in it is resumed.")],
+    ply: Annotated[
+        Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
+    ] = None,
+    editor: Annotated[
+        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
+    ] = "small-plain",
+    preset: Annotated[
+        Preset, typer.Option(help="The method's choices; see docs/editing-a-scene.md.")
+    ] = Preset.corrected,
+    source: Annotated[
+        str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
+    ] = None,
+    source_picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The source view, edited elsewhere.")
+    ] = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
+    ] = None,
+    stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
+    views_per_stage: Annotated[
+        int | None, typer.Option(min=1, help="New views a stage edits.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of denoising (20).")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=0, help="Of tuning, in each stage (300).")
+    ] = None,
+    size: Annotated[
+        int | None,
+        typer.Option(min=16, help="Longest side in px to edit at; the editor's own if left out."),
+    ] = None,
+    alone: Annotated[
+        bool, typer.Option("--each-view-alone", help="Edit view by view, for comparison.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything random (0).")] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the preset."),
+    ] = None,
+    fit_iterations: Annotated[
+        int, typer.Option(min=1, help="Of the fit, where no PLY is given.")
+    ] = 3000,
+    kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids, for the fit.")] = Kind.two,
+    max_splats: Annotated[
+        int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
+    ] = None,
+    max_size: Annotated[
+        int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
+    ] = None,
+    store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
+    device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
+    ] = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Edit a scene: one view by an instruction, the others along with it, the splats on all."""
+    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+        options: dict[str, Any] = {
+            "stages": stages, "views_per_stage": views_per_stage, "steps": steps,
+            "iterations": iterations, "size": size, "seed": seed,
+            "method": "each view alone" if alone else None,
+        }  # fmt: skip
+        changes = {name: value for name, value in options.items() if value is not None}
+        flags = {name: f"--{name.replace('_', '-')}" for name in options}
+        changes |= _assignments(change or [], {**flags, "method": "--each-view-alone"})
+        _check_out(out)
+
+        from attnwarp.propagate.settings import preset as choices
+
+        settings = choices(preset.value, **changes)
+        _use_threads(threads)
+        import torch
+
+        # Networks are large enough for threads.
+        torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
+        dataset = _read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+        )
+        splats = None if ply is None else _read_splats(ply, None, None)
+        from attnwarp.propagate.command import FitPlan, edit_dataset
+
+        result, page = edit_dataset(
+            dataset, splats, editor, instruction, settings, out,
+            fit_plan=FitPlan(fit_iterations, kind.value[:2], max_splats), source=source,
+            source_picture=source_picture, masks=masks, max_size=max_size, store=store.value,
+            device=device, say=lambda text: typer.echo(text, err=True),
+        )  # fmt: skip
+        seconds = sum(result.seconds.values())
+        typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")
+        typer.echo(page)
 
 
 @app.command()
@@ -490,6 +626,7 @@ def render(
 
         import attnwarp.render
         from attnwarp.io.file import write_atomically
+        from attnwarp.io.names import file_stems
 
         _use_threads(threads)
         splats = _read_splats(model, kind, antialiased)
@@ -503,7 +640,7 @@ def render(
             points=False,
         ).cameras
         out.mkdir(parents=True, exist_ok=True)
-        for camera, name in zip(views, _file_names(views), strict=True):
+        for camera, name in zip(views, file_stems(views), strict=True):
             if size is not None:
                 factor = size / max(camera.width, camera.height)
                 camera = camera.resize(
@@ -632,15 +769,6 @@ def _color(text: str) -> list[float]:
             " 0.2,0.5,1"
         )
     return values
-
-
-def _file_names(cameras: Any) -> list[str]:
-    """A file name a camera: the last part of its own, numbered where two would be the same."""
-    stems = [Path(camera.name).stem or "view" for camera in cameras]
-    return [
-        stem if stems.count(stem) == 1 else f"{index:04d}-{stem}"
-        for index, stem in enumerate(stems)
-    ]
 
 
 def _write_image(path: Path, rgb: Any) -> None:

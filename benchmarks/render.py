@@ -171,10 +171,14 @@ def _collect_garbage(_: int) -> None:
     gc.collect()
 
 
+def _timed(splats: Gaussians, view: Camera) -> Callable[[int], Round]:
+    return lambda _: time_once(splats, view)
+
+
 def time_in_turn(built: Sequence[tuple[Case, Gaussians, Camera]], rounds: int) -> None:
     """Time the cases and write what they took into them."""
     turns = in_turn(
-        [lambda _, splats=splats, view=view: time_once(splats, view) for _, splats, view in built],
+        [_timed(splats, view) for _, splats, view in built],
         rounds,
         before=_collect_garbage,
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import CONTROLNET_BRANCHES
-from attnwarp.editing.editor import Image, Latent, tensor_of
+from attnwarp.editing.editor import Guide, Image, Latent, tensor_of
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
@@ -48,6 +48,8 @@ class DepthControlNet(Latent):
         control_scale: what the ControlNet's residuals are multiplied by.
         negative_prompt: of the unconditional branch.
     """
+
+    guide: Guide = "depth"
 
     def __init__(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from attnwarp import check
 from attnwarp.editing.schedule import Schedule, following, steps_from
 
 Image = npt.NDArray[np.float32]
+Guide = Literal["picture", "depth"]
 
 STEPS = 20
 
@@ -43,6 +44,10 @@ class Editor(Protocol):
 
     unet: Any
     schedule: Schedule
+    factor: int
+    """Pixels along the side of a latent."""
+    guide: Guide
+    """What :meth:`task` takes of a view: its picture or its depth map."""
 
     @property
     def branches(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from attnwarp.editing.attention import PIX2PIX_BRANCHES
-from attnwarp.editing.editor import Latent, tensor_of
+from attnwarp.editing.editor import Guide, Latent, tensor_of
 
 
 class InstructPix2Pix(Latent):
@@ -24,6 +24,8 @@ class InstructPix2Pix(Latent):
         text_guidance: s_T of e = e_un + s_T (e_txt - e_img) + s_I (e_img - e_un).
         image_guidance: s_I. Guidance is off, and the batch a third, where s_T is 1 and s_I is 1.
     """
+
+    guide: Guide = "picture"
 
     def __init__(
         self,

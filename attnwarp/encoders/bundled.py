@@ -209,3 +209,8 @@ class BundledPerceptual:
                 x, y = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (first, second))
                 distances.append(float(self.net(x, y)))
         return np.array(distances, dtype=np.float64)
+
+    def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
+        x, y = (each.permute(2, 0, 1)[None] for each in (image, target))
+        return self.net(x, y)[0]

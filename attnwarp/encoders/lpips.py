@@ -156,7 +156,7 @@ class Lpips:
         self.about = about
         self._backbone = backbone
         self._device = torch.device(device)
-        self._network = network.to(self._device, torch.float32).eval()
+        self._network = network.to(self._device, torch.float32).eval().requires_grad_(False)
         self._weights = [w.to(self._device, torch.float32).reshape(1, -1, 1, 1) for w in weights]
 
     def distance(self, a: Sequence[Image], b: Sequence[Image]) -> npt.NDArray[np.float64]:
@@ -179,21 +179,28 @@ class Lpips:
         if np.array_equal(a, b):
             return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
         with full_float32():
-            pair = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2).to(self._device)
-            shift, scale = (
-                torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
-            )
-            x = (2 * pair - 1 - shift) / scale
-            total = 0.0
-            stage = 0
-            for i, layer in enumerate(self._network):
-                x = layer(x)
-                if i == self._backbone.taps[stage]:
-                    unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
-                    weighted = ((unit[0] - unit[1]) ** 2)[None] * self._weights[stage]
-                    total += float(weighted.sum(1).mean(dtype=torch.float64))
-                    stage += 1
-        return total
+            stacked = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2)
+            return float(sum(self._stages(stacked.to(self._device))))
+
+    def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
+        stacked = torch.stack([image, target]).permute(0, 3, 1, 2).to(self._device)
+        return torch.stack(self._stages(stacked)).sum()
+
+    def _stages(self, pair: torch.Tensor) -> list[torch.Tensor]:
+        """() float64 of each stage, of a pair (2, 3, H, W) in [0, 1]."""
+        shift, scale = (
+            torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
+        )
+        x = (2 * pair - 1 - shift) / scale
+        parts: list[torch.Tensor] = []
+        for i, layer in enumerate(self._network):
+            x = layer(x)
+            if i == self._backbone.taps[len(parts)]:
+                unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
+                weighted = ((unit[0] - unit[1]) ** 2)[None] * self._weights[len(parts)]
+                parts.append(weighted.sum(1).mean(dtype=torch.float64))
+        return parts
 
 
 def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:

@@ -37,6 +37,14 @@ from attnwarp_eval.metrics.image import (
     ssim,
     ssim_map,
 )
+from attnwarp_eval.metrics.multiview import (
+    YawMean,
+    above_floor,
+    answers_by_view,
+    edit_fidelity,
+    mean_by_yaw,
+    same_answer,
+)
 from attnwarp_eval.metrics.occlusion import COUNTS, YawBin, by_yaw, confusion, mask_error, scores
 from attnwarp_eval.metrics.registry import METRICS, at_size, metric
 from attnwarp_eval.metrics.warp import endpoint_error, feature_error
@@ -49,6 +57,9 @@ __all__ = [
     "Flow",
     "Similarity",
     "YawBin",
+    "YawMean",
+    "above_floor",
+    "answers_by_view",
     "approximation_error",
     "at_size",
     "by_yaw",
@@ -57,6 +68,7 @@ __all__ = [
     "cross_view",
     "depth_error",
     "directional_similarity",
+    "edit_fidelity",
     "edit_psnr",
     "endpoint_error",
     "feature_error",
@@ -66,6 +78,7 @@ __all__ = [
     "image_error",
     "image_similarity",
     "mask_error",
+    "mean_by_yaw",
     "metric",
     "ms_ssim",
     "mse",
@@ -73,6 +86,7 @@ __all__ = [
     "optical_flow",
     "perceptual",
     "psnr",
+    "same_answer",
     "scores",
     "ssim",
     "ssim_map",

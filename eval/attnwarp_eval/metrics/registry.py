@@ -173,6 +173,14 @@ _SPECS = (
     Metric(
         "consistency.flow_false", "share", "lower", 1e-3, 0, "of what flow's check passes, not visible in the source"
     ),
+    Metric("multiview.delta_e", "dE00", "lower", 1e-3, 1e-2, "mean CIEDE2000 of two edited views at the same points"),
+    Metric("multiview.delta_e_floor", "dE00", "none", 1e-3, 1e-2, "the same of the true edited views"),
+    Metric("multiview.delta_e_above", "dE00", "lower", 1e-3, 1e-2, "disagreement above that floor"),
+    Metric("multiview.share", "share", "none", 1e-4, 0, "share of the pixels asked about that was compared"),
+    Metric("multiview.pixels", "pixels", "none", 0, 0, "pixels compared"),
+    Metric("multiview.same_answer", "share", "higher", 1e-4, 0, "views whose nearest answer is the source's"),
+    Metric("multiview.views", "views", "none", 0, 0, "views that have a nearest answer"),
+    Metric("multiview.views_undefined", "views", "none", 0, 0, "views that show nothing of the edited object"),
     Metric("fidelity.mse", "ratio", "lower", 1e-6, 1e-2, "mean squared error against the truth of the edit"),
     Metric("fidelity.psnr", "dB", "higher", 1e-2, 1e-3, "PSNR against the truth of the edit"),
     Metric("fidelity.ssim", "ratio", "higher", 1e-4, 1e-3, "SSIM against the truth of the edit"),

@@ -1,0 +1,187 @@
+"""The work of the command attnwarp edit: from photographs to an edited PLY and a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.small import load_editor
+from attnwarp.errors import InputError, suggest
+from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, random_points
+from attnwarp.fit.progress import progress_display as fit_progress
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import Dataset, read_image
+from attnwarp.propagate.folder import Folder
+from attnwarp.propagate.page import write_page
+from attnwarp.propagate.progress import progress_display
+from attnwarp.propagate.run import Propagation, propagate
+from attnwarp.propagate.settings import PropagateSettings
+
+FIT_FOLDER = "fit"
+
+FIRST_POINTS = 10_000
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """How a scene is fitted before it is edited.
+
+    Args:
+        iterations: of the fit.
+        kind: "2d" or "3d".
+        max_splats: no more than these; None for no limit.
+    """
+
+    iterations: int
+    kind: str
+    max_splats: int | None
+
+
+def edit_dataset(
+    dataset: Dataset,
+    splats: Gaussians | None,
+    editor_name: str,
+    instruction: str,
+    settings: PropagateSettings,
+    out: Path,
+    *,
+    fit_plan: FitPlan,
+    source: str | None,
+    source_picture: Path | None,
+    masks: Path | None,
+    max_size: int | None,
+    store: Any,
+    device: str,
+    say: Callable[[str], None],
+) -> tuple[Propagation, Path]:
+    """Fit where no splats are given, edit, and write the page.
+
+    Args:
+        dataset: cameras and pictures.
+        splats: the scene before the edit, or None.
+        editor_name: see :func:`attnwarp.editing.small.load_editor`.
+        instruction: in words.
+        settings: of the edit. Without a size, the editor's own is taken.
+        out: folder of all results.
+        fit_plan: of the fit.
+        source: name or number of the source view; the first if None.
+        source_picture: file of the source view edited elsewhere.
+        masks: folder with a mask picture for each view.
+        max_size: larger pictures are averaged down to it.
+        store, device: see :func:`attnwarp.propagate.propagate` and ``load_editor``.
+        say: shows a line to the user.
+
+    Returns:
+        The edit and the path of its page.
+
+    Raises:
+        InputError: no such view, mask or editor.
+    """
+    views = load_views(dataset, max_size=max_size)
+    index = _view_of(views.cameras, source)
+    segments = None if masks is None else _masks(masks, views.cameras)
+    by_hand = None if source_picture is None else _rgb(read_image(source_picture))
+    editor = load_editor(editor_name, device=device)
+    if settings.size is None:
+        settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
+    if splats is None:
+        splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
+    black = torch.zeros(3)
+    images = [views.target(k, black).numpy() for k in range(len(views))]
+    with progress_display(title=out.name) as watch:
+        result = propagate(
+            splats,
+            views.cameras,
+            images,
+            editor,
+            instruction,
+            settings,
+            source=index,
+            source_picture=by_hand,
+            segments=segments,
+            folder=out,
+            store=store,
+            watch=watch,
+            announce=say,
+        )
+    return result, write_page(Folder(out, views.cameras))
+
+
+def _fitted(
+    dataset: Dataset,
+    views: Views,
+    plan: FitPlan,
+    seed: int,
+    folder: Path,
+    say: Callable[[str], None],
+) -> Gaussians:
+    """Splats fitted to all views; a fit in the folder is resumed."""
+    settings = FitSettings.from_dict(
+        {
+            "kind": plan.kind,
+            "iterations": plan.iterations,
+            "max_splats": plan.max_splats,
+            "seed": seed,
+        }
+    )
+    if dataset.points is not None and len(dataset.points):
+        points, colors = dataset.points, dataset.colors
+    else:
+        say(f"no points in the data: the fit begins with {FIRST_POINTS} random ones")
+        points, colors = random_points(views.cameras, FIRST_POINTS, seed=seed)
+    start = from_points(points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    with fit_progress(title="fit") as watch:
+        return fit(start, views, settings, folder=folder, watch=watch).gaussians
+
+
+def _view_of(cameras: Any, name: str | None) -> int:
+    """The number of a view by its name, its file's name with or without suffix, or its number."""
+    if name is None:
+        return 0
+    names = [camera.name for camera in cameras]
+    files, stems = ([getattr(Path(each), part) for each in names] for part in ("name", "stem"))
+    for candidates in (names, files, stems):
+        if candidates.count(name) == 1:
+            return candidates.index(name)
+    if name.isdigit() and int(name) < len(names):
+        return int(name)
+    raise InputError(
+        f"--source: got {name!r}, expected a view's name or a number below {len(names)}"
+        f"{suggest(name, names)}"
+    )
+
+
+def _masks(folder: Path, cameras: Any) -> list[npt.NDArray[np.bool_]]:
+    """(H, W) bool of each view from NAME.png: white is edited."""
+    masks = []
+    for camera in cameras:
+        path = folder / f"{Path(camera.name).stem}.png"
+        if not path.is_file():
+            raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
+        masks.append(_mask(path, camera))
+    return masks
+
+
+def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
+    import cv2
+
+    pixels = read_image(path)
+    bright = pixels[..., :3].mean(axis=-1) / np.iinfo(pixels.dtype).max
+    size = (camera.width, camera.height)
+    if bright.shape != size[::-1]:
+        bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(bright > 0.5)
+
+
+def _rgb(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    """(H, W, 3) float32 in [0, 1]."""
+    top = np.iinfo(pixels.dtype).max
+    return (pixels[..., :3] / top).astype(np.float32)

@@ -1,0 +1,145 @@
+"""The folder of an edit: every file whole or absent, and a manifest that says whose they are.
+
+manifest.json            settings, plan, hashes of the inputs
+source.png  source.json  the source's edit; features.png: its recorded features as colours
+views/NAME.png  .json    each edited view, and what its edit was
+masks/  features/        where features were injected, and the warped features as colours
+stages/1.ply  1.pt       the splats after each stage, and the state of their optimiser
+renders/before/  after/  the scene from every view
+edited.ply  result.json  the edited splats; Edit PSNR and counters
+times.json               seconds by part, over all sittings
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp.errors import InputError
+from attnwarp.io.file import FileFormatError, write_atomically
+from attnwarp.io.images import encode_png, read_image
+from attnwarp.io.names import file_stems
+
+FORMAT = 1
+"""Raised when a folder's files change meaning; older folders are then refused."""
+
+MANIFEST = "manifest.json"
+FOLDERS = ("views", "masks", "features", "stages", "renders/before", "renders/after")
+
+
+class Folder:
+    """Files of one edit.
+
+    Args:
+        path: made if need be.
+        cameras: of the views, whose names the files have.
+
+    Attributes:
+        path: see there.
+        names: file names of the views, without suffix.
+    """
+
+    def __init__(self, path: Path, cameras: Sequence[Camera]) -> None:
+        self.path = path
+        self.names = file_stems(cameras)
+        for name in FOLDERS:
+            (path / name).mkdir(parents=True, exist_ok=True)
+
+    def claim(self, manifest: dict[str, Any]) -> None:
+        """Write the manifest, or hold the one that is there against it.
+
+        Raises:
+            InputError: the folder holds an edit of other settings or inputs, by name.
+        """
+        path = self.path / MANIFEST
+        manifest = json.loads(json.dumps({"format": FORMAT, **manifest}))
+        if not path.exists():
+            self.write_json(MANIFEST, manifest)
+            return
+        stored = self.read_json(MANIFEST)
+        differing = list(_differences(stored, manifest))
+        if differing:
+            raise InputError(
+                f"{self.path}: holds an edit of other {'; '.join(differing[:3])}"
+                f"{'; ...' if len(differing) > 3 else ''}. Go on with the same ones, or name"
+                " another folder"
+            )
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write JSON atomically."""
+        text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+        write_atomically(self.path / name, lambda stream: stream.write(text.encode()))
+
+    def read_json(self, name: str) -> Any:
+        """Read JSON.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        path = self.path / name
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise FileFormatError(path, f"not JSON ({error}); remove it, it is made anew") from None
+
+    def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
+        """Write an (H, W, 3) uint8 PNG atomically."""
+        data = encode_png(pixels)
+        write_atomically(self.path / name, lambda stream: stream.write(data))
+
+    def read_picture(self, name: str) -> npt.NDArray[np.uint8]:
+        """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
+        return read_image(self.path / name)
+
+    def has(self, name: str) -> bool:
+        """Whether a file is there, and so whole."""
+        return (self.path / name).is_file()
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 of arrays, bytes and JSON values, one after another.
+
+    Example:
+        >>> import numpy as np
+        >>> digest(np.zeros(2), "a") == digest(np.zeros(2), "a")
+        True
+        >>> digest(np.zeros(2)) == digest(np.zeros(2, np.float32))  # the type counts
+        False
+    """
+    total = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            total.update(f"{part.dtype}{part.shape}".encode())
+            total.update(np.ascontiguousarray(part).tobytes())
+        elif isinstance(part, bytes):
+            total.update(part)
+        else:
+            total.update(json.dumps(part, sort_keys=True, default=str).encode())
+    return total.hexdigest()
+
+
+def _differences(stored: Any, now: Any, name: str = "") -> list[str]:
+    """What differs between two JSON values, by the path of its key."""
+    if isinstance(stored, dict) and isinstance(now, dict):
+        return [
+            line
+            for key in {**stored, **now}
+            for line in _differences(stored.get(key), now.get(key), f"{name}.{key}".lstrip("."))
+        ]
+    if stored == now:
+        return []
+    # A hash tells a person nothing.
+    hashes = name.startswith("inputs.")
+    return [name if hashes else f"{name} ({_short(stored)}, now {_short(now)})"]
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

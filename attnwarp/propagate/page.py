@@ -1,0 +1,158 @@
+"""The page that shows an edit: one HTML file with its pictures in it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from attnwarp.io.file import write_atomically
+from attnwarp.propagate.folder import MANIFEST, Folder
+
+PAGE = "index.html"
+
+MOST_ROWS = 12
+"""Views with all their pictures on the page; the folder has the rest."""
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8884; --soft: #8881; }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 1200px; padding: 1.5rem; }
+h1 { font-size: 1.6rem; }
+h2 { font-size: 1.2rem; margin-top: 2em; border-top: 1px solid var(--line); }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid var(--line); }
+th:first-child, td:first-child { text-align: left; } th { background: var(--soft); }
+.row { display: flex; flex-wrap: wrap; gap: .6rem; margin: .3em 0 1em; }
+figure { margin: 0; width: 180px; } img { width: 100%; border-radius: 4px; image-rendering: auto; }
+figcaption { font-size: .82em; opacity: .8; }
+"""
+
+
+def write_page(folder: Folder) -> Path:
+    """Write ``index.html`` of a finished edit from its folder's files.
+
+    Returns:
+        Its path.
+    """
+    manifest, result = folder.read_json(MANIFEST), folder.read_json("result.json")
+    seconds = folder.read_json("times.json")
+    source = manifest["source"]
+    targets = [name for stage in manifest["stages"] for name in stage]
+    about = {name: folder.read_json(f"views/{name}.json") for name in targets}
+    parts = [
+        f"<h1>{escape(manifest['instruction'])}</h1>",
+        _summary(manifest, result),
+        f"<h2>Source view: {escape(source)}</h2>",
+        _row(
+            folder,
+            ("before, render", f"renders/before/{source}.png"),
+            ("edit of the source", "source.png"),
+            ("its attention features, three principal components", "features.png"),
+            ("edited scene", f"renders/after/{source}.png"),
+        ),
+        "<h2>Edited views</h2>",
+        f"<p>{min(len(targets), MOST_ROWS)} of {len(targets)}; the folder has all.</p>",
+    ]
+    for name in _spread(targets, MOST_ROWS):
+        share = about[name]["injected"]
+        parts += [
+            f"<h3>{escape(name)}, stage {about[name]['stage']}: {share:.0%} of the pixels get"
+            " features of the source</h3>",
+            _row(
+                folder,
+                ("before, render", f"renders/before/{name}.png"),
+                ("edited view", f"views/{name}.png"),
+                ("mask", f"masks/{name}.png"),
+                ("warped features", f"features/{name}.png"),
+                ("edited scene", f"renders/after/{name}.png"),
+            ),
+        ]
+    rest = [name for name in folder.names if name not in {source, *targets}]
+    if rest:
+        parts.append("<h2>Views that were not edited</h2>")
+        for name in _spread(rest, 4):
+            parts.append(
+                _row(
+                    folder,
+                    (f"{name}, before", f"renders/before/{name}.png"),
+                    ("edited scene", f"renders/after/{name}.png"),
+                )
+            )
+    parts += ["<h2>Time</h2>", _table(("part", "seconds"), _times(seconds))]
+    parts += ["<h2>Settings</h2>", _settings(manifest["settings"])]
+    title = escape(f"{manifest['instruction']} - attnwarp edit")
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{_STYLE}</style></head>\n<body>\n"
+        + "\n".join(parts)
+        + "\n</body></html>\n"
+    )
+    path = folder.path / PAGE
+    write_atomically(path, lambda stream: stream.write(page.encode()))
+    return path
+
+
+def _summary(manifest: dict[str, Any], result: dict[str, Any]) -> str:
+    psnr, counters = result["edit_psnr"], result["counters"]
+    rows = [
+        ("stages", len(manifest["stages"])),
+        ("edited views", counters["views"]),
+        ("splats", counters["splats"]),
+        ("iterations of tuning", counters["iterations"]),
+        ("share of the targets' pixels with features of the source", f"{counters['injected']:.0%}"),
+        ("recorded features", f"{counters['feature_bytes'] / 2**20:.1f} MiB"),
+        ("Edit PSNR, pooled over the edited views", _decibels(psnr["pooled"])),
+        ("Edit PSNR, mean over them", _decibels(psnr["mean"])),
+    ]
+    text = "<p>The edited scene is <code>edited.ply</code> in this folder.</p>"
+    return text + _table(("", ""), rows)
+
+
+def _decibels(value: float | None) -> str:
+    return "equal pictures" if value is None else f"{value:.2f} dB"
+
+
+def _times(seconds: dict[str, float]) -> list[tuple[str, str]]:
+    rows = [(part, f"{value:.1f}") for part, value in seconds.items()]
+    return [*rows, ("all", f"{sum(seconds.values()):.1f}")]
+
+
+def _settings(settings: dict[str, Any]) -> str:
+    flat = {k: v for k, v in settings.items() if k != "warp"}
+    flat |= {f"warp.{k}": v for k, v in settings["warp"].items()}
+    rows = [(name, "none" if value is None else value) for name, value in flat.items()]
+    return f"<details><summary>all</summary>{_table(('setting', 'value'), rows)}</details>"
+
+
+def _table(head: tuple[str, str], rows: Sequence[tuple[str, Any]]) -> str:
+    top = "".join(f"<th>{escape(name)}</th>" for name in head) if any(head) else ""
+    body = "".join(
+        f"<tr><td>{escape(str(name))}</td><td>{escape(str(value))}</td></tr>"
+        for name, value in rows
+    )
+    return f"<table>{f'<tr>{top}</tr>' if top else ''}{body}</table>"
+
+
+def _row(folder: Folder, *pictures: tuple[str, str]) -> str:
+    """Pictures side by side; those that an edit does not have are left out."""
+    figures = "".join(
+        f'<figure><img alt="{escape(text)}" src="{_data(folder.path / name)}">'
+        f"<figcaption>{escape(text)}</figcaption></figure>"
+        for text, name in pictures
+        if folder.has(name)
+    )
+    return f'<div class="row">{figures}</div>'
+
+
+def _data(path: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _spread(names: Sequence[str], most: int) -> list[str]:
+    """At most so many, evenly spread."""
+    if len(names) <= most:
+        return list(names)
+    return [names[k * len(names) // most] for k in range(most)]

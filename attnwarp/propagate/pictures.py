@@ -1,0 +1,148 @@
+"""Pictures of views: sizes, segments, and feature maps as colours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+Image = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+Size = tuple[int, int]
+
+
+def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Size:
+    """(h, w) at which a picture is edited: its longest side, with sides that are multiples.
+
+    Example:
+        >>> edit_size(1080, 1920, 512, 64)
+        (320, 512)
+        >>> edit_size(64, 64, None, 16)
+        (64, 64)
+    """
+    scale = 1.0 if longest is None else longest / max(height, width)
+    h, w = (max(multiple, round(n * scale / multiple) * multiple) for n in (height, width))
+    return h, w
+
+
+def resized(image: Image, size: Size) -> Image:
+    """(h, w, 3) of an (H, W, 3) picture in [0, 1]: averaged where it shrinks, cubic elsewhere."""
+    import cv2
+
+    if image.shape[:2] == size:
+        return image
+    shrinks = size[0] * size[1] < image.shape[0] * image.shape[1]
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC
+    result = cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=how)
+    return np.clip(result, 0, 1).astype(np.float32)
+
+
+def enlarged_change(original: Image, edited: Image) -> Image:
+    """The full-size picture plus the enlarged change of a smaller edit of it.
+
+    Args:
+        original: (H, W, 3) in [0, 1].
+        edited: (h, w, 3) in [0, 1].
+
+    Example:
+        >>> original = np.full((8, 8, 3), 0.5, np.float32)
+        >>> edited = np.full((4, 4, 3), 0.75, np.float32)
+        >>> float(enlarged_change(original, edited).mean())
+        0.75
+    """
+    import cv2
+
+    h, w = original.shape[:2]
+    if edited.shape[:2] == (h, w):
+        return edited
+    change = edited - resized(original, (edited.shape[0], edited.shape[1]))
+    large = cv2.resize(change, (w, h), interpolation=cv2.INTER_LINEAR)
+    return np.clip(original + large, 0, 1).astype(np.float32)
+
+
+def composite(edited: Image, original: Image, segment: Mask, how: str, blur: float) -> Image:
+    """The edit inside a segment; the original or black outside.
+
+    Args:
+        edited, original: (h, w, 3) in [0, 1].
+        segment: (H, W) bool at any size.
+        how: "none", "black" or "original".
+        blur: sigma in px of the edit's picture.
+    """
+    if how == "none":
+        return edited
+    import cv2
+
+    h, w = edited.shape[:2]
+    share: npt.NDArray[Any] = segment.astype(np.float32)
+    if share.shape != (h, w):
+        share = cv2.resize(share, (w, h), interpolation=cv2.INTER_AREA)
+    if blur > 0:
+        share = cv2.GaussianBlur(share, (0, 0), blur)
+    behind = original if how == "original" else np.zeros_like(original)
+    share = share[..., None]
+    return np.clip(share * edited + (1 - share) * behind, 0, 1).astype(np.float32)
+
+
+def to_bytes(image: npt.NDArray[Any]) -> Bytes:
+    """(H, W, 3) uint8 of a picture in [0, 1]."""
+    return np.asarray(np.rint(255 * np.clip(image, 0, 1)), dtype=np.uint8)
+
+
+def mask_picture(mask: Tensor) -> Bytes:
+    """(H, W, 3) uint8: white where the mask is True."""
+    pixels = 255 * mask.to(torch.uint8).cpu().numpy()
+    return np.repeat(pixels[..., None], 3, axis=2)
+
+
+class Principal:
+    """Three principal components of a source's feature map, as colours.
+
+    Args:
+        features: (N, C) of the source; the basis and the range of the colours come from them, so
+            that equal features of other views have equal colours.
+
+    Example:
+        >>> import torch
+        >>> line = torch.arange(5.0)[:, None] * torch.tensor([[3.0, 4.0]])
+        >>> colors = Principal(line).colors(line)
+        >>> colors[:, 0].tolist() == sorted(colors[:, 0].tolist())
+        True
+    """
+
+    def __init__(self, features: Tensor) -> None:
+        values = features.detach().cpu().double()
+        self.mean = values.mean(dim=0)
+        centered = values - self.mean
+        _, vectors = torch.linalg.eigh(centered.T @ centered)
+        basis = vectors.flip(-1)[:, :3]
+        # An eigenvector's sign is arbitrary.
+        largest = basis.abs().argmax(dim=0)
+        basis = basis * basis.gather(0, largest[None]).sign()
+        self.basis = torch.nn.functional.pad(basis, (0, 3 - basis.shape[1]))
+        projected = centered @ self.basis
+        self.low, self.high = projected.quantile(0.01, dim=0), projected.quantile(0.99, dim=0)
+
+    def colors(self, features: Tensor) -> Tensor:
+        """(N, 3) float64 in [0, 1] of (N, C) features."""
+        projected = (features.detach().cpu().double() - self.mean) @ self.basis
+        return ((projected - self.low) / (self.high - self.low).clamp_min(1e-12)).clamp(0, 1)
+
+    def picture(self, features: Tensor, size: Size, mask: Tensor | None = None) -> Bytes:
+        """(h, w, 3) uint8 of (h w, C) features; black where the mask is False."""
+        colors = self.colors(features)
+        if mask is not None:
+            colors = torch.where(mask.reshape(-1, 1).cpu(), colors, 0.0)
+        return to_bytes(colors.reshape(*size, 3).numpy())
+
+
+def enlarged(pixels: Bytes, size: Size) -> Bytes:
+    """Each pixel as a block, for looking at."""
+    import cv2
+
+    blocks = cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(blocks, dtype=np.uint8)

@@ -1,0 +1,581 @@
+"""Algorithm 1: an edit of one view is carried into the others, and the scene is tuned on them."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import check, losses
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import Layer, Recording
+from attnwarp.editing.editor import Editor
+from attnwarp.errors import InputError
+from attnwarp.fit import FitSettings, extent_of
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import write_ply
+from attnwarp.propagate.editing import Guide, Source, Store, ViewEditor
+from attnwarp.propagate.folder import Folder, digest
+from attnwarp.propagate.pictures import (
+    Bytes,
+    Image,
+    Principal,
+    composite,
+    edit_size,
+    enlarged,
+    enlarged_change,
+    mask_picture,
+    resized,
+    to_bytes,
+)
+from attnwarp.propagate.plan import Plan
+from attnwarp.propagate.progress import Step
+from attnwarp.propagate.scene import Scene, Segments
+from attnwarp.propagate.settings import PRESETS, PropagateSettings
+from attnwarp.propagate.tune import TrainingView, Tuning
+from attnwarp.render import render
+from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
+
+RECORDING = ".recording"
+"""Folder of the recorded features while an edit with ``store="disk"`` is in progress."""
+
+Watch = Callable[[Step], object]
+
+
+@dataclass(frozen=True, eq=False)
+class Propagation:
+    """The result of :func:`propagate`.
+
+    Attributes:
+        gaussians: the edited splats, float32, outside autograd.
+        plan: the views of each stage.
+        edited: (h, w, 3) uint8 sRGB by the view's number, the source first, at the size of the
+            editor's work.
+        edit_psnr: dB: "pooled" (of the mean squared error over views), "mean" (of the views'
+            PSNRs), and "views", the names that were counted.
+        counters: "network_rows" (rows through the UNet), "feature_bytes", "iterations", "splats",
+            "injected" (mean share of the targets' pixels that got features).
+        seconds: by part, over all sittings.
+    """
+
+    gaussians: Gaussians
+    plan: Plan
+    edited: dict[int, Bytes]
+    edit_psnr: dict[str, Any]
+    counters: dict[str, float]
+    seconds: dict[str, float]
+
+
+def propagate(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: PropagateSettings = PRESETS["corrected"],
+    *,
+    source: int = 0,
+    source_picture: npt.NDArray[Any] | None = None,
+    segments: Segments | None = None,
+    folder: Path | str | None = None,
+    store: Literal["device", "cpu", "disk"] = "cpu",
+    checkpoint_seconds: float = 30.0,
+    backend: str = "auto",
+    watch: Watch | None = None,
+    announce: Callable[[str], None] | None = None,
+) -> Propagation:
+    """Edit one view of a scene, carry the edit into others, and tune the splats on all of them.
+
+    The source view's edit is recorded once. Each stage then edits a random subset of the views
+    that are still unedited, with features of the source warped along the scene's geometry, and
+    tunes the splats on edited views.
+
+    With ``folder``, everything is written there at once (:mod:`attnwarp.propagate.folder` lists
+    the files). A run that was killed at any moment goes on from there, and all files but
+    ``times.json`` get the bytes of an uninterrupted run (on one machine, with the same number of
+    threads). Edited views are rounded to 8 bits, with a folder or without.
+
+    Args:
+        gaussians: the scene before the edit, N splats of either kind.
+        cameras: V views, at least one.
+        images: V pictures (H, W, 3), sRGB, uint8, uint16 or floating in [0, 1]: the views before
+            the edit. None takes renders of ``gaussians``.
+        editor: see :mod:`attnwarp.editing`.
+        instruction: an instruction or a prompt, as the editor takes it.
+        settings: every choice of the method, see :class:`PropagateSettings`.
+        source: number of the source view.
+        source_picture: (h, w, 3) the source view edited elsewhere, such as by hand. It is resized
+            to the editor's size, and its features are recorded while its own noise is replayed
+            (edit-friendly inversion).
+        segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
+            and picture. See ``composite`` of the settings and ``segment`` of their warp.
+        folder: made if need be.
+        store: of the recorded features: on the editor's "device", in main memory ("cpu"), or in
+            the folder ("disk") until the edit is done.
+        checkpoint_seconds: between two checkpoints of tuning.
+        backend: of :func:`attnwarp.render.render`.
+        watch: told how the edit stands, :func:`attnwarp.propagate.progress.progress_display`.
+        announce: told the memory of the recording before it is made.
+
+    Raises:
+        ValueError: an argument of another size or type; the message names it.
+        InputError: the folder holds an edit of other settings or inputs; the message names them.
+        RuntimeError: tuning diverged; the last checkpoint stays.
+
+    Example:
+        >>> import torch
+        >>> from attnwarp import Camera, Gaussians
+        >>> from attnwarp.editing.small import load_editor
+        >>> from attnwarp.propagate import preset, propagate
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> view = dict(width=32, height=32, fov_y=40, up=(0, 1, 0))
+        >>> cameras = [Camera.look_at((x, 0, 3), (0, 0, 0), **view) for x in (0, 1)]
+        >>> quick = preset("corrected", stages=1, steps=1, iterations=1)
+        >>> result = propagate(disc, cameras, None, load_editor("small-plain"), "red", quick)
+        >>> result.plan.stages, result.edited[1].shape
+        (((1,),), (32, 32, 3))
+    """
+    if not cameras:
+        raise ValueError("cameras: got none, expected at least one")
+    if not 0 <= source < len(cameras):
+        raise ValueError(f"source: got {source}, expected a number of a view below {len(cameras)}")
+    check.one_of(store, ("device", "cpu", "disk"), "store")
+    if not instruction.strip():
+        raise ValueError("instruction: is empty, expected words such as 'make it red'")
+    if images is None:
+        near = _near(cameras)
+        images = [_render(gaussians, camera, near, backend) for camera in cameras]
+    scene = Scene.checked(cameras, images, segments)
+    by_hand = None if source_picture is None else _by_hand(source_picture)
+    with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
+        run = _Run(
+            gaussians, scene, editor, instruction, settings, source, by_hand, Path(str(place)),
+            store, checkpoint_seconds, backend, watch, announce,
+        )  # fmt: skip
+        return run.go()
+
+
+class _Run:
+    """An edit in progress. What is done stands in the folder; nothing else is remembered."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        scene: Scene,
+        editor: Editor,
+        instruction: str,
+        settings: PropagateSettings,
+        source: int,
+        by_hand: Image | None,
+        folder: Path,
+        store: str,
+        checkpoint_seconds: float,
+        backend: str,
+        watch: Watch | None,
+        announce: Callable[[str], None] | None,
+    ) -> None:
+        self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
+        self.settings, self.backend, self.watch = settings, backend, watch
+        self.checkpoint_seconds = checkpoint_seconds
+        self.plan = Plan.draw(len(scene.cameras), source, settings)
+        multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
+        self.sizes = [
+            edit_size(camera.height, camera.width, settings.size, multiple)
+            for camera in scene.cameras
+        ]
+        self.by_hand = None if by_hand is None else resized(by_hand, self.sizes[source])
+        self.folder = Folder(folder, scene.cameras)
+        self.names = self.folder.names
+        disk = folder / RECORDING
+        place: Store = disk if store == "disk" else "device" if store == "device" else "cpu"
+        self.view_editor = ViewEditor(
+            editor, instruction, settings, self.sizes[source], store=place, announce=announce
+        )
+        self.tuning = Tuning(
+            gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
+        )
+        self.near = _near(scene.cameras)
+        self._frozen_surface: Surface | None = None
+        self.seconds: dict[str, float] = {}
+        self.done = 0
+        rows = 1 + sum(len(stage) for stage in self.plan.stages)
+        self.total = rows * settings.steps + len(self.plan.stages) * settings.iterations
+        self.folder.claim(
+            {
+                "instruction": instruction,
+                "settings": settings.to_dict(),
+                "source": self.names[source],
+                "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],
+                "inputs": {
+                    "splats": _splats_digest(gaussians),
+                    **scene.digest(),
+                    "editor": _editor_digest(editor),
+                    "source_picture": None if by_hand is None else digest(by_hand),
+                },
+            }
+        )
+
+    def go(self) -> Propagation:
+        if self.folder.has("times.json"):
+            self.seconds = dict(self.folder.read_json("times.json"))
+        self._edited_source()
+        for number, stage in enumerate(self.plan.stages):
+            self._edit_stage(number, stage)
+            self._tune_stage(number)
+        self._clear_recording()
+        result = self._finish()
+        self._tell("done", done=self.total)
+        return result
+
+    # --- editing
+
+    def _edited_source(self) -> None:
+        if not self.folder.has("source.json"):
+            _ = self.source
+
+    @cached_property
+    def source(self) -> Source:
+        """The source's edit; made anew, to the same bytes, in each sitting that needs it."""
+        view = self.plan.source
+        text = f"editing the source, {self.names[view]}"
+        with self._timed("source"):
+            source = self.view_editor.source(
+                view,
+                self._guide(view, self.frozen),
+                self._start_picture(view, self.frozen),
+                self.by_hand,
+                watch=lambda: self._tell(text, 1),
+            )
+        pixels = to_bytes(self._composite(view, source.picture))
+        if source.recording is not None:
+            layer, features = self._shown(source.recording)
+            self._principal = Principal(features)
+        if self.folder.has("source.json"):
+            if not np.array_equal(pixels, self.folder.read_picture("source.png")):
+                raise InputError(
+                    f"{self.folder.path}: the source's edit is not the one in source.png; go on"
+                    " with the same device, number of threads and versions, or name another folder"
+                )
+            return source
+        self.folder.write_picture("source.png", pixels)
+        if source.recording is not None:
+            size = layer.size(source.recording.plan.latent_size)
+            picture = self._principal.picture(features, size)
+            shape = self.scene.pictures[view].shape
+            self.folder.write_picture("features.png", enlarged(picture, (shape[0], shape[1])))
+        self.folder.write_json(
+            "source.json",
+            {
+                "view": self.names[view],
+                "branches": list(source.branches),
+                "feature_bytes": 0 if source.recording is None else source.recording.plan.bytes,
+            },
+        )
+        return source
+
+    def _shown(self, recording: Recording) -> tuple[Layer, torch.Tensor]:
+        """The layer whose features are shown as colours, and its (h w, C) features half-way."""
+        plan = recording.plan
+        layer = min(plan.layers, key=lambda layer: (layer.level, layer.kind != "self"))
+        timestep = recording.timesteps[len(recording.timesteps) // 2]
+        return layer, recording.features(timestep, layer, plan.keep[0])[0].float()
+
+    def _edit_stage(self, number: int, stage: tuple[int, ...]) -> None:
+        for batch in self._batches(stage):
+            if all(self.folder.has(f"views/{self.names[view]}.json") for view in batch):
+                self.done += len(batch) * self.settings.steps
+                continue
+            self._edit_batch(number, stage, batch)
+
+    def _batches(self, stage: tuple[int, ...]) -> Iterator[list[int]]:
+        """Views that go through the network together: neighbours in the order, of one size."""
+        batch: list[int] = []
+        for view in stage:
+            full = len(batch) == self.settings.batch
+            if batch and (full or self.sizes[view] != self.sizes[batch[0]]):
+                yield batch
+                batch = []
+            batch.append(view)
+        if batch:
+            yield batch
+
+    def _edit_batch(self, number: int, stage: tuple[int, ...], batch: list[int]) -> None:
+        source = self.source  # first, so that its time is not counted here
+        # Stages before are tuned by now: this is the current model.
+        model = self.tuning.gaussians()
+        with self._timed("warp"):
+            warps = [self._warp(view, model) for view in batch]
+        text = (
+            f"stage {number + 1} of {len(self.plan.stages)}: editing view"
+            f" {stage.index(batch[0]) + 1} of {len(stage)}"
+        )
+        starts = [self._start_picture(view, model) for view in batch]
+        with self._timed("edit"):
+            pictures = self.view_editor.targets(
+                source,
+                [self._guide(view, model) for view in batch],
+                batch,
+                warps,
+                number,
+                None if starts[0] is None else [start for start in starts if start is not None],
+                watch=lambda: self._tell(text, len(batch)),
+            )
+        with self._timed("write"):
+            for view, picture, warp in zip(batch, pictures, warps, strict=True):
+                self._write_view(number, view, picture, warp, source)
+        self._write_times()
+
+    def _write_view(
+        self, number: int, view: int, picture: Image, warp: WarpedView | None, source: Source
+    ) -> None:
+        name = self.names[view]
+        about: dict[str, Any] = {"view": name, "stage": number + 1, "injected": 0.0}
+        if warp is not None and source.recording is not None:
+            about["injected"] = float(warp.mask.float().mean())
+            about["rules"] = {k: float(rule.float().mean()) for k, rule in warp.rules.items()}
+            self.folder.write_picture(f"masks/{name}.png", mask_picture(warp.mask))
+            layer, features = self._shown(source.recording)
+            h, w = (side // self.editor.factor for side in self.sizes[view])
+            size = layer.size((h, w))
+            at = warp.at(size, source_size=layer.size(source.recording.plan.latent_size))
+            warped = at.warp_tokens(features[None].cpu())[0]
+            colors = self._principal.picture(warped, size, at.mask)
+            shape = self.scene.pictures[view].shape
+            self.folder.write_picture(f"features/{name}.png", enlarged(colors, shape[:2]))
+        self.folder.write_picture(f"views/{name}.png", to_bytes(self._composite(view, picture)))
+        # Last: a view counts as edited once this is there.
+        self.folder.write_json(f"views/{name}.json", about)
+
+    def _warp(self, view: int, model: Gaussians) -> WarpedView | None:
+        s = self.settings
+        if s.method != "warp":
+            return None
+        before = self.frozen if s.depth_from == "frozen" else model
+        segments = self.scene.segments
+        warp = warp_view(
+            before,
+            self.scene.cameras[self.plan.source],
+            self.scene.cameras[view],
+            s.warp,
+            source_image=self.scene.pictures[self.plan.source],
+            target_image=self.scene.pictures[view],
+            target_segment=None if segments is None else torch.from_numpy(segments[view]),
+            source_surface=self._source_surface(before),
+            backend=self.backend,
+        )
+        return warp if s.mask else replace(warp, mask=torch.ones_like(warp.mask), _at={})
+
+    def _source_surface(self, model: Gaussians) -> Surface:
+        camera = self.scene.cameras[self.plan.source]
+        if model is not self.frozen:
+            return render_surface(model, camera, self.settings.warp, backend=self.backend)
+        if self._frozen_surface is None:
+            self._frozen_surface = render_surface(
+                model, camera, self.settings.warp, backend=self.backend
+            )
+        return self._frozen_surface
+
+    def _guide(self, view: int, model: Gaussians) -> Guide:
+        if self.editor.guide == "picture":
+            return resized(self.scene.pictures[view], self.sizes[view])
+        before = self.frozen if self.settings.depth_from == "frozen" else model
+        h, w = self.sizes[view]
+        camera = self.scene.cameras[view].resize(w, h)
+        depth = render_surface(before, camera, self.settings.warp, backend=self.backend).depth
+        return np.asarray(depth)
+
+    def _start_picture(self, view: int, model: Gaussians) -> Image | None:
+        if self.view_editor.timestep is None:
+            return None
+        h, w = self.sizes[view]
+        if self.settings.start_picture == "original":
+            return resized(self.scene.pictures[view], (h, w))
+        return _render(model, self.scene.cameras[view].resize(w, h), self.near, self.backend)
+
+    def _composite(self, view: int, picture: Image) -> Image:
+        if self.scene.segments is None:
+            return picture
+        original = resized(self.scene.pictures[view], self.sizes[view])
+        s = self.settings
+        return composite(
+            picture, original, self.scene.segments[view], s.composite, s.composite_blur
+        )
+
+    # --- tuning
+
+    def _tune_stage(self, number: int) -> None:
+        s = self.settings
+        state, splats = f"stages/{number + 1}.pt", f"stages/{number + 1}.ply"
+        if self.folder.has(state):
+            self.tuning.restore(self.folder.path / state)
+            self.done += self.tuning.iteration - number * s.iterations
+        end = (number + 1) * s.iterations
+        if self.tuning.iteration < end or not self.folder.has(state):
+            text = f"stage {number + 1} of {len(self.plan.stages)}: tuning"
+            views = [self._training(view) for view in self.plan.training(number, s.training)]
+
+            def tell() -> None:
+                self._tell(f"{text}, loss {self.tuning.loss:.4f}", 1)
+
+            with self._timed("tune"):
+                self.tuning.stage(
+                    number,
+                    views,
+                    self._training(self.plan.source),
+                    checkpoint=self.folder.path / state,
+                    checkpoint_seconds=self.checkpoint_seconds,
+                    watch=tell,
+                )
+        if not self.folder.has(splats):
+            write_ply(self.folder.path / splats, self.tuning.gaussians())
+        self._write_times()
+
+    def _training(self, view: int) -> TrainingView:
+        camera = self.scene.cameras[view]
+        edited = self._edited(view).astype(np.float32) / np.float32(255)
+        if self.settings.detail == "change":
+            picture = enlarged_change(self.scene.pictures[view], edited)
+            return TrainingView(view, camera, picture)
+        h, w = self.sizes[view]
+        return TrainingView(view, camera.resize(w, h), edited)
+
+    def _edited(self, view: int) -> Bytes:
+        source = view == self.plan.source
+        name = "source.png" if source else f"views/{self.names[view]}.png"
+        return self.folder.read_picture(name)
+
+    # --- what is left for people
+
+    def _finish(self) -> Propagation:
+        final = self.tuning.gaussians()
+        with self._timed("render"):
+            write_ply(self.folder.path / "edited.ply", final)
+            for part, model in (("before", self.frozen), ("after", final)):
+                for camera, name in zip(self.scene.cameras, self.names, strict=True):
+                    path = f"renders/{part}/{name}.png"
+                    if not self.folder.has(path):
+                        pixels = to_bytes(_render(model, camera, self.near, self.backend))
+                        self.folder.write_picture(path, pixels)
+            psnr = self._edit_psnr(final)
+        counters = self._counters(final)
+        self.folder.write_json(
+            "result.json",
+            {
+                "edit_psnr": psnr,
+                "counters": counters,
+                "tuned": {self.names[v]: n for v, n in sorted(self.tuning.visits.items())},
+            },
+        )
+        self._write_times()
+        edited = {view: self._edited(view) for view in self.plan.edited}
+        return Propagation(final, self.plan, edited, psnr, counters, dict(self.seconds))
+
+    def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:
+        views = list(self.plan.edited)
+        if self.settings.psnr_views == "before_last_stage" and len(self.plan.stages) > 1:
+            views = [view for view in views if view not in self.plan.stages[-1]]
+        errors = []
+        for view in views:
+            target = self._training(view)
+            picture = _render(final, target.camera, self.near, self.backend)
+            errors.append(float(np.square(picture.astype(np.float64) - target.picture).mean()))
+        each = [losses.psnr_of_mse(error) for error in errors]
+        finite = [value for value in each if np.isfinite(value)]
+        pooled = losses.psnr_of_mse(sum(errors) / len(errors))
+        return {
+            "pooled": pooled if np.isfinite(pooled) else None,
+            "mean": sum(finite) / len(finite) if finite else None,
+            "views": [self.names[view] for view in views],
+        }
+
+    def _counters(self, final: Gaussians) -> dict[str, float]:
+        source = self.folder.read_json("source.json")
+        targets = [view for stage in self.plan.stages for view in stage]
+        shares = [
+            self.folder.read_json(f"views/{self.names[view]}.json")["injected"] for view in targets
+        ]
+        rows = (1 + len(targets)) * self.settings.steps * len(source["branches"])
+        return {
+            "views": 1 + len(targets),
+            "network_rows": rows,
+            "feature_bytes": source["feature_bytes"],
+            "injected": sum(shares) / len(shares) if shares else 0.0,
+            "iterations": self.tuning.iteration,
+            "splats": len(final),
+        }
+
+    def _clear_recording(self) -> None:
+        recording = self.folder.path / RECORDING
+        if recording.is_dir():
+            for path in recording.iterdir():
+                path.unlink()
+            recording.rmdir()
+
+    # --- time and progress
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begin
+
+    def _write_times(self) -> None:
+        rounded = {part: round(seconds, 3) for part, seconds in self.seconds.items()}
+        self.folder.write_json("times.json", rounded)
+
+    def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
+        self.done = self.done + steps if done is None else done
+        if self.watch is not None:
+            self.watch(Step(min(self.done, self.total), self.total, text))
+
+
+def _near(cameras: Sequence[Camera]) -> float:
+    """Nothing nearer is drawn, as in the tuning."""
+    return FitSettings().near * extent_of(cameras)
+
+
+def _render(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
+    """(H, W, 3) float32 in [0, 1], over black."""
+    with torch.no_grad():
+        color = render(gaussians, camera, backend=backend, near=near).color
+    return np.asarray(color.clamp(0, 1).float().cpu().numpy())
+
+
+def _by_hand(picture: npt.NDArray[Any]) -> Image:
+    array = np.asarray(picture)
+    check.shape(array, ("H", "W", 3), "source_picture")
+    if array.dtype == np.uint8:
+        return array.astype(np.float32) / np.float32(255)
+    check.finite(array, "source_picture")
+    if array.dtype.kind != "f" or array.min() < 0 or array.max() > 1:
+        raise ValueError("source_picture: expected uint8, or floating values in [0, 1]")
+    return array.astype(np.float32)
+
+
+def _splats_digest(gaussians: Gaussians) -> str:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    arrays = [getattr(gaussians, name).detach().cpu().numpy() for name in names]
+    return digest(gaussians.kind, gaussians.antialiased, gaussians.origin, *arrays)
+
+
+def _editor_digest(editor: Any) -> str:
+    """SHA-256 of an editor's networks, schedule and guidance."""
+    parts: list[Any] = [type(editor).__name__]
+    for name in ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt"):
+        parts.append(getattr(editor, name, None))
+    parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
+    for name in ("unet", "vae", "text_encoder", "controlnet"):
+        network = getattr(editor, name, None)
+        for key, value in sorted(network.state_dict().items()) if network is not None else ():
+            parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
+    return digest(*parts)

@@ -1,0 +1,95 @@
+"""What an edit is given: cameras, pictures before the edit, and segments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import check
+from attnwarp.camera import Camera
+from attnwarp.propagate.folder import digest
+from attnwarp.propagate.pictures import Image, Mask
+
+Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.NDArray[Any]]
+"""(H, W) bool masks of what is edited: one for each view, or a function of a view's number and its
+picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Views before the edit.
+
+    Attributes:
+        cameras: one for each view.
+        pictures: (H, W, 3) float32 sRGB in [0, 1].
+        segments: (H, W) bool, or None where all is edited.
+    """
+
+    cameras: list[Camera]
+    pictures: list[Image]
+    segments: list[Mask] | None
+
+    @classmethod
+    def checked(
+        cls,
+        cameras: Sequence[Camera],
+        images: Sequence[npt.NDArray[Any]],
+        segments: Segments | None,
+    ) -> Scene:
+        """Validate what came from outside.
+
+        Raises:
+            ValueError: lists of different lengths, or a picture or segment of another size or type;
+                the message names it.
+        """
+        if len(images) != len(cameras):
+            raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
+        pictures = [
+            _picture(image, camera, f"images[{k}] ({camera.name})")
+            for k, (image, camera) in enumerate(zip(images, cameras, strict=True))
+        ]
+        if segments is None:
+            return cls(list(cameras), pictures, None)
+        given = (
+            [segments(k, picture) for k, picture in enumerate(pictures)]
+            if callable(segments)
+            else segments
+        )
+        if len(given) != len(cameras):
+            raise ValueError(f"segments: got {len(given)}, expected {len(cameras)}, as cameras")
+        masks = []
+        for k, (segment, camera) in enumerate(zip(given, cameras, strict=True)):
+            name = f"segments[{k}] ({camera.name})"
+            mask = np.asarray(segment)
+            check.shape(mask, (camera.height, camera.width), name)
+            if mask.dtype != np.bool_:
+                raise ValueError(f"{name}: got {mask.dtype}, expected bool")
+            masks.append(mask)
+        return cls(list(cameras), pictures, masks)
+
+    def digest(self) -> dict[str, str | None]:
+        """SHA-256 of cameras, pictures and segments."""
+        cameras = [{**camera.to_dict(), "name": camera.name} for camera in self.cameras]
+        return {
+            "cameras": digest(cameras),
+            "images": digest(*self.pictures),
+            "segments": None if self.segments is None else digest(*self.segments),
+        }
+
+
+def _picture(image: npt.NDArray[Any], camera: Camera, name: str) -> Image:
+    """(H, W, 3) float32 in [0, 1] of 8 bits, 16 bits or floating values."""
+    array = np.asarray(image)
+    check.shape(array, (camera.height, camera.width, 3), name)
+    if array.dtype in (np.uint8, np.uint16):
+        return array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
+    if array.dtype.kind != "f":
+        raise ValueError(f"{name}: got {array.dtype}, expected uint8, uint16 or floating")
+    check.finite(array, name)
+    if array.min() < 0 or array.max() > 1:
+        raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
+    return array.astype(np.float32)

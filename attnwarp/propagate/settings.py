@@ -1,0 +1,308 @@
+"""The choices that Algorithm 1 is made of, and presets: the paper's text, its released code, and
+what measures right.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+from attnwarp import check
+from attnwarp.editing.attention import Block, Kind
+from attnwarp.warp import PRESETS as WARP_PRESETS
+from attnwarp.warp import WarpSettings
+
+Method = Literal["warp", "each view alone"]
+Noise = Literal["shared", "fresh"]
+StartPicture = Literal["render", "original"]
+DepthFrom = Literal["frozen", "current"]
+Decay = Literal["linear", "constant"]
+FeatureType = Literal["float32", "float16"]
+Composite = Literal["none", "black", "original"]
+Training = Literal["all", "stage", "modulo"]
+Background = Literal["black", "white", "random"]
+Detail = Literal["change", "none"]
+PsnrViews = Literal["all", "before_last_stage"]
+
+MOST_VIEWS = 40
+"""Views of a stage in the paper."""
+
+_CHOICES: dict[str, Any] = {
+    "method": Method,
+    "noise": Noise,
+    "start_picture": StartPicture,
+    "depth_from": DepthFrom,
+    "decay": Decay,
+    "feature_type": FeatureType,
+    "composite": Composite,
+    "training": Training,
+    "background": Background,
+    "detail": Detail,
+    "psnr_views": PsnrViews,
+}
+
+
+@dataclass(frozen=True)
+class PropagateSettings:
+    """Every choice of :func:`attnwarp.propagate.propagate`; the defaults are ``corrected``.
+
+    Args:
+        method: "warp" carries the source's features into each view; "each view alone" edits each
+            view by itself, with all else equal: the control.
+        stages: of editing and tuning.
+        views_per_stage: new views that a stage edits. None: an equal share of the views, at most
+            40. A stage for which no view is left is dropped.
+        seed: of the subsets, the noise, and the order of tuning.
+        size: longest side in px at which the editor works; None for the cameras' own. Sides are
+            rounded to what the editor takes.
+        steps: of denoising.
+        noise: "shared" by source and targets, or "fresh" for each view.
+        start: (lowest, highest) timestep, of which one is drawn for all views, to start from in
+            place of pure noise.
+        start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
+        text_guidance: s_T of the first stage; None for the editor's own.
+        guidance_drop: what each further stage takes off s_T.
+        source_text_guidance: s_T of the source; None for the first stage's.
+        batch: target views that go through the network together. Another batch gives other bits.
+        warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
+        mask: False injects wherever the target has a depth (the ablation "no M").
+        depth_from: the model before the edit ("frozen") or as tuned so far ("current").
+        a0: weight of the injected features at the first step.
+        decay: "linear", a_t = a0 (T - t) / T, or "constant".
+        fractions, kinds, blocks: layers, :func:`attnwarp.editing.attention.choose_layers`.
+        branches: guidance branches that get features. None: text and image of InstructPix2Pix,
+            both of a ControlNet.
+        feature_type: of the recorded features; float16 halves their memory and rounds.
+        composite: what stands outside the segments, where they are given: the edit ("none"),
+            "black", or the "original" picture.
+        composite_blur: sigma in px that the segments are blurred with before compositing.
+        iterations: of tuning in each stage, one view each.
+        training: views that a stage tunes on. "all": the source and everything edited so far.
+            "stage": the stage's views. "modulo": view ``step % n`` of the stage's n views, but the
+            source at every tenth step; of 40 views 4 are then never visited (the released code).
+        l1, perceptual, normal, distortion: weights of the losses.
+        perceptual_encoder: :func:`attnwarp.encoders.load_encoder`'s name of the perceptual loss.
+        color_rate: factor of the published learning rates of colours. Adam moves a coefficient by
+            at most its rate in a step: at 1, 900 steps change a colour by at most 0.63.
+        geometry_rate: factor of the learning rates of centres, scales, rotations and opacities; 0
+            tunes colours alone.
+        background: behind the splats while tuning.
+        detail: where the editor works at a smaller size than the pictures', "change" adds the
+            edit's change, enlarged, to the full picture; "none" tunes at the editor's size.
+        psnr_views: views that Edit PSNR counts; "before_last_stage" as the released code has it.
+
+    Raises:
+        ValueError: an unknown choice or a number out of range; the message names the field.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from attnwarp.propagate import PRESETS, PropagateSettings
+        >>> PropagateSettings() == PRESETS["corrected"]
+        True
+        >>> replace(PropagateSettings(), a0=2)
+        Traceback (most recent call last):
+        ValueError: a0: got 2, expected a number in [0, 1]
+    """
+
+    method: Method = "warp"
+    stages: int = 3
+    views_per_stage: int | None = None
+    seed: int = 0
+    size: int | None = None
+    steps: int = 20
+    noise: Noise = "shared"
+    start: tuple[int, int] | None = None
+    start_picture: StartPicture = "render"
+    text_guidance: float | None = None
+    guidance_drop: float = 0.0
+    source_text_guidance: float | None = None
+    batch: int = 1
+    warp: WarpSettings = WARP_PRESETS["corrected"]
+    mask: bool = True
+    depth_from: DepthFrom = "frozen"
+    a0: float = 0.9
+    decay: Decay = "linear"
+    fractions: tuple[float, ...] = (1.0, 0.5)
+    kinds: tuple[Kind, ...] = ("self", "cross")
+    blocks: tuple[Block, ...] = ("up",)
+    branches: tuple[str, ...] | None = None
+    feature_type: FeatureType = "float32"
+    composite: Composite = "original"
+    composite_blur: float = 0.0
+    iterations: int = 300
+    training: Training = "all"
+    l1: float = 1.0
+    perceptual: float = 1.0
+    normal: float = 0.05
+    distortion: float = 0.01
+    perceptual_encoder: str = "perceptual-small"
+    color_rate: float = 4.0
+    geometry_rate: float = 1.0
+    background: Background = "black"
+    detail: Detail = "change"
+    psnr_views: PsnrViews = "all"
+
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            check.one_of(getattr(self, name), get_args(choices), name)
+        if not isinstance(self.mask, bool):
+            raise ValueError(f"mask: got {self.mask!r}, expected true or false")
+        if not isinstance(self.warp, WarpSettings):
+            raise ValueError(f"warp: got {self.warp!r}, expected WarpSettings")
+        for name in ("fractions", "kinds", "blocks", "branches", "start"):
+            value = getattr(self, name)
+            if isinstance(value, list):
+                object.__setattr__(self, name, tuple(value))
+            elif not isinstance(value, tuple) and not (
+                value is None and name in ("branches", "start")
+            ):
+                raise ValueError(f"{name}: got {value!r}, expected a list")
+        for name, (low, high) in _LIMITS.items():
+            _check_number(name, getattr(self, name), low, high)
+        _check_start(self.start)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
+        values = asdict(self)
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> PropagateSettings:
+        """The settings :meth:`to_dict` wrote. Fields left out take the default.
+
+        Raises:
+            ValueError: a key that is no field, or a value out of range.
+        """
+        for key in data:
+            check.one_of(key, [field.name for field in fields(cls)], "setting")
+        values = dict(data)
+        if isinstance(values.get("warp"), dict):
+            values["warp"] = WarpSettings.from_dict(values["warp"])
+        return cls(**values)
+
+    def guidance(self, stage: int) -> float | None:
+        """s_T of a stage, counted from 0; None for the editor's own.
+
+        Example:
+            >>> from attnwarp.propagate import PRESETS
+            >>> [PRESETS["released"].guidance(stage) for stage in range(3)]
+            [12.5, 11.0, 9.5]
+        """
+        if self.text_guidance is None:
+            return None
+        return self.text_guidance - self.guidance_drop * stage
+
+
+_WHOLE = {"stages", "views_per_stage", "seed", "size", "steps", "batch", "iterations"}
+_OPTIONAL = {"views_per_stage", "size", "text_guidance", "source_text_guidance"}
+_LIMITS: dict[str, tuple[float, float]] = {
+    "stages": (1, math.inf),
+    "views_per_stage": (1, math.inf),
+    "seed": (0, 2**62),
+    "size": (1, math.inf),
+    "steps": (1, 1000),
+    "text_guidance": (0, math.inf),
+    "guidance_drop": (0, math.inf),
+    "source_text_guidance": (0, math.inf),
+    "batch": (1, math.inf),
+    "a0": (0, 1),
+    "composite_blur": (0, math.inf),
+    "iterations": (0, math.inf),
+    "l1": (0, math.inf),
+    "perceptual": (0, math.inf),
+    "normal": (0, math.inf),
+    "distortion": (0, math.inf),
+    "color_rate": (0, math.inf),
+    "geometry_rate": (0, math.inf),
+}
+
+
+def _check_number(name: str, value: Any, low: float, high: float) -> None:
+    if value is None and name in _OPTIONAL:
+        return
+    whole = name in _WHOLE
+    right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    if not right or not math.isfinite(value) or not low <= value <= high:
+        kind = "a whole number" if whole else "a number"
+        bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+        raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
+
+
+def _check_start(start: tuple[int, int] | None) -> None:
+    if start is None:
+        return
+    right = len(start) == 2 and all(isinstance(t, int) and t >= 0 for t in start)
+    if not right or start[0] > start[1]:
+        raise ValueError(f"start: got {list(start)}, expected [lowest, highest] timestep")
+
+
+_RELEASED = PropagateSettings(
+    views_per_stage=MOST_VIEWS,
+    start=(700, 980),
+    text_guidance=12.5,
+    guidance_drop=1.5,
+    warp=WARP_PRESETS["released"],
+    depth_from="current",
+    composite_blur=1.5,
+    training="modulo",
+    color_rate=1.0,
+    background="random",
+    psnr_views="before_last_stage",
+)
+
+PRESETS: dict[str, PropagateSettings] = {
+    "paper": PropagateSettings(
+        views_per_stage=MOST_VIEWS,
+        warp=WARP_PRESETS["paper"],
+        depth_from="current",
+        composite="black",
+        training="stage",
+        color_rate=1.0,
+    ),
+    "released": _RELEASED,
+    "released-controlnet": replace(
+        _RELEASED,
+        noise="fresh",
+        start=None,
+        text_guidance=12.5,
+        guidance_drop=0.0,
+        source_text_guidance=7.5,
+    ),
+    "corrected": PropagateSettings(),
+}
+"""Sets of choices, each with the warp of that name (:data:`attnwarp.warp.PRESETS`).
+
+``paper``: the text. Each stage draws 40 views and tunes on these alone, depth comes from the scene
+as it stands, and pictures are black outside the segments. What the text leaves open is as in
+``corrected``.
+
+``released``: the authors' code with InstructPix2Pix. One timestep in [700, 980] and one noise for
+all views, s_T = 12.5 - 1.5 stage, depth of the current model, tuning by the step's number modulo
+the stage's views, segments blurred with sigma 1.5. ``released-controlnet``: the same with a
+ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and the targets 12.5.
+
+``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
+tunes on everything edited so far, with larger steps of the colours.
+"""
+
+
+def preset(name: str, **changes: Any) -> PropagateSettings:
+    """A preset, with some of its fields changed; ``warp.NAME`` reaches a field of its warp.
+
+    Raises:
+        ValueError: an unknown preset or field, or a value out of range; the message names it.
+
+    Example:
+        >>> from attnwarp.propagate import preset
+        >>> preset("corrected", stages=1, **{"warp.opaque": 0.9}).warp.opaque
+        0.9
+    """
+    check.one_of(name, list(PRESETS), "preset")
+    values = PRESETS[name].to_dict()
+    for key, value in changes.items():
+        if key.startswith("warp."):
+            values["warp"] = {**values["warp"], key.removeprefix("warp."): value}
+        else:
+            values[key] = value
+    return PropagateSettings.from_dict(values)

@@ -1,0 +1,233 @@
+"""Tuning of the splats on edited views: L1, perceptual distance, normals, depth distortion."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import torch
+from torch import Tensor
+
+from attnwarp import losses
+from attnwarp.camera import Camera
+from attnwarp.encoders import load_encoder
+from attnwarp.fit import FitSettings, extent_of
+from attnwarp.fit.checkpoint import load, save
+from attnwarp.fit.model import Model
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import FileFormatError
+from attnwarp.propagate.pictures import Image
+from attnwarp.propagate.settings import PropagateSettings
+from attnwarp.render import Render, render
+
+SOURCE_EVERY = 10
+"""The released code tunes on the source at every tenth step."""
+
+
+class PerceptualLoss(Protocol):
+    """A perceptual distance with a gradient."""
+
+    def loss(self, image: Tensor, target: Tensor) -> Tensor:
+        """() of two (H, W, 3) pictures in [0, 1]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """A view to tune on.
+
+    Attributes:
+        number: of the view.
+        camera: of the size of the picture.
+        picture: (H, W, 3) in [0, 1].
+    """
+
+    number: int
+    camera: Camera
+    picture: Image
+
+
+class Tuning:
+    """Splats, their optimiser and its place in the work; goes on through all stages.
+
+    Args:
+        start: the splats before the edit.
+        cameras: of all views; they decide the extent.
+        settings: losses, iterations, rates.
+        stages: number of stages, over which the centres' learning rate falls.
+        backend: of the renderer.
+
+    Attributes:
+        iteration: iterations done, over all stages.
+        loss: of the last iteration.
+        visits: how often each view was tuned on, by its number.
+    """
+
+    def __init__(
+        self,
+        start: Gaussians,
+        cameras: Sequence[Camera],
+        settings: PropagateSettings,
+        stages: int,
+        backend: str = "auto",
+    ) -> None:
+        self.settings, self.stages, self.backend = settings, stages, backend
+        rates = FitSettings(kind=start.kind)
+        c, g = settings.color_rate, settings.geometry_rate
+        self.fit = FitSettings(
+            kind=start.kind,
+            sh_degree=start.sh_degree,
+            antialiased=start.antialiased,
+            lr_means=g * rates.lr_means,
+            lr_means_final=g * rates.lr_means_final,
+            lr_dc=c * rates.lr_dc,
+            lr_rest=c * rates.lr_rest,
+            lr_opacity=g * rates.lr_opacity,
+            lr_scales=g * rates.lr_scales,
+            lr_quats=g * rates.lr_quats,
+        )
+        self.model = Model(start, self.fit, extent_of(cameras))
+        self.random = torch.Generator().manual_seed(settings.seed)
+        self.queue: list[int] = []
+        self.iteration = 0
+        self.loss = math.nan
+        self.visits: dict[int, int] = {}
+        self._perceptual: PerceptualLoss | None = None
+
+    def gaussians(self) -> Gaussians:
+        """The splats as they stand, outside autograd."""
+        return self.model.gaussians().detach()
+
+    def stage(
+        self,
+        number: int,
+        views: Sequence[TrainingView],
+        source: TrainingView,
+        *,
+        checkpoint: Path,
+        checkpoint_seconds: float = 30.0,
+        watch: Callable[[], None] | None = None,
+    ) -> None:
+        """Tune through a stage, from wherever it stands to its end.
+
+        Args:
+            number: of the stage, from 0.
+            views: to tune on; the settings' ``training`` says how.
+            source: the source view.
+            checkpoint: file that is written every ``checkpoint_seconds`` and at the end.
+            watch: called after each iteration.
+        """
+        end = (number + 1) * self.settings.iterations
+        if self.iteration == number * self.settings.iterations:
+            self.queue = []  # of the stage before, whose views were fewer
+        written = time.perf_counter()
+        while self.iteration < end:
+            self._iterate(number, views, source)
+            if watch is not None:
+                watch()
+            if self.iteration < end and time.perf_counter() - written >= checkpoint_seconds:
+                save(checkpoint, self.state())
+                written = time.perf_counter()
+        save(checkpoint, self.state())
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next iteration depends on."""
+        return {
+            "model": self.model.state(),
+            "random": self.random.get_state(),
+            "queue": list(self.queue),
+            "iteration": self.iteration,
+            "loss": self.loss,
+            "visits": dict(self.visits),
+        }
+
+    def restore(self, path: Path) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            FileFormatError: it is damaged.
+        """
+        state = load(path)
+        try:
+            self.model.restore(state["model"])
+            self.random.set_state(state["random"])
+            self.queue = list(state["queue"])
+            self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
+            self.visits = {int(view): int(n) for view, n in state["visits"].items()}
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise FileFormatError(path, f"lacks something ({error}); remove it") from error
+
+    def next_view(
+        self, number: int, views: Sequence[TrainingView], source: TrainingView
+    ) -> TrainingView:
+        """The view of the next iteration."""
+        step = self.iteration - number * self.settings.iterations
+        if self.settings.training == "modulo":
+            return source if step % SOURCE_EVERY == 0 else views[step % len(views)]
+        if not self.queue:
+            self.queue = torch.randperm(len(views), generator=self.random).tolist()
+        return views[self.queue.pop()]
+
+    def _iterate(self, number: int, views: Sequence[TrainingView], source: TrainingView) -> None:
+        view = self.next_view(number, views, source)
+        background = self._background()
+        try:
+            gaussians = self.model.gaussians()
+        except ValueError as error:
+            raise RuntimeError(f"tuning, iteration {self.iteration}: {error}") from error
+        picture = render(
+            gaussians,
+            view.camera,
+            backend=self.backend,
+            background=background,
+            near=self.fit.near * self.model.extent,
+        )
+        loss = self.loss_of(picture, torch.from_numpy(view.picture))
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise RuntimeError(
+                f"tuning, iteration {self.iteration}: the loss is {value} on view"
+                f" {view.camera.name!r}; lower geometry_rate"
+            )
+        loss.backward()
+        self.iteration += 1
+        self.model.step(self.iteration / max(1, self.stages * self.settings.iterations))
+        self.loss = value
+        self.visits[view.number] = self.visits.get(view.number, 0) + 1
+
+    def loss_of(self, view: Render, target: Tensor) -> Tensor:
+        """The weighted sum of the losses.
+
+        Args:
+            view: the render.
+            target: (H, W, 3) in [0, 1].
+        """
+        s = self.settings
+        image = view.color.float()
+        target = target.to(image.device)
+        loss = s.l1 * losses.l1(image, target)
+        if s.perceptual:
+            distance = self.perceptual_net().loss(image.clamp(0, 1), target)
+            loss = loss + s.perceptual * distance.to(loss)
+        if s.normal:
+            loss = loss + s.normal * losses.normal_consistency(view)
+        if s.distortion:
+            loss = loss + s.distortion * losses.depth_distortion(view, scale=self.model.extent)
+        return loss
+
+    def perceptual_net(self) -> PerceptualLoss:
+        """The perceptual distance, loaded when it is first asked for."""
+        if self._perceptual is None:
+            net = load_encoder(self.settings.perceptual_encoder, "perceptual")
+            self._perceptual = cast(PerceptualLoss, net)
+        return self._perceptual
+
+    def _background(self) -> Tensor:
+        choice = self.settings.background
+        if choice == "random":
+            return torch.rand(3, generator=self.random)
+        return torch.full((3,), 1.0 if choice == "white" else 0.0)

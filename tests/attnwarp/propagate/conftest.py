@@ -1,0 +1,37 @@
+import pytest
+import torch
+from tiny_editors import pix2pix
+from tiny_scenes import cameras, pictures, splats
+
+from attnwarp.editing.pix2pix import InstructPix2Pix
+
+
+@pytest.fixture(autouse=True, scope="package")
+def one_thread():
+    """Pictures this small gain nothing from threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def editor():
+    pipe = pix2pix()
+    # With random weights attention is a faint mean of all tokens; it is made to look and to count.
+    for name, module in pipe.unet.named_modules():
+        if name.startswith("up_blocks") and name.endswith((".attn1", ".attn2")):
+            module.to_q.weight.data *= 10
+            module.to_k.weight.data *= 10
+            module.to_v.weight.data *= 10
+            module.to_out[0].weight.data *= 10
+    return InstructPix2Pix(
+        pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler, text_guidance=3.0
+    )
+
+
+@pytest.fixture(scope="session")
+def scene():
+    """Splats, cameras, and pictures before the edit."""
+    model, views = splats(), cameras()
+    return model, views, pictures(model, views)

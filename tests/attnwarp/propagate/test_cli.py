@@ -1,0 +1,201 @@
+"""The command as a person runs it, on a small random editor in a folder; the oracle is the library and the files."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from base64 import b64decode
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_editors import pix2pix
+from tiny_scenes import cameras, pictures, splats
+from typer.testing import CliRunner
+
+from attnwarp.cli import app
+from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
+from attnwarp.io.images import encode_png
+
+runner = CliRunner()
+QUICK = (
+    "--steps",
+    2,
+    "--iterations",
+    3,
+    "--stages",
+    2,
+    "--views-per-stage",
+    1,
+    "--size",
+    32,
+    "--threads",
+    1,
+)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A data set, its splats, and an editor."""
+    folder = tmp_path_factory.mktemp("edit")
+    model, views = splats(), cameras()
+    (folder / "data" / "images").mkdir(parents=True)
+    paths = []
+    for camera, image in zip(views, pictures(model, views), strict=True):
+        paths.append(folder / "data" / "images" / camera.name)
+        paths[-1].write_bytes(encode_png(np.rint(255 * image).astype(np.uint8)))
+    points = model.world_means()
+    write_transforms(
+        folder / "data", Dataset(views, paths, points, np.full(points.shape, 99, np.uint8))
+    )
+    write_ply(folder / "splats.ply", model)
+    pix2pix().save_pretrained(folder / "editor")
+    return folder
+
+
+def run(place, out, *more, instruction="a bear"):
+    arguments = [
+        "edit",
+        place / "data",
+        "--instruction",
+        instruction,
+        "--editor",
+        place / "editor",
+        "--out",
+        out,
+    ]
+    return runner.invoke(app, [*map(str, arguments), *map(str, QUICK), *map(str, more)])
+
+
+class Page(HTMLParser):
+    """Pictures and links of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.pictures, self.other = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        if tag == "img":
+            self.pictures.append(b64decode(values["src"].removeprefix("data:image/png;base64,")))
+        elif "src" in values or "href" in values:
+            self.other.append(values)
+
+
+def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_path):
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--source", "v2.png")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines()[-1] == str(tmp_path / "index.html")
+    edited = read_ply(tmp_path / "edited.ply")
+    assert len(edited) == 60
+    assert not np.array_equal(edited.sh, read_ply(place / "splats.ply").sh)
+    page = Page((tmp_path / "index.html").read_text())
+    assert page.other == []
+    files = {path.read_bytes() for path in tmp_path.rglob("*.png")}
+    assert set(page.pictures) <= files
+    # Source: 4 pictures; two edited views: 5 each; two views that were not edited: 2 each.
+    assert len(page.pictures) == 4 + 2 * 5 + 2 * 2
+    assert (tmp_path / "source.png").read_bytes() in page.pictures
+    assert not (tmp_path / "fit").exists()
+
+
+def test_without_splats_it_fits_them_first(place, tmp_path):
+    result = run(place, tmp_path, "--fit-iterations", 5)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "fit" / "splats.ply").is_file()
+    assert (tmp_path / "edited.ply").is_file()
+
+
+def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((32, 32, 3), np.uint8)
+    half[:, :16] = 255
+    for camera in cameras():
+        (masks / camera.name).write_bytes(encode_png(half))
+    hand = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    (tmp_path / "hand.png").write_bytes(encode_png(hand))
+    result = run(
+        place, tmp_path / "out", "--ply", place / "splats.ply", "--masks", masks, "--source-picture", tmp_path / "hand.png",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    source = read_image(tmp_path / "out" / "source.png")
+    original = read_image(place / "data" / "images" / "v0.png")
+    assert np.array_equal(source[:, :16], hand[:, :16])
+    assert np.array_equal(source[:, 16:], original[:, 16:])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--source", "v9"), "--source: got 'v9', expected a view's name or a number below 5"),
+        (("--editor", "smal"), "editor 'smal': neither bundled"),
+        (("--set", "opaqe=1"), "setting: got 'opaqe', expected one of"),
+        (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
+        (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
+        (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
+        (("--source-picture", "no.png"), "no.png: no such file"),
+        (("--ply", "no.ply"), "no.ply: no such file"),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path):
+    ply = () if "--ply" in more else ("--ply", place / "splats.ply")
+    result = run(place, tmp_path / "out", *ply, *more)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert len(result.output.strip().splitlines()) == 1
+
+
+def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path, *ply).exit_code == 0
+    result = run(place, tmp_path, *ply, instruction="a robot")
+    assert result.exit_code == 2
+    assert 'instruction ("a bear", now "a robot")' in result.output
+    assert "name another folder" in result.output
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from typer.testing import CliRunner; from attnwarp.cli import app;"
+        "assert CliRunner().invoke(app, ['edit', '--help']).exit_code == 0;"
+        "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_a_process_that_is_killed_and_started_again_leaves_the_same_bytes(place, tmp_path):
+    def command(out):
+        arguments = [
+            "edit", place / "data", "--instruction", "a bear", "--editor", place / "editor", "--out", out, "--ply",
+            place / "splats.ply", *QUICK, "--iterations", 60,
+        ]  # fmt: skip
+        return [sys.executable, "-m", "attnwarp.cli", *map(str, arguments)]
+
+    def files(out):
+        # The page shows the seconds.
+        skipped = {"times.json", "index.html"}
+        paths = [path for path in sorted(Path(out).rglob("*")) if path.is_file()]
+        return {str(p.relative_to(out)): p.read_bytes() for p in paths if p.name not in skipped}
+
+    subprocess.run(command(tmp_path / "whole"), check=True, capture_output=True)
+    expected = files(tmp_path / "whole")
+    marks = ["manifest.json", "source.json", "views/.*json", "stages/1.pt", "stages/2.ply"]
+    for mark in marks:
+        process = subprocess.Popen(command(tmp_path / "killed"), stderr=subprocess.DEVNULL)
+        while process.poll() is None:
+            names = [
+                p.relative_to(tmp_path / "killed").as_posix()
+                for p in (tmp_path / "killed").rglob("*")
+            ]
+            if any(re.fullmatch(mark, name) for name in names):
+                os.kill(process.pid, signal.SIGKILL)
+            time.sleep(0.005)
+    subprocess.run(command(tmp_path / "killed"), check=True, capture_output=True)
+    assert files(tmp_path / "killed") == expected

@@ -1,0 +1,414 @@
+"""Oracles: the editor's own loop, a float64 pass written out with its geometry, counts by hooks, bytes of files."""
+
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_scenes import cameras, pictures, splats
+
+from attnwarp import Camera, Gaussians
+from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.errors import InputError
+from attnwarp.io import read_image, read_ply
+from attnwarp.propagate import preset, propagate
+from attnwarp.propagate.pictures import to_bytes
+from attnwarp.warp import preset as warp_preset
+
+QUICK = preset("corrected", stages=2, views_per_stage=2, steps=2, iterations=3)
+
+
+def files(folder):
+    """Everything that has to be the same after a kill: all but the seconds."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file() and path.name != "times.json"
+    }
+
+
+def run(scene, editor, folder=None, settings=QUICK, words="a bear", **more):
+    model, views, images = scene
+    return propagate(model, views, images, editor, words, settings, folder=folder, **more)
+
+
+@pytest.fixture(scope="module")
+def finished(scene, editor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    return run(scene, editor, folder), folder
+
+
+def test_the_source_is_edited_as_the_editor_alone_does(finished, scene, editor):
+    result, folder = finished
+    alone = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0).images[0]
+    assert np.array_equal(result.edited[0], to_bytes(alone))
+    assert np.array_equal(read_image(folder / "source.png"), to_bytes(alone))
+
+
+def test_a_view_at_the_sources_place_gets_the_sources_edit(scene, editor):
+    model, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
+    result = propagate(model, [views[0], twin], [images[0], images[0]], editor, "a bear", settings)
+    assert np.array_equal(result.edited[0], result.edited[1])
+
+
+def test_weight_zero_is_each_view_alone_bit_for_bit(scene, editor, tmp_path):
+    run(scene, editor, tmp_path / "zero", replace(QUICK, a0=0.0))
+    run(scene, editor, tmp_path / "alone", replace(QUICK, method="each view alone"))
+    zero, alone = files(tmp_path / "zero"), files(tmp_path / "alone")
+    same = [name for name in alone if name.startswith(("views/", "stages/", "edited"))]
+    assert sum(name.endswith(".png") for name in same) == 4
+    assert "edited.ply" in same
+    for name in same:
+        if not name.endswith(".json"):
+            assert zero[name] == alone[name], name
+    # Injection does change the views, or the test above would show nothing.
+    full = run(scene, editor, settings=replace(QUICK, a0=1.0))
+    for view in full.plan.stages[0]:
+        name = Path(scene[1][view].name).stem
+        picture = read_image(tmp_path / "alone" / "views" / f"{name}.png")
+        assert not np.array_equal(full.edited[view], picture)
+
+
+def wall():
+    """One disc so large that both cameras see it alone, in the plane z = 0."""
+    color = Gaussians.sh_from_rgb(torch.tensor([[0.8, 0.4, 0.2]]))
+    return Gaussians(
+        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 50.0), torch.ones(1), color,
+    )  # fmt: skip
+
+
+def positions(source, target, h, w):
+    """(h, w, 2) where the source sees what the target's (h, w) grid sees, on the plane z = 0."""
+    grid, onto = target.resize(w, h), source.resize(w, h)
+    rays = grid.directions() @ grid.rotation
+    points = grid.position - rays * (grid.position[2] / rays[..., 2])[..., None]
+    return onto.project(points)[0]
+
+
+def blended(own, source, xy, a):
+    """(h w, C) float64: bilinear, the border repeated, pixel by pixel."""
+    h, w = xy.shape[:2]
+    grid, result = source.reshape(h, w, -1), own.clone()
+    for y in range(h):
+        for x in range(w):
+            u = min(max(xy[y, x, 0] - 0.5, 0.0), w - 1.0)
+            v = min(max(xy[y, x, 1] - 0.5, 0.0), h - 1.0)
+            left, top = int(u), int(v)
+            right, below = min(left + 1, w - 1), min(top + 1, h - 1)
+            du, dv = u - left, v - top
+            warped = (1 - dv) * ((1 - du) * grid[top, left] + du * grid[top, right]) + dv * (
+                (1 - du) * grid[below, left] + du * grid[below, right]
+            )
+            result[y * w + x] = a * warped + (1 - a) * own[y * w + x]
+    return result
+
+
+def test_one_step_is_the_written_out_injection_in_float64(editor, monkeypatch):
+    from attnwarp.propagate import editing
+
+    edits = []
+    monkeypatch.setattr(editing, "edit", lambda *a, **k: edits.append(edit(*a, **k)) or edits[-1])
+    model, views = wall(), cameras(2)
+    random = np.random.default_rng(0)
+    images = [random.random((32, 32, 3)).astype(np.float32) for _ in views]
+    settings = replace(
+        QUICK, steps=1, stages=1, iterations=0, a0=0.7, mask=False, warp=warp_preset("corrected", normal_test="none"),
+    )  # fmt: skip
+    result = propagate(model, views, images, editor, "a bear", settings)
+
+    exact = copy.copy(editor)
+    exact.unet = copy.deepcopy(editor.unet).double()
+    exact.vae = copy.deepcopy(editor.vae).double()
+    timestep = editor.timesteps(1)[0]
+    texts = editor.embed(["a bear", ""]).double()[[0, 1, 1]]
+    noise = shared_noise((1, 4, 16, 16), 0).double()
+
+    def one_pass(image, hook):
+        pixels = torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None]
+        before = exact.vae.encode(2 * pixels - 1).latent_dist.mode()
+        x = torch.cat([torch.cat([noise] * 3), torch.cat([before, before, 0 * before])], dim=1)
+        handles = [
+            module.register_forward_hook(lambda m, args, out, name=name: hook(name, out))
+            for name, module in exact.unet.named_modules()
+            if name.startswith("up_blocks") and name.endswith((".attn1", ".attn2"))
+        ]
+        with torch.no_grad():
+            out = exact.unet(x, torch.tensor(timestep), encoder_hidden_states=texts).sample
+            for handle in handles:
+                handle.remove()
+            text, image_only, uncond = out
+            e = uncond + 3.0 * (text - image_only) + 1.5 * (image_only - uncond)
+            alpha = float(editor.schedule.alphas[timestep])
+            x0 = (noise - (1 - alpha) ** 0.5 * e) / alpha**0.5
+            last = editor.schedule.final_alpha
+            latents = last**0.5 * x0 + (1 - last) ** 0.5 * e
+            decoded = exact.vae.decode(latents / exact.vae.config.scaling_factor).sample[0]
+        return latents, (decoded / 2 + 0.5).clamp(0, 1).permute(1, 2, 0).numpy()
+
+    recorded = {}
+
+    def keep(name, out):
+        recorded[name] = out.clone()
+
+    def inject(name, out):
+        side = round(out.shape[1] ** 0.5)
+        xy = positions(views[0], views[1], side, side)
+        rows = [blended(out[k], recorded[name][k], xy, 0.7) for k in (0, 1)]
+        return torch.stack([*rows, out[2]])
+
+    expected = one_pass(images[0], keep), one_pass(images[1], inject)
+    assert len(recorded) == 8
+    for view, (latents, picture) in enumerate(expected):
+        # float32 through a network whose attention is made loud.
+        assert torch.allclose(edits[view].latents.double(), latents, rtol=0, atol=2e-4)
+        assert np.abs(result.edited[view] / 255 - picture).max() < 0.5 / 255 + 1e-4
+    alone, _ = one_pass(images[1], lambda name, out: None)
+    assert (alone - expected[1][0]).abs().max() > 0.02  # 100 times the tolerance
+
+
+def test_the_folder_holds_what_a_person_wants(finished, scene):
+    result, folder = finished
+    names = {Path(camera.name).stem for camera in scene[1]}
+    edited = {Path(scene[1][view].name).stem for stage in result.plan.stages for view in stage}
+    for part, expected in (
+        ("views", edited), ("masks", edited), ("features", edited), ("renders/before", names), ("renders/after", names),
+    ):  # fmt: skip
+        assert {path.stem for path in (folder / part).glob("*.png")} == expected
+    assert (folder / "features.png").is_file()
+    assert not (folder / ".recording").exists()
+    last = read_ply(folder / "stages" / "2.ply")
+    assert torch.equal(read_ply(folder / "edited.ply").means, last.means)
+    assert torch.allclose(result.gaussians.means, last.means, rtol=0, atol=1e-6)
+    seconds = json.loads((folder / "times.json").read_text())
+    assert set(seconds) == {"source", "warp", "edit", "write", "tune", "render"}
+    assert all(value > 0 for value in seconds.values())
+
+
+def test_counters_are_what_was_done(scene, editor):
+    rows = 0
+
+    def count(module, args, kwargs):
+        nonlocal rows
+        rows += (args[0] if args else kwargs["sample"]).shape[0]
+
+    handle = editor.unet.register_forward_pre_hook(count, with_kwargs=True)
+    result = run(scene, editor, settings=replace(QUICK, batch=2))
+    handle.remove()
+    assert result.counters["network_rows"] == rows == 5 * 2 * 3
+    assert result.counters["iterations"] == 6
+    assert result.counters["views"] == 5
+
+
+def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, editor):
+    result, folder = finished
+    errors = {}
+    for view in result.plan.edited:
+        name = Path(scene[1][view].name).stem
+        picture = result.edited[view] / 255
+        render = read_image(folder / "renders" / "after" / f"{name}.png") / 255
+        errors[name] = np.square(picture - render).mean()
+    assert result.edit_psnr["views"] == list(errors)
+    pooled = -10 * np.log10(np.mean(list(errors.values())))
+    each = -10 * np.log10(list(errors.values()))
+    assert result.edit_psnr["pooled"] == pytest.approx(
+        pooled, abs=0.05
+    )  # renders rounded to 8 bits
+    assert result.edit_psnr["mean"] == pytest.approx(np.mean(each), abs=0.05)
+    released = run(scene, editor, settings=replace(QUICK, psnr_views="before_last_stage"))
+    assert released.edit_psnr["views"] == list(errors)[:3]
+
+
+def test_a_recording_on_disk_gives_the_same_bytes_and_goes_away(finished, scene, editor, tmp_path):
+    run(scene, editor, tmp_path, store="disk")
+    assert files(tmp_path) == files(finished[1])
+    assert not (tmp_path / ".recording").exists()
+
+
+class Killed(BaseException):
+    """Leaves the files as a kill would: nothing catches it but the atomic write."""
+
+
+def events(monkeypatch, stop):
+    """Count steps of progress and writes; die at number ``stop``, before a write or after it."""
+    from attnwarp.fit import checkpoint
+    from attnwarp.io import ply
+    from attnwarp.propagate import folder
+
+    count = 0
+
+    def event(*_):
+        nonlocal count
+        count += 1
+        if count == stop:
+            raise Killed
+
+    def wrapped(write):
+        def around(*args, **kwargs):
+            event()
+            write(*args, **kwargs)
+            event()
+
+        return around
+
+    for module in (checkpoint, ply, folder):
+        monkeypatch.setattr(module, "write_atomically", wrapped(module.write_atomically))
+    return event, lambda: count
+
+
+def killed_and_resumed(scene, editor, folder, moments):
+    """Kill a run at one moment after another, each counted from where the last sitting began."""
+    for moment in moments:
+        with pytest.MonkeyPatch.context() as patch:
+            watch, _ = events(patch, moment)
+            try:
+                run(scene, editor, folder, watch=watch, checkpoint_seconds=0)
+                return
+            except Killed:
+                pass
+    run(scene, editor, folder)
+
+
+def all_events(scene, editor, folder):
+    with pytest.MonkeyPatch.context() as patch:
+        watch, count = events(patch, None)
+        run(scene, editor, folder, watch=watch, checkpoint_seconds=0)
+    return count()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_at_a_random_moment_and_resumed_it_gives_the_same_bytes(
+    seed, finished, scene, editor, tmp_path
+):
+    moment = int(np.random.default_rng(seed).integers(1, 60))
+    killed_and_resumed(scene, editor, tmp_path, [moment])
+    assert files(tmp_path) == files(finished[1])
+
+
+@pytest.mark.slow
+def test_killed_at_20_random_moments_it_gives_the_same_bytes(finished, scene, editor, tmp_path):
+    total = all_events(scene, editor, tmp_path / "all")
+    assert files(tmp_path / "all") == files(finished[1])
+    random = np.random.default_rng(0)
+    for k, moment in enumerate(random.integers(1, total, 20)):
+        killed_and_resumed(scene, editor, tmp_path / str(k), [int(moment)])
+        assert files(tmp_path / str(k)) == files(finished[1]), moment
+    killed_and_resumed(scene, editor, tmp_path / "often", random.integers(1, 12, 20).tolist())
+    assert files(tmp_path / "often") == files(finished[1])
+
+
+@pytest.mark.parametrize(
+    ("settings", "words", "message"),
+    [
+        ({"steps": 3}, "a bear", r"settings\.steps \(2, now 3\)"),
+        ({"warp": warp_preset("corrected", opaque=0.9)}, "a bear", r"settings\.warp\.opaque \(0\.5, now 0\.9\)"),
+        ({}, "a robot", r'instruction \("a bear", now "a robot"\)'),
+    ],
+)  # fmt: skip
+def test_a_folder_of_another_edit_is_refused_by_name(
+    settings, words, message, finished, scene, editor
+):
+    before = files(finished[1])
+    with pytest.raises(InputError, match=message):
+        run(scene, editor, finished[1], replace(QUICK, **settings), words)
+    assert files(finished[1]) == before
+
+
+def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
+    model, views, images = scene
+    with pytest.raises(InputError, match=r"inputs\.images"):
+        run((model, views, [1 - image for image in images]), editor, finished[1])
+    moved = replace(model, means=model.means + 0.01)
+    with pytest.raises(InputError, match=r"inputs\.splats"):
+        run((moved, views, images), editor, finished[1])
+
+
+def test_segments_leave_the_original_or_black_outside(scene, editor):
+    images = scene[2]
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :16] = True
+    settings = replace(QUICK, iterations=0)
+    whole = run(scene, editor, settings=settings)
+    kept = run(scene, editor, settings=settings, segments=lambda view, picture: left)
+    black = run(scene, editor, settings=replace(settings, composite="black"), segments=[left] * 5)
+    for view in whole.plan.edited:
+        assert np.array_equal(kept.edited[view][:, :16], whole.edited[view][:, :16])
+        assert np.array_equal(kept.edited[view][:, 16:], to_bytes(images[view])[:, 16:])
+        assert (black.edited[view][:, 16:] == 0).all()
+    with pytest.raises(ValueError, match=r"segments\[0\] \(v0.png\): got float64, expected bool"):
+        run(scene, editor, settings=settings, segments=[left * 1.0] * 5)
+
+
+def test_a_picture_edited_by_hand_is_the_source(scene, editor):
+    picture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    settings = replace(QUICK, iterations=0)
+    by_hand = run(scene, editor, settings=settings, source_picture=picture)
+    assert np.array_equal(by_hand.edited[0], picture)
+    plain = run(scene, editor, settings=settings)
+    for view in plain.plan.stages[0]:
+        assert not np.array_equal(by_hand.edited[view], plain.edited[view])
+
+
+def test_fresh_noise_is_each_views_own_and_shared_noise_is_one(scene, editor):
+    from attnwarp.propagate.editing import ViewEditor
+
+    guides = [scene[2][0]] * 2
+    shared = ViewEditor(editor, "a bear", QUICK, (32, 32)).noise(guides, [1, 2])
+    assert torch.equal(shared[0], shared[1])
+    fresh = ViewEditor(editor, "a bear", replace(QUICK, noise="fresh"), (32, 32))
+    first = fresh.noise(guides, [1, 2])
+    assert not torch.equal(first[0], first[1])
+    # A view's noise does not depend on who is edited beside it.
+    assert torch.equal(first[1], fresh.noise(guides[:1], [2])[0])
+
+
+def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
+    from attnwarp.propagate.editing import ViewEditor
+
+    drawn = set()
+    for seed in range(50):
+        settings = replace(QUICK, start=(700, 980), seed=seed)
+        drawn.add(ViewEditor(editor, "a bear", settings, (32, 32)).timestep)
+    assert min(drawn) >= 700
+    assert max(drawn) <= 980
+    assert len(drawn) > 30
+    result = run(scene, editor, settings=replace(QUICK, start=(700, 700), start_picture="original"))
+    noised = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0, start=700).images[0]
+    assert np.array_equal(result.edited[0], to_bytes(noised))
+
+
+def test_depth_of_the_frozen_model_does_not_follow_the_tuning(scene, editor, tmp_path):
+    rough = replace(QUICK, geometry_rate=200.0, kinds=("self",))
+    still = run(scene, editor, tmp_path / "still", replace(rough, iterations=0))
+    last = [Path(scene[1][view].name).stem for view in still.plan.stages[1]]
+
+    def pictures_of(name):
+        return [(tmp_path / name / "features" / f"{view}.png").read_bytes() for view in last]
+
+    run(scene, editor, tmp_path / "frozen", rough)
+    run(scene, editor, tmp_path / "current", replace(rough, depth_from="current"))
+    assert pictures_of("frozen") == pictures_of("still")
+    assert pictures_of("current") != pictures_of("still")
+
+
+def test_views_are_edited_at_the_editors_size_and_their_change_enlarged(scene, editor, tmp_path):
+    model, views = splats(), cameras(size=64)
+    images = pictures(model, views)
+    settings = replace(QUICK, size=32, iterations=0)
+    result = propagate(model, views, images, editor, "a bear", settings, folder=tmp_path)
+    assert {picture.shape for picture in result.edited.values()} == {(32, 32, 3)}
+    assert read_image(tmp_path / "masks" / "v1.png").shape == (64, 64, 3)
+
+
+def test_arguments_that_do_not_fit_are_named(scene, editor):
+    model, views, images = scene
+    with pytest.raises(ValueError, match="images: got 4, expected 5"):
+        propagate(model, views, images[:4], editor, "a bear", QUICK)
+    with pytest.raises(ValueError, match="source: got 5"):
+        propagate(model, views, images, editor, "a bear", QUICK, source=5)
+    with pytest.raises(ValueError, match="instruction: is empty"):
+        propagate(model, views, images, editor, "  ", QUICK)

@@ -1,0 +1,90 @@
+"""Oracle: the table "where paper and released code differ" of the method, written out."""
+
+import json
+from dataclasses import fields, replace
+
+import pytest
+
+from attnwarp.propagate import PRESETS, Plan, PropagateSettings, preset
+from attnwarp.warp import PRESETS as WARPS
+
+TABLE = {
+    # field: (paper, released, corrected)
+    "views_per_stage": (40, 40, None),
+    "warp": (WARPS["paper"], WARPS["released"], WARPS["corrected"]),
+    "noise": ("shared", "shared", "shared"),
+    "start": (None, (700, 980), None),
+    "depth_from": ("current", "current", "frozen"),
+    "training": ("stage", "modulo", "all"),
+    "text_guidance": (None, 12.5, None),
+    "guidance_drop": (0.0, 1.5, 0.0),
+    "composite": ("black", "original", "original"),
+    "composite_blur": (0.0, 1.5, 0.0),
+    "psnr_views": ("all", "before_last_stage", "all"),
+    "color_rate": (1.0, 1.0, 4.0),
+    "background": ("black", "random", "black"),
+}
+
+
+@pytest.mark.parametrize(("name", "column"), [("paper", 0), ("released", 1), ("corrected", 2)])
+def test_presets_are_the_columns_of_the_table_and_agree_in_all_else(name, column):
+    changed = {field: values[column] for field, values in TABLE.items()}
+    assert PRESETS[name] == replace(PropagateSettings(), **changed)
+
+
+def test_a_controlnet_of_the_released_code_draws_fresh_noise_and_has_other_guidance():
+    one, other = PRESETS["released"], PRESETS["released-controlnet"]
+    differing = {f.name for f in fields(one) if getattr(one, f.name) != getattr(other, f.name)}
+    assert differing == {"noise", "start", "guidance_drop", "source_text_guidance"}
+    assert other.noise == "fresh"
+    assert other.source_text_guidance == 7.5
+    assert [other.guidance(stage) for stage in range(3)] == [12.5, 12.5, 12.5]
+    assert [one.guidance(stage) for stage in range(3)] == [12.5, 11.0, 9.5]
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_settings_survive_json(name):
+    text = json.dumps(PRESETS[name].to_dict())
+    assert PropagateSettings.from_dict(json.loads(text)) == PRESETS[name]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"a0": 1.5}, "a0: got 1.5, expected a number in"),
+        ({"steps": 0}, "steps: got 0"),
+        ({"steps": 2.5}, "steps: got 2.5, expected a whole number"),
+        ({"noise": "frsh"}, "did you mean 'fresh'"),
+        ({"start": (5, 3)}, "start: got \\[5, 3\\]"),
+        ({"stagse": 1}, "did you mean 'stages'"),
+        ({"warp.opaqe": 1}, "did you mean 'opaque'"),
+        ({"mask": 1}, "mask: got 1, expected true or false"),
+    ],
+)
+def test_a_wrong_setting_is_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        preset("corrected", **change)
+
+
+@pytest.mark.parametrize(("views", "each"), [(10, 3), (10, 4), (64, None), (200, None), (2, 5)])
+def test_stages_are_disjoint_seeded_subsets_without_the_source(views, each):
+    settings = PropagateSettings(views_per_stage=each, seed=7)
+    plan = Plan.draw(views, 1, settings)
+    drawn = [view for stage in plan.stages for view in stage]
+    assert len(set(drawn)) == len(drawn)
+    assert set(drawn) <= set(range(views)) - {1}
+    expected = each or min(40, -(-(views - 1) // 3))
+    left = views - 1
+    for stage in plan.stages:
+        assert len(stage) == min(expected, left)
+        left -= len(stage)
+    assert plan == Plan.draw(views, 1, settings)
+    if views > 2:
+        assert plan != Plan.draw(views, 1, replace(settings, seed=8))
+
+
+def test_a_view_is_drawn_first_as_often_as_any_other():
+    first = [Plan.draw(5, 0, PropagateSettings(seed=seed)).stages[0][0] for seed in range(400)]
+    for view in (1, 2, 3, 4):
+        # Binomial with 400 trials of 1/4: mean 100, standard deviation 8.7; 5 of them.
+        assert abs(first.count(view) - 100) < 44

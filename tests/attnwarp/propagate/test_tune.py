@@ -1,0 +1,103 @@
+"""Oracles: the order written out, finite differences, a picture's own loss."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny_scenes import cameras, pictures, splats
+
+from attnwarp.encoders import load_encoder
+from attnwarp.propagate import preset
+from attnwarp.propagate.tune import TrainingView, Tuning
+from attnwarp.render import render
+
+SETTINGS = preset("corrected", iterations=40)
+
+
+def views_of(count, size=32):
+    place = cameras(1)[0]
+    return [TrainingView(k, place, np.zeros((size, size, 3), np.float32)) for k in range(count)]
+
+
+def visited(training, count=40, iterations=400):
+    settings = replace(SETTINGS, training=training, iterations=iterations)
+    tuning = Tuning(splats(), cameras(), settings, 1)
+    views, order = views_of(count), []
+    source = TrainingView(99, cameras(1)[0], np.zeros((32, 32, 3), np.float32))
+    for _ in range(iterations):
+        order.append(tuning.next_view(0, views, source).number)
+        tuning.iteration += 1
+    return order
+
+
+def test_the_released_order_never_visits_four_of_forty_views():
+    order = visited("modulo")
+    expected = [99 if step % 10 == 0 else step % 40 for step in range(400)]
+    assert order == expected
+    assert set(range(40)) - set(order) == {0, 10, 20, 30}
+
+
+def test_otherwise_every_view_is_visited_once_in_each_round():
+    order = visited("all")
+    for start in range(0, 400, 40):
+        assert sorted(order[start : start + 40]) == list(range(40))
+    assert order[:40] != order[40:80]
+
+
+def test_tuning_recolours_the_scene_to_its_pictures():
+    start, views = splats(), cameras()
+    goal = replace(start, sh=start.sh.flip(-1))  # red and blue exchanged
+    training = [
+        TrainingView(k, camera, picture)
+        for k, (camera, picture) in enumerate(zip(views, pictures(goal, views), strict=True))
+    ]
+    tuning = Tuning(start, views, replace(SETTINGS, iterations=250, color_rate=20.0), 1)
+
+    def error():
+        return sum(
+            float((render(tuning.gaussians(), v.camera).color - torch.from_numpy(v.picture)).abs().mean())
+            for v in training
+        )  # fmt: skip
+
+    before = error()
+    for _ in range(250):
+        tuning._iterate(0, training, training[0])
+    assert error() < 0.3 * before
+    assert sum(tuning.visits.values()) == 250
+
+
+def test_without_a_geometry_rate_only_colours_move():
+    start, views = splats(), cameras()
+    settings = replace(SETTINGS, geometry_rate=0.0)
+    tuning = Tuning(start, views, settings, 1)
+    for _ in range(5):
+        tuning._iterate(0, views_of(3), views_of(1)[0])
+    result = tuning.gaussians()
+    assert torch.equal(result.means, start.means)
+    assert torch.equal(result.quats, start.quats)
+    assert torch.allclose(result.scales, start.scales, rtol=1e-6, atol=0)  # through a logarithm
+    assert not torch.equal(result.sh, start.sh)
+
+
+def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
+    net = load_encoder("perceptual-small", "perceptual")
+    random = torch.Generator().manual_seed(0)
+    image, target, way = (torch.rand((32, 24, 3), generator=random) for _ in range(3))
+    assert float(net.loss(image, target)) == pytest.approx(
+        net.distance([image.numpy()], [target.numpy()])[0], rel=1e-5
+    )
+    assert float(net.loss(target, target)) == 0
+    net.net.double()
+    try:
+        x = image.double().requires_grad_(True)
+        net.loss(x, target.double()).backward()
+        slope = float((x.grad * way).sum())
+        step = 1e-5
+        ahead, behind = (
+            float(net.loss(x.detach() + s * way, target.double())) for s in (step, -step)
+        )
+        # ReLU has kinks; along so short a step few are crossed.
+        assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
+    finally:
+        net.net.float()
