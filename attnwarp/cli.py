@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
-from attnwarp.editing.cli import edit_image
+from attnwarp.editing.cli import SegmenterOption, WhereOption, edit_image
 from attnwarp.errors import InputWarning
 
 if TYPE_CHECKING:
@@ -502,6 +502,8 @@ def edit(
     masks: Annotated[
         Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
     ] = None,
+    words: WhereOption = None,
+    segmenter: SegmenterOption = "clip-small",
     stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
     views_per_stage: Annotated[
         int | None, typer.Option(min=1, help="New views a stage edits.")
@@ -577,8 +579,9 @@ def edit(
         result, page = edit_dataset(
             dataset, splats, editor, instruction, settings, out,
             fit_plan=FitPlan(fit_iterations, kind.value[:2], max_splats), source=source,
-            source_picture=source_picture, masks=masks, max_size=max_size, store=store.value,
-            device=device, say=lambda text: typer.echo(text, err=True),
+            source_picture=source_picture, masks=masks, words=words, segmenter=segmenter,
+            max_size=max_size, store=store.value, device=device,
+            say=lambda text: typer.echo(text, err=True),
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")

@@ -12,6 +12,17 @@ if TYPE_CHECKING:
 
 TILE_COLUMNS = 5
 
+WhereOption = Annotated[
+    str | None,
+    typer.Option(
+        "--where", metavar="WORDS", help='What is edited, such as "bear"; the rest stays.'
+    ),
+]
+SegmenterOption = Annotated[
+    str,
+    typer.Option(help="What --where asks: clip-small, or DINO_FOLDER,SAM_FOLDER (transformers)."),
+]
+
 
 def edit_image(
     picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
@@ -35,17 +46,27 @@ def edit_image(
     sheet: Annotated[
         Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
     ] = None,
+    words: WhereOption = None,
+    segmenter: SegmenterOption = "clip-small",
+    mask_out: Annotated[
+        Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
 ) -> None:
     """Edit a picture by an instruction."""
-    for path in (out, sheet):
+    if mask_out is not None and words is None:
+        raise ValueError("--mask: needs --where, which makes the mask")
+    for path in (out, sheet, mask_out):
         if path is not None and path.suffix.lower() != ".png":
             raise ValueError(f"{path}: expected a name that ends in .png")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
     image = _read(picture)
 
+    import numpy as np
+
     from attnwarp.editing.editor import edit
+    from attnwarp.editing.segment import load_segmenter
     from attnwarp.editing.small import load_editor
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
@@ -53,6 +74,12 @@ def edit_image(
     model = load_editor(editor, device=device, **given)
     image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)
     h, w = image.shape[:2]
+    share = None
+    if words is not None:
+        mask = load_segmenter(segmenter, device=device).segment(image, words)
+        share = mask[..., None].astype(np.float32)
+        if mask_out is not None:
+            _write(mask_out, np.repeat(share, 3, axis=2))
     tiles: list[Image] = [image]
     with typer.progressbar(length=steps, label=f"{w} x {h} px", file=_stderr()) as bar:
 
@@ -62,7 +89,8 @@ def edit_image(
                 tiles.append(model.decode(latents)[0])
 
         result = edit(model, [image], instruction, steps=steps, seed=seed, watch=watch)
-    _write(out, result.images[0])
+    edited = result.images[0]
+    _write(out, edited if share is None else share * edited + (1 - share) * image)
     if sheet is not None:
         _write(sheet, _sheet(tiles))
     typer.echo(out)

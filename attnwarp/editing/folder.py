@@ -60,19 +60,19 @@ def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict
 
     def model(name: str, *kinds: Any) -> Any:
         place = folder / name
-        with _readable(place):
+        with readable(place):
             wanted = json.loads((place / "config.json").read_text()).get("_class_name", "")
         kind = next((k for k in kinds if k.__name__ == wanted), kinds[0])
-        return _load(kind, place, device, dtype)
+        return load_network(kind, place, device, dtype)
 
     parts = {
         "unet": model("unet", UNet2DConditionModel, EditUNet),
         "vae": model("vae", AutoencoderKL, AutoencoderTiny, HaarLatents),
         "text_encoder": model("text_encoder", CLIPTextModel),
     }
-    with _readable(words):
+    with readable(words):
         parts["tokenizer"] = AutoTokenizer.from_pretrained(words, local_files_only=True)
-    with _readable(folder / "scheduler"):
+    with readable(folder / "scheduler"):
         parts["scheduler"] = DDIMScheduler.from_pretrained(
             folder / "scheduler", local_files_only=True
         )
@@ -93,10 +93,15 @@ def load_controlnet(folder: Path, *, device: str = "cpu", dtype: torch.dtype) ->
 
     from diffusers import ControlNetModel
 
-    return _load(ControlNetModel, folder, device, dtype)
+    return load_network(ControlNetModel, folder, device, dtype)
 
 
-def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
+def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
+    """A network of diffusers or transformers from its folder.
+
+    Raises:
+        InputError: files that cannot be read, or that lack tensors.
+    """
     from transformers import PreTrainedModel
     from transformers.utils import logging
 
@@ -106,7 +111,7 @@ def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
     # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
     how = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     try:
-        with _readable(folder):
+        with readable(folder):
             # Quietly filling what a file lacks with random numbers would look like a bad editor.
             loaded = kind.from_pretrained(
                 folder, local_files_only=True, torch_dtype=dtype, output_loading_info=True, **how
@@ -124,7 +129,7 @@ def _load(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> Any:
 
 
 @contextmanager
-def _readable(folder: Path) -> Iterator[None]:
+def readable(folder: Path) -> Iterator[None]:
     """Turn what transformers, diffusers and tokenizers raise for a damaged file, of many kinds,
     into one line.
     """

@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
+from attnwarp.editing.segment import Segmenter, load_segmenter, segments_of
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, random_points
 from attnwarp.fit.progress import progress_display as fit_progress
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_image
+from attnwarp.io.file import write_atomically
+from attnwarp.io.images import encode_png
+from attnwarp.io.names import file_stems
 from attnwarp.propagate.folder import Folder
 from attnwarp.propagate.page import write_page
+from attnwarp.propagate.pictures import mask_picture
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.settings import PropagateSettings
 
 FIT_FOLDER = "fit"
+SEGMENTS_FOLDER = "segments"
 
 FIRST_POINTS = 10_000
 
@@ -56,6 +63,8 @@ def edit_dataset(
     source: str | None,
     source_picture: Path | None,
     masks: Path | None,
+    words: str | None,
+    segmenter: str,
     max_size: int | None,
     store: Any,
     device: str,
@@ -74,6 +83,8 @@ def edit_dataset(
         source: name or number of the source view; the first if None.
         source_picture: file of the source view edited elsewhere.
         masks: folder with a mask picture for each view.
+        words: of what is edited, instead of masks; the masks go to ``segments/`` of the folder.
+        segmenter: makes them; see :func:`attnwarp.editing.segment.load_segmenter`.
         max_size: larger pictures are averaged down to it.
         store, device: see :func:`attnwarp.propagate.propagate` and ``load_editor``.
         say: shows a line to the user.
@@ -82,19 +93,27 @@ def edit_dataset(
         The edit and the path of its page.
 
     Raises:
-        InputError: no such view, mask or editor.
+        InputError: no such view, mask, editor or segmenter; masks and words; words without a
+            detection in a view.
     """
+    if masks is not None and words is not None:
+        raise InputError("--where: got --masks too, expected one of the two")
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
+    black = torch.zeros(3)
+    images = [views.target(k, black).numpy() for k in range(len(views))]
     segments = None if masks is None else _masks(masks, views.cameras)
+    if words is not None:
+        say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
+        segments = _masks_by_words(
+            load_segmenter(segmenter, device=device), words, images, views, out / SEGMENTS_FOLDER
+        )
     by_hand = None if source_picture is None else _rgb(read_image(source_picture))
     editor = load_editor(editor_name, device=device)
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views))]
     with progress_display(title=out.name) as watch:
         result = propagate(
             splats,
@@ -168,6 +187,28 @@ def _masks(folder: Path, cameras: Any) -> list[npt.NDArray[np.bool_]]:
             raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
         masks.append(_mask(path, camera))
     return masks
+
+
+def _masks_by_words(
+    segmenter: Segmenter,
+    words: str,
+    images: Sequence[npt.NDArray[np.float32]],
+    views: Views,
+    folder: Path,
+) -> list[npt.NDArray[np.bool_]]:
+    """(H, W) bool of each view, also as NAME.png: what ``--masks`` reads."""
+    segment = segments_of(segmenter, words, [camera.name for camera in views.cameras])
+    folder.mkdir(parents=True, exist_ok=True)
+    masks = []
+    for k, (name, image) in enumerate(zip(file_stems(views.cameras), images, strict=True)):
+        masks.append(segment(k, image))
+        data = encode_png(mask_picture(torch.from_numpy(masks[-1])))
+        write_atomically(folder / f"{name}.png", partial(_put, data=data))
+    return masks
+
+
+def _put(stream: BinaryIO, data: bytes) -> None:
+    stream.write(data)
 
 
 def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:

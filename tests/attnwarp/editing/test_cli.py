@@ -4,10 +4,12 @@ import cv2
 import numpy as np
 import pytest
 from tiny_editors import pix2pix
+from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
 from attnwarp.cli import app
 from attnwarp.editing.editor import edit
+from attnwarp.editing.segment import GroundedSam
 from attnwarp.editing.small import load_editor
 
 runner = CliRunner()
@@ -67,6 +69,41 @@ def test_the_picture_is_worked_on_at_the_size_asked_for(folder, photo, tmp_path)
     )
     assert result.exit_code == 0, result.output
     assert cv2.imread(str(out)).shape == (32, 48, 3)  # 30 px rounded to a multiple of 8
+
+
+def test_words_edit_what_they_name_alone(folder, tmp_path):
+    """Oracle: SAM and Grounding DINO called directly, and the edit without a mask."""
+    models = tmp_path / "dino", tmp_path / "sam"
+    save_dino(models[0])
+    save_sam(models[1])
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 64, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "photo.png"), pixels[..., ::-1])
+    out, mask_file = tmp_path / "out.png", tmp_path / "mask.png"
+    segmenter = ("--segmenter", ",".join(map(str, models)))
+    common = (
+        tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", out, "--steps", 2, "--size", 64,
+    )  # fmt: skip
+    result = run(*common, "--where", "bear", *segmenter, "--mask", mask_file)
+    assert result.exit_code == 0, result.output
+    masked, mask = cv2.imread(str(out)), cv2.imread(str(mask_file))[..., 0] > 127
+    expected = GroundedSam.from_folders(*models).segment(pixels.astype(np.float32) / 255, "bear")
+    assert np.array_equal(mask, expected)
+    assert 0 < mask.mean() < 1
+    assert run(*common).exit_code == 0
+    everywhere = cv2.imread(str(out))
+    assert np.array_equal(masked[mask], everywhere[mask])
+    assert np.array_equal(masked[~mask], pixels[..., ::-1][~mask])
+
+
+def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_path):
+    cv2.imwrite(str(tmp_path / "photo.png"), np.full((40, 64, 3), 128, np.uint8))
+    result = run(
+        tmp_path / "photo.png", "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "a.png", "--where", "snowman",
+    )  # fmt: skip
+    assert result.exit_code == 2
+    assert "no 'snowman' was detected in the picture" in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / "a.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
+from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
 from attnwarp.cli import app
@@ -129,6 +130,24 @@ def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     assert np.array_equal(source[:, 16:], original[:, 16:])
 
 
+def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
+    """Oracle: the same edit with ``--masks`` of the files that the words left."""
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam")
+    ply = ("--ply", place / "splats.ply")
+    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    result = run(place, tmp_path / "words", *ply, "--where", "bear", *segmenter)
+    assert result.exit_code == 0, result.output
+    files = sorted((tmp_path / "words" / "segments").iterdir())
+    assert [path.name for path in files] == [camera.name for camera in cameras()]
+    shares = [(read_image(path) > 127).mean() for path in files]
+    assert min(shares) > 0 and max(shares) < 1
+    result = run(place, tmp_path / "files", *ply, "--masks", tmp_path / "words" / "segments")
+    assert result.exit_code == 0, result.output
+    for name in ("source.png", "edited.ply"):
+        assert (tmp_path / "words" / name).read_bytes() == (tmp_path / "files" / name).read_bytes()
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -138,6 +157,8 @@ def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
         (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
         (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
         (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
+        (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
+        (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
@@ -148,6 +169,13 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path):
     assert result.exit_code == 2
     assert message in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):
+    result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
+    assert result.exit_code == 2
+    assert "no 'snowman' was detected in view v0.png" in result.output
+    assert not (tmp_path / "edited.ply").exists()
 
 
 def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):

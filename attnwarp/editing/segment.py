@@ -1,0 +1,430 @@
+"""Masks by words: what is edited, said in words instead of drawn.
+
+``GroundedSam`` detects boxes with Grounding DINO and outlines them with SAM, both from local
+folders. ``ClipSegmenter`` needs no download: it rates windows of the picture with clip-small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.encoders import TextImageEncoder, load_encoder
+from attnwarp.encoders.base import checked_image
+from attnwarp.errors import InputError, optional_imports
+
+Image = npt.NDArray[Any]
+"""(H, W, 3) sRGB, floating, in [0, 1]."""
+Mask = npt.NDArray[np.bool_]
+"""(H, W)."""
+
+BACKGROUNDS = (
+    "grass", "sand", "snow", "a wooden floor", "a tiled floor", "a road", "bare earth", "the sky",
+)  # fmt: skip
+"""What surrounds things; :class:`ClipSegmenter` rates the words against them."""
+
+SHARPNESS = 30.0
+"""Factor of cosines before their softmax: clip-small's own, which training led to 30.4."""
+
+WORKING_SIDE = 256
+"""Larger pictures are rated and cut at this short side in px: windows become 112 px anyway."""
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """A picture and words to a mask.
+
+    Example:
+        >>> isinstance(ClipSegmenter.bundled(), Segmenter)
+        True
+    """
+
+    def segment(self, image: Image, words: str) -> Mask:
+        """(H, W) bool: True where the picture shows what the words name.
+
+        Args:
+            image: (H, W, 3) sRGB, floating, in [0, 1].
+            words: a noun with or without attributes, such as "bear" or "red mug".
+
+        Raises:
+            NoDetectionError: the picture shows nothing of the kind.
+            ValueError: a picture of another shape, type or range, or no words.
+        """
+        ...
+
+
+class NoDetectionError(InputError):
+    """A picture in which a segmenter detects nothing that the words name.
+
+    Args:
+        words: what was asked for.
+        view: name of the view, if it has one.
+    """
+
+    def __init__(self, words: str, view: str | None = None) -> None:
+        place = "the picture" if view is None else f"view {view}"
+        super().__init__(
+            f"no {words!r} was detected in {place}; use other words, or give a mask instead"
+        )
+        self.words = words
+        self.view = view
+
+
+def segments_of(
+    segmenter: Segmenter, words: str, names: Sequence[str]
+) -> Callable[[int, Image], Mask]:
+    """Masks of views as a function of a view's number and picture, as ``propagate`` takes them.
+
+    Args:
+        segmenter: see :class:`Segmenter`.
+        words: of what is edited.
+        names: of the views, for errors.
+
+    Raises:
+        NoDetectionError: by the function; the message names the words and the view.
+    """
+
+    def segment(index: int, image: Image) -> Mask:
+        try:
+            return segmenter.segment(image, words)
+        except NoDetectionError:
+            raise NoDetectionError(words, names[index]) from None
+
+    return segment
+
+
+def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
+    """A segmenter by name.
+
+    Args:
+        name: "clip-small", or "DINO_FOLDER,SAM_FOLDER" of transformers' models.
+        device: "cpu" or "cuda", for the models in folders.
+
+    Raises:
+        InputError: no such segmenter, or files that are missing, by name.
+
+    Example:
+        >>> type(load_segmenter("clip-small")).__name__
+        'ClipSegmenter'
+    """
+    if name == "clip-small":
+        return ClipSegmenter.bundled()
+    folders = name.split(",")
+    if len(folders) != 2 or not all(folder.strip() for folder in folders):
+        raise InputError(
+            f"segmenter {name!r}: unknown, expected clip-small, or DINO_FOLDER,SAM_FOLDER"
+        )
+    return GroundedSam.from_folders(*(Path(folder.strip()) for folder in folders), device=device)
+
+
+@dataclass(frozen=True, eq=False)
+class GroundedSam:
+    """Grounding DINO's boxes, outlined by SAM: the union of each box's best mask.
+
+    Args:
+        detector: transformers' ``GroundingDinoForObjectDetection``.
+        detector_processor: its processor.
+        sam: transformers' ``SamModel``.
+        sam_processor: its processor.
+        box_threshold: of a box's best score, in [0, 1].
+        text_threshold: of the scores that name a box, in [0, 1]. A box that no word of the text
+            names, only a mark between words, is dropped.
+    """
+
+    detector: Any
+    detector_processor: Any
+    sam: Any
+    sam_processor: Any
+    box_threshold: float = 0.35
+    text_threshold: float = 0.25
+
+    def __post_init__(self) -> None:
+        for name in ("box_threshold", "text_threshold"):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name}: got {value}, expected a number in [0, 1]")
+
+    @classmethod
+    def from_folders(
+        cls, dino: Path, sam: Path, *, device: str = "cpu", **thresholds: float
+    ) -> GroundedSam:
+        """Both models from local folders in the format of transformers; nothing is downloaded.
+
+        Args:
+            dino: such as IDEA-Research/grounding-dino-tiny: config.json, model.safetensors,
+                preprocessor_config.json, and tokenizer.json or vocab.txt.
+            sam: such as facebook/sam-vit-base: config.json, model.safetensors and
+                preprocessor_config.json.
+            device: "cpu" or "cuda".
+            thresholds: ``box_threshold``, ``text_threshold``.
+
+        Raises:
+            InputError: files that are missing, by name, or that cannot be read.
+            MissingExtraError: transformers is not installed.
+        """
+        from attnwarp.encoders._weights import device_of
+
+        torch_device = str(device_of(device))
+        _check_folder(Path(dino), "grounding-dino", ("tokenizer.json", "vocab.txt"))
+        _check_folder(Path(sam), "sam", ())
+        with optional_imports():
+            from transformers import (
+                AutoProcessor,
+                GroundingDinoForObjectDetection,
+                SamModel,
+                SamProcessor,
+            )
+        import torch
+
+        from attnwarp.editing.folder import load_network, readable
+
+        parts = []
+        for folder, network, processor in (
+            (Path(dino), GroundingDinoForObjectDetection, AutoProcessor),
+            (Path(sam), SamModel, SamProcessor),
+        ):
+            loaded = load_network(network, folder, torch_device, torch.float32)
+            parts.append(loaded.eval().requires_grad_(False))
+            with readable(folder):
+                parts.append(processor.from_pretrained(folder, local_files_only=True))
+        return cls(*parts, **thresholds)
+
+    def segment(self, image: Image, words: str) -> Mask:
+        """See :meth:`Segmenter.segment`. Several things are separated by a period: "bear. mug"."""
+        import torch
+
+        pixels = np.rint(255 * checked_image(image)).astype(np.uint8)
+        text = _checked_words(words)
+        with torch.inference_mode():
+            boxes = self._boxes(pixels, text)
+            if not len(boxes):
+                raise NoDetectionError(text)
+            mask = self._outline(pixels, boxes)
+        if not mask.any():
+            raise NoDetectionError(text)
+        return mask
+
+    def _boxes(self, pixels: npt.NDArray[np.uint8], text: str) -> Any:
+        """(N, 4) x0, y0, x1, y1 in px."""
+        # Grounding DINO was trained on lower-case phrases that end with a period.
+        prompt = text.lower() if text.endswith(".") else f"{text.lower()}."
+        processor = self.detector_processor
+        inputs = processor(images=pixels, text=prompt, return_tensors="pt").to(self.detector.device)
+        result = processor.post_process_grounded_object_detection(
+            self.detector(**inputs),
+            inputs["input_ids"],
+            threshold=self.box_threshold,
+            text_threshold=self.text_threshold,
+            target_sizes=[pixels.shape[:2]],
+        )[0]
+        marks = {".", *processor.tokenizer.all_special_tokens}
+        named = [
+            any(token not in marks for token in label.replace(".", " . ").split())
+            for label in result["text_labels"]
+        ]
+        boxes = result["boxes"].cpu()
+        # Without a box, transformers still gives one empty label.
+        return boxes[np.array(named[: len(boxes)], dtype=bool)]
+
+    def _outline(self, pixels: npt.NDArray[np.uint8], boxes: Any) -> Mask:
+        """(H, W) union over boxes of the mask that SAM itself rates best."""
+        inputs = self.sam_processor(pixels, input_boxes=[boxes.tolist()], return_tensors="pt")
+        device = self.sam.device
+        output = self.sam(
+            pixel_values=inputs["pixel_values"].to(device),
+            input_boxes=inputs["input_boxes"].float().to(device),
+        )
+        masks = self.sam_processor.post_process_masks(
+            output.pred_masks.cpu(), inputs["original_sizes"], inputs["reshaped_input_sizes"]
+        )[0]
+        best = output.iou_scores[0].argmax(dim=-1).tolist()
+        return np.logical_or.reduce([masks[i, k].numpy() for i, k in enumerate(best)])
+
+
+def _check_folder(folder: Path, model_type: str, tokenizers: tuple[str, ...]) -> None:
+    """Raise InputError that names the files a folder of transformers lacks."""
+    from attnwarp.encoders.preprocess import read_json
+
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected a {model_type} model of transformers")
+    wanted = [
+        ("config.json",),
+        (
+            "model.safetensors", "pytorch_model.bin", "model.safetensors.index.json",
+            "pytorch_model.bin.index.json",
+        ),
+        ("preprocessor_config.json", "processor_config.json"),
+        *([tokenizers] if tokenizers else []),
+    ]  # fmt: skip
+    missing = [names[0] for names in wanted if not any((folder / n).is_file() for n in names)]
+    if missing:
+        raise InputError(
+            f"{folder}: lacks {', '.join(missing)}; fetch the {model_type} model again in"
+            " transformers' format"
+        )
+    actual = read_json(folder / "config.json").get("model_type")
+    if actual != model_type:
+        raise InputError(
+            f"{folder}: config.json is of model_type {actual!r}, expected {model_type!r}"
+        )
+
+
+def _checked_words(words: str) -> str:
+    text = words.strip()
+    if not any(character.isalnum() for character in text):
+        raise InputError(f"words: got {words!r}, expected a name such as 'bear'")
+    return text
+
+
+@dataclass(frozen=True, eq=False)
+class ClipSegmenter:
+    """Windows rated by a text and image encoder, then cut out along colours by OpenCV's grabCut.
+
+    A window's relevance is the softmax share of the words among backgrounds. A pixel's relevance is
+    the geometric mean over window sizes of its windows' mean. grabCut (Rother, Kolmogorov, Blake
+    2004) starts from the pixels of high relevance. The constants come from 25 training worlds. The
+    report reports/editor/segments.md has the measured overlap with exact masks: it finds whole
+    things on a plain ground, and is no substitute for :class:`GroundedSam` on photographs or parts.
+
+    Args:
+        encoder: of windows and words; see :func:`attnwarp.encoders.load_encoder`.
+        windows: sides of the square windows as shares of the picture's short side.
+        stride: between windows as a share of the short side.
+        likely: relevance, as a share of its range in the picture, of what is first taken for it.
+        background: share of the range below which a pixel can never become part of the mask.
+        peak: share of the range that is the thing for sure, where a free cut fails.
+        detection: least relevance, in [0, 1], that the best pixel must have.
+
+    Example:
+        >>> import numpy as np
+        >>> ClipSegmenter.bundled().relevance(np.zeros((48, 64, 3)), "red mug").shape
+        (48, 64)
+    """
+
+    encoder: TextImageEncoder
+    windows: Sequence[float] = (0.375, 0.5, 0.75)
+    stride: float = 1 / 12
+    likely: float = 0.5
+    background: float = 0.05
+    peak: float = 0.95
+    detection: float = 0.15
+
+    @classmethod
+    def bundled(cls) -> ClipSegmenter:
+        """With clip-small."""
+        return cls(load_encoder("clip-small", "clip"))
+
+    def segment(self, image: Image, words: str) -> Mask:
+        """See :meth:`Segmenter.segment`."""
+        import cv2
+
+        picture: Image = checked_image(image)
+        text = _checked_words(words)
+        height, width = picture.shape[:2]
+        scale = WORKING_SIDE / min(height, width)
+        if scale < 1:
+            size = (max(1, round(scale * width)), max(1, round(scale * height)))
+            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        relevance = self.relevance(picture, text)
+        if relevance.max() < self.detection:
+            raise NoDetectionError(text)
+        mask = self._cut(picture, relevance)
+        if not mask.any():
+            raise NoDetectionError(text)
+        if mask.shape != (height, width):
+            share = cv2.resize(mask.astype(np.float32), (width, height))
+            mask = np.asarray(share > 0.5)
+        return mask
+
+    def relevance(self, image: Image, words: str) -> npt.NDArray[np.float64]:
+        """(H, W) in (0, 1]: share of the words among backgrounds in the windows around a pixel.
+
+        Args:
+            image: (H, W, 3) sRGB, floating, in [0, 1].
+            words: see :meth:`segment`.
+        """
+        picture = checked_image(image)
+        texts = [f"a photo of {name}" for name in (_named(words), *BACKGROUNDS)]
+        directions = _unit(self.encoder.texts(texts))
+        logs = np.zeros(picture.shape[:2])
+        for share in self.windows:
+            # A floor: one size alone shall not veto.
+            logs += np.log(self._means(picture, share, directions) + 1e-3)
+        return np.minimum(np.exp(logs / len(self.windows)), 1.0)
+
+    def _means(
+        self, picture: Image, share: float, directions: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.float64]:
+        """(H, W) mean relevance of the windows of one size, which count most at their centres."""
+        short = min(picture.shape[:2])
+        side = max(1, round(share * short))
+        step = max(1.0, self.stride * short)
+        rows, columns = (_starts(length, side, step) for length in picture.shape[:2])
+        corners = [(y, x) for y in rows for x in columns]
+        embeddings = _unit(
+            self.encoder.images([picture[y : y + side, x : x + side] for y, x in corners])
+        )
+        scores = SHARPNESS * embeddings @ directions.T
+        shares = np.exp(scores - scores.max(axis=1, keepdims=True))
+        relevances = shares[:, 0] / shares.sum(axis=1)
+        bump = np.exp(-0.5 * ((np.arange(side) + 0.5 - side / 2) / (side / 4)) ** 2)
+        weight = np.outer(bump, bump)
+        total, weights = np.zeros(picture.shape[:2]), np.zeros(picture.shape[:2])
+        for (y, x), relevance in zip(corners, relevances, strict=True):
+            total[y : y + side, x : x + side] += weight * relevance
+            weights[y : y + side, x : x + side] += weight
+        return total / weights
+
+    def _cut(self, picture: Image, relevance: npt.NDArray[np.float64]) -> Mask:
+        """(H, W) the pixels of high relevance, moved to borders of colour."""
+        import cv2
+
+        low, high = relevance.min(), relevance.max()
+        # Where all windows are alike, all of them show it.
+        if high - low < 1e-6:
+            return np.ones(relevance.shape, dtype=bool)
+        share = (relevance - low) / (high - low)
+        labels = np.full(relevance.shape, cv2.GC_PR_BGD, np.uint8)
+        labels[share >= self.likely] = cv2.GC_PR_FGD
+        labels[share < self.background] = cv2.GC_BGD
+        pixels = np.rint(255 * picture).astype(np.uint8)
+        mask = _grab_cut(pixels, labels)
+        if not mask.any() or share[mask].mean() < share.mean():
+            # Free labels may all turn to background, or change sides; the peak's then stay.
+            labels[share >= self.peak] = cv2.GC_FGD
+            mask = _grab_cut(pixels, labels)
+        return mask
+
+
+def _grab_cut(pixels: npt.NDArray[np.uint8], labels: npt.NDArray[np.uint8]) -> Mask:
+    """(H, W) foreground of five rounds from (H, W) labels, which are left as they are."""
+    import cv2
+
+    result = labels.copy()
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(0)  # of its k-means
+    cv2.grabCut(pixels, result, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
+    return np.isin(result, (cv2.GC_FGD, cv2.GC_PR_FGD))
+
+
+def _named(words: str) -> str:
+    """Words with an article, as the encoder's captions have them."""
+    text = _checked_words(words).removesuffix(".")
+    if text.split()[0].lower() in ("a", "an", "the"):
+        return text
+    return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
+
+
+def _starts(length: int, side: int, step: float) -> list[int]:
+    """First pixels of windows that cover a length evenly."""
+    count = max(1, int(np.ceil((length - side) / step)) + 1)
+    return sorted({round(start) for start in np.linspace(0, length - side, count)})
+
+
+def _unit(rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)

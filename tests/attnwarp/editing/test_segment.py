@@ -1,0 +1,165 @@
+"""Masks by words; oracles are transformers' own processors, and exact masks of a ray-cast world."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from tiny_segmenters import save_dino, save_sam
+
+from attnwarp.editing.segment import (
+    ClipSegmenter,
+    GroundedSam,
+    NoDetectionError,
+    Segmenter,
+    load_segmenter,
+    segments_of,
+)
+from attnwarp.errors import InputError
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (50, 70, 3), dtype=np.uint8)
+IMAGE = PIXELS.astype(np.float32) / 255
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    place = tmp_path_factory.mktemp("segmenters")
+    return place / "dino", place / "sam", save_dino(place / "dino"), save_sam(place / "sam")
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.98, 0.9995])
+def test_it_is_transformers_own_models_and_processors_in_turn(folders, threshold):
+    dino, sam, (detector, processor), (outliner, outliner_processor) = folders
+    with torch.no_grad():
+        inputs = processor(images=PIXELS, text="a bear.", return_tensors="pt")
+        boxes = processor.post_process_grounded_object_detection(
+            detector(**inputs), inputs.input_ids, threshold=threshold, text_threshold=0.25, target_sizes=[(50, 70)]
+        )[0]  # fmt: skip
+        named = [
+            i for i, label in enumerate(boxes["text_labels"]) if "bear" in label or "a" in label
+        ]
+        expected = np.zeros((50, 70), bool)
+        for box in boxes["boxes"][named]:
+            inputs = outliner_processor(PIXELS, input_boxes=[[box.tolist()]], return_tensors="pt")
+            inputs["input_boxes"] = inputs["input_boxes"].float()
+            sizes = inputs["original_sizes"], inputs["reshaped_input_sizes"]
+            output = outliner(
+                pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"]
+            )
+            masks = outliner_processor.post_process_masks(output.pred_masks, *sizes)[0]
+            expected |= masks[0, output.iou_scores[0, 0].argmax()].numpy()
+    segmenter = GroundedSam.from_folders(dino, sam, box_threshold=threshold)
+    assert isinstance(segmenter, Segmenter)
+    mask = segmenter.segment(IMAGE, "A bear")
+    assert mask.dtype == np.bool_
+    assert 0 < expected.mean() < 1
+    assert len(named) == {0.0: 6, 0.98: 4, 0.9995: 2}[threshold]
+    # SAM on all boxes at once rounds in another order than on one.
+    assert (mask != expected).mean() < 1e-3
+
+
+def test_a_threshold_that_no_box_reaches_is_an_error_with_the_words(folders):
+    segmenter = GroundedSam.from_folders(*folders[:2], box_threshold=1.0)
+    with pytest.raises(NoDetectionError, match="no 'red mug' was detected in the picture") as error:
+        segmenter.segment(IMAGE, "red mug")
+    assert error.value.words == "red mug"
+    masks = segments_of(segmenter, "red mug", ["a.png", "b.png"])
+    with pytest.raises(NoDetectionError, match="no 'red mug' was detected in view b.png"):
+        masks(1, IMAGE)
+
+
+@pytest.mark.parametrize(
+    ("model", "file", "message"),
+    [
+        ("dino", "config.json", "dino: lacks config.json; fetch the grounding-dino model"),
+        ("dino", "model.safetensors", "dino: lacks model.safetensors"),
+        ("dino", "processor_config.json", "dino: lacks preprocessor_config.json"),
+        ("dino", "tokenizer.json", "dino: lacks tokenizer.json"),
+        ("sam", "model.safetensors", "sam: lacks model.safetensors; fetch the sam model"),
+        ("sam", "processor_config.json", "sam: lacks preprocessor_config.json"),
+    ],
+)
+def test_missing_files_are_named(folders, tmp_path, model, file, message):
+    for folder in folders[:2]:
+        shutil.copytree(folder, tmp_path / folder.name)
+    (tmp_path / model / file).unlink()
+    with pytest.raises(InputError, match=message):
+        GroundedSam.from_folders(tmp_path / "dino", tmp_path / "sam")
+
+
+def test_folders_in_the_wrong_order_and_no_folder_are_errors(folders, tmp_path):
+    dino, sam, *_ = folders
+    with pytest.raises(InputError, match="lacks tokenizer.json|model_type 'sam'"):
+        load_segmenter(f"{sam},{dino}")
+    with pytest.raises(InputError, match="nowhere: no such folder"):
+        load_segmenter(f"{tmp_path / 'nowhere'},{sam}")
+
+
+def test_damaged_weights_are_one_line(folders, tmp_path):
+    shutil.copytree(folders[1], tmp_path / "sam")
+    (tmp_path / "sam" / "model.safetensors").write_bytes(b"damaged")
+    with pytest.raises(InputError, match="sam: cannot be read"):
+        GroundedSam.from_folders(folders[0], tmp_path / "sam")
+
+
+@pytest.mark.parametrize("change", [{"box_threshold": 1.5}, {"text_threshold": -0.1}])
+def test_thresholds_are_probabilities(folders, change):
+    with pytest.raises(ValueError, match=r"expected a number in \[0, 1\]"):
+        GroundedSam.from_folders(*folders[:2], **change)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return ClipSegmenter.bundled()
+
+
+def ball():
+    """A red disc on green noise, drawn by OpenCV, and its exact pixels."""
+    noise = np.random.default_rng(0).normal(0, 0.03, (96, 120, 1))
+    image = np.clip(np.array([0.35, 0.5, 0.2]) + noise, 0, 1)
+    truth = np.zeros((96, 120), np.uint8)
+    cv2.circle(truth, (70, 50), 22, 1, -1)
+    image[truth == 1] = (0.75, 0.1, 0.1)
+    return image.astype(np.float32), truth == 1
+
+
+def test_the_bundled_segmenter_cuts_a_ball_from_the_grass_the_same_each_time(clip):
+    image, truth = ball()
+    mask = clip.segment(image, "red ball")
+    assert mask.shape == truth.shape and mask.dtype == np.bool_
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.9
+    assert np.array_equal(mask, clip.segment(image, "red ball"))
+
+
+def test_larger_pictures_get_masks_of_their_own_size(clip):
+    image, truth = ball()
+    large = cv2.resize(image, (480, 384), interpolation=cv2.INTER_NEAREST)
+    exact = cv2.resize(truth.astype(np.uint8), (480, 384), interpolation=cv2.INTER_NEAREST) > 0
+    mask = clip.segment(large, "red ball")
+    assert mask.shape == (384, 480)
+    assert (mask & exact).sum() / (mask | exact).sum() > 0.9
+
+
+def test_nothing_in_an_empty_picture_is_an_error(clip):
+    with pytest.raises(NoDetectionError, match="no 'dinosaur' was detected"):
+        clip.segment(np.full((40, 50, 3), 0.5), "dinosaur")
+
+
+@pytest.mark.parametrize("words", ["", " ", "..."])
+def test_words_without_letters_are_refused(clip, words):
+    with pytest.raises(InputError, match="words: got"):
+        clip.segment(IMAGE, words)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 5)), r"got shape \(4, 5\), expected \(H, W, 3\)"),
+        (PIXELS, "got uint8"),
+        (2 * np.ones((4, 5, 3)), r"expected \[0, 1\]"),
+    ],
+)
+def test_other_pictures_are_refused(clip, image, message):
+    with pytest.raises(ValueError, match=message):
+        clip.segment(image, "bear")
