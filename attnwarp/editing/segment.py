@@ -287,9 +287,9 @@ class ClipSegmenter:
 
     A window's relevance is the softmax share of the words among backgrounds. A pixel's relevance is
     the geometric mean over window sizes of its windows' mean. grabCut (Rother, Kolmogorov, Blake
-    2004) starts from the pixels of high relevance. The constants come from 25 training worlds. The
-    report reports/editor/segments.md has the measured overlap with exact masks: it finds whole
-    things on a plain ground, and is no substitute for :class:`GroundedSam` on photographs or parts.
+    2004) starts from the pixels of high relevance. The constants come from 25 training worlds.
+    Its overlap with exact masks (reports/editor/segments.md) is fair for single things on a plain
+    ground and poor, below 0.4, on the bundled scenes. Look at its masks before you use them.
 
     Args:
         encoder: of windows and words; see :func:`attnwarp.encoders.load_encoder`.

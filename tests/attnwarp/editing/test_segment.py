@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from tiny_segmenters import save_dino, save_sam
+from training.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
+from training.render import pictures
 
 from attnwarp.editing.segment import (
     ClipSegmenter,
@@ -114,31 +116,18 @@ def clip():
     return ClipSegmenter.bundled()
 
 
-def ball():
-    """A red disc on green noise, drawn by OpenCV, and its exact pixels."""
-    noise = np.random.default_rng(0).normal(0, 0.03, (96, 120, 1))
-    image = np.clip(np.array([0.35, 0.5, 0.2]) + noise, 0, 1)
-    truth = np.zeros((96, 120), np.uint8)
-    cv2.circle(truth, (70, 50), 22, 1, -1)
-    image[truth == 1] = (0.75, 0.1, 0.1)
-    return image.astype(np.float32), truth == 1
-
-
-def test_the_bundled_segmenter_cuts_a_ball_from_the_grass_the_same_each_time(clip):
-    image, truth = ball()
-    mask = clip.segment(image, "red ball")
-    assert mask.shape == truth.shape and mask.dtype == np.bool_
-    assert (mask & truth).sum() / (mask | truth).sum() > 0.9
-    assert np.array_equal(mask, clip.segment(image, "red ball"))
-
-
-def test_larger_pictures_get_masks_of_their_own_size(clip):
-    image, truth = ball()
-    large = cv2.resize(image, (480, 384), interpolation=cv2.INTER_NEAREST)
-    exact = cv2.resize(truth.astype(np.uint8), (480, 384), interpolation=cv2.INTER_NEAREST) > 0
-    mask = clip.segment(large, "red ball")
-    assert mask.shape == (384, 480)
+def test_the_bundled_segmenter_cuts_a_held_out_snowman_out(clip):
+    """Oracle: the ray-cast world's own pixels. The report has the overlap with many worlds, also the bad ones."""
+    split = PAIR_SPLITS["edit-test"]
+    world, look = edit_world(22, split), edit_looks(22, split)[0][0]
+    made, hits = pictures(world, [look], 128, view=0)
+    exact = hits.valid & (shown_things(hits.object_id, world) == THING)
+    image = made[0].astype(np.float32) / 255
+    mask = clip.segment(image, "snowman")
+    assert mask.shape == exact.shape and mask.dtype == np.bool_
     assert (mask & exact).sum() / (mask | exact).sum() > 0.9
+    large = cv2.resize(image, (512, 512), interpolation=cv2.INTER_NEAREST)
+    assert clip.segment(large, "snowman").shape == (512, 512)
 
 
 def test_nothing_in_an_empty_picture_is_an_error(clip):
