@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 from tiny_segmenters import save_dino, save_sam
-from training.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
-from training.render import pictures
 
 from attnwarp.editing.segment import (
     ClipSegmenter,
@@ -19,6 +17,8 @@ from attnwarp.editing.segment import (
     segments_of,
 )
 from attnwarp.errors import InputError
+from training.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
+from training.render import pictures
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (50, 70, 3), dtype=np.uint8)
 IMAGE = PIXELS.astype(np.float32) / 255
