@@ -65,6 +65,17 @@ class Propagation:
         counters: "network_rows" (rows through the UNet), "feature_bytes", "iterations", "splats",
             "injected" (mean share of the targets' pixels that got features).
         seconds: by part, over all sittings.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.propagate import Plan, Propagation
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> edited = {view: np.zeros((8, 8, 3), np.uint8) for view in (2, 0, 1)}
+        >>> result = Propagation(disc, Plan(2, ((0,), (1,))), edited, {}, {}, {"edit": 2.5})
+        >>> list(result.edited) == list(result.plan.edited)  # the source first
+        True
     """
 
     gaussians: Gaussians
