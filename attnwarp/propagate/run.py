@@ -251,7 +251,9 @@ class _Run:
     # --- editing
 
     def _edited_source(self) -> None:
-        if not self.folder.has("source.json"):
+        if self.folder.has("source.json"):
+            self.done += self.settings.steps
+        else:
             _ = self.source
 
     @cached_property
@@ -259,13 +261,15 @@ class _Run:
         """The source's edit; made anew, to the same bytes, in each sitting that needs it."""
         view = self.plan.source
         text = f"editing the source, {self.names[view]}"
+        # Edited again for its features, it is no progress.
+        step = 0 if self.folder.has("source.json") else 1
         with self._timed("source"):
             source = self.view_editor.source(
                 view,
                 self._guide(view, self.frozen),
                 self._start_picture(view, self.frozen),
                 self.by_hand,
-                watch=lambda: self._tell(text, 1),
+                watch=lambda: self._tell(text, step),
             )
         pixels = to_bytes(self._composite(view, source.picture))
         if source.recording is not None:
