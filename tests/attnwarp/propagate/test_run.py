@@ -491,3 +491,19 @@ def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
     # The last is the word that all is done.
     assert done[-2] == done[-1] == 16
     assert steps[-1].text == "done"
+
+
+def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor):
+    from attnwarp.propagate.editing import ViewEditor
+
+    whole, half = (
+        ViewEditor(editor, "a bear", replace(QUICK, feature_type=name), (32, 32))
+        .source(0, scene[2][0])
+        .recording
+        for name in ("float32", "float16")
+    )
+    assert whole.bytes == 2 * half.bytes
+    for layer in whole.plan.layers:
+        for timestep in whole.timesteps:
+            exact = whole.features(timestep, layer, "text")
+            assert torch.equal(half.features(timestep, layer, "text"), exact.half())
