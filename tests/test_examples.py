@@ -25,6 +25,7 @@ DOORS = [
     "attnwarp.fit",
     "attnwarp.io",
     "attnwarp.losses",
+    "attnwarp.propagate",
     "attnwarp.render",
     "attnwarp.warp",
     "attnwarp_eval.document.charts",
