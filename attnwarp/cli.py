@@ -537,7 +537,8 @@ def edit(
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
     threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
+        int | None,
+        typer.Option(min=1, help="CPU threads; all cores if left out, one for a bundled editor."),
     ] = None,
     format: FormatOption = None,
     images: ImagesOption = None,
@@ -563,8 +564,11 @@ def edit(
         _use_threads(threads)
         import torch
 
-        # Networks are large enough for threads.
-        torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
+        from attnwarp.editing.small import bundled
+
+        # Bundled networks gain little from threads, and lose much where others want the cores.
+        small = editor in bundled()
+        torch.set_num_threads(threads or (1 if small else len(os.sched_getaffinity(0))))
         dataset = _read_views(
             data,
             format=format,

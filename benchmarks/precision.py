@@ -7,6 +7,9 @@ distance to what the float64 reference may give when its thresholds move by thei
 share of the value where that is above 1. The table has the worst of all pixels, outputs and
 pictures, and how many pictures are off by more than 1e-4.
 
+Before it stands a table of single 2D needles: the error of their alpha against their width in the
+picture, which is what the error depends on.
+
 The last column is the part of the 2D error that conditioning does not explain: the definition is
 also rendered with each splat moved by what float32 may round of a pixel's position,
 :data:`ROUNDED_PIXELS`. What no such move gives is the renderer's own.
@@ -51,6 +54,9 @@ MODES = [
 """Kind, depth, antialiased."""
 
 RATIOS = (1e0, 1e2, 1e3, 1e4, 1e6, 1e8, 1e10, 1e12)
+
+WIDTHS = (1.0, 0.1, 0.03, 0.01, 0.003, 0.001)
+"""Of needles, px."""
 
 LIMIT = 1e-4
 
@@ -197,6 +203,53 @@ def run(ratios: Sequence[float], pictures: int) -> list[dict[str, Any]]:
     return rows
 
 
+def needle(seed: int, width: float) -> tuple[Gaussians, Camera, tuple[int, int]]:
+    """A 2D splat that faces the camera, 13 px long and ``width`` px wide (sigmas), such that a
+    pixel lies one sigma off its long axis, and that pixel's (row, column)."""
+    rng = np.random.default_rng(seed)
+    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
+    angle, place = rng.uniform(0, 2 * np.pi), rng.uniform(3, 10)
+    along, across = (
+        np.array([np.cos(angle), np.sin(angle)]),
+        np.array([-np.sin(angle), np.cos(angle)]),
+    )
+    column, row = int(rng.integers(10, 30)), int(rng.integers(8, 22))
+    center = np.array([column + 0.5, row + 0.5]) - width * across - place * along
+    depth = 3.0
+    splats = Gaussians(
+        "2d",
+        torch.tensor([[*(center - K[:2, 2]) * depth / 40, depth]]),
+        torch.tensor([[np.cos(angle / 2), 0, 0, np.sin(angle / 2)]]),
+        torch.tensor([[1.0, width * depth / 40]], dtype=torch.float64),
+        torch.ones(1, dtype=torch.float64),
+        torch.zeros(1, 1, 3, dtype=torch.float64),
+    ).to(dtype=torch.float32)
+    return splats, Camera(K, np.eye(4), 40, 30), (row, column)
+
+
+def needles(widths: Sequence[float], count: int) -> list[dict[str, float]]:
+    """The largest error of alpha one sigma off needles of each width, and what
+    :data:`ROUNDED_PIXELS` bounds it by: alpha changes by at most exp(-1/2) / width a pixel."""
+    rows = []
+    for width in widths:
+        worst = 0.0
+        for seed in range(count):
+            splats, camera, pixel = needle(seed, width)
+            inputs = prepared(splats, camera)
+            error = cpu.render(inputs).alpha.double() - reference.render(inputs).alpha
+            worst = max(worst, float(error[pixel].abs()))
+        bound = math.exp(-0.5) * math.sqrt(2) * ROUNDED_PIXELS / width
+        rows.append({"width": width, "worst": worst, "bound": bound})
+    return rows
+
+
+def needle_table(rows: Sequence[dict[str, float]]) -> str:
+    """The rows for a person, as Markdown."""
+    lines = ["| width of a 2D needle, px | worst error of alpha | bound |", "|---|---|---|"]
+    lines += [f"| {r['width']:g} | {r['worst']:.1e} | {r['bound']:.1e} |" for r in rows]
+    return "\n".join(lines)
+
+
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows for a person, as Markdown."""
     lines = [
@@ -230,11 +283,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # small tensors: threads would only wait for each other
+    thin = needles(WIDTHS, 20 if options.quick else 200)
+    print(needle_table(thin) + "\n")
     rows = run((1e0, 1e6), 2) if options.quick else run(RATIOS, options.pictures)
     print(table(rows))
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(rows, indent=1) + "\n")
+        figures = {"needles": thin, "ratios": rows}
+        options.out.write_text(json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":

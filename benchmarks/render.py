@@ -167,21 +167,18 @@ def time_once(splats: Gaussians, view: Camera) -> Round:
     return Round(forward, forward_cpu, both, both_cpu, measure_peak(thread_count()), counters)
 
 
+def _contestant(splats: Gaussians, view: Camera) -> Callable[[int], Round]:
+    return lambda _: time_once(splats, view)
+
+
 def _collect_garbage(_: int) -> None:
     gc.collect()
 
 
-def _timed(splats: Gaussians, view: Camera) -> Callable[[int], Round]:
-    return lambda _: time_once(splats, view)
-
-
 def time_in_turn(built: Sequence[tuple[Case, Gaussians, Camera]], rounds: int) -> None:
     """Time the cases and write what they took into them."""
-    turns = in_turn(
-        [_timed(splats, view) for _, splats, view in built],
-        rounds,
-        before=_collect_garbage,
-    )
+    contestants = [_contestant(splats, view) for _, splats, view in built]
+    turns = in_turn(contestants, rounds, before=_collect_garbage)
     for (case, _, _), results in zip(built, turns.results, strict=True):
         case.forward = [r.forward for r in results]
         case.forward_cpu = [r.forward_cpu for r in results]

@@ -4,6 +4,8 @@ weights/.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,9 @@ if TYPE_CHECKING:
 
 WEIGHTS = Path(__file__).parent / "weights"
 
+SUMS = "sha256.json"
+"""File beside a bundled editor's others with the SHA-256 of each."""
+
 TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
 """At higher text guidance a few colours take most answers, and colours saturate."""
 
@@ -21,6 +26,32 @@ TEXT_GUIDANCE, IMAGE_GUIDANCE = 1.5, 1.0
 def bundled(folder: Path = WEIGHTS) -> list[str]:
     """Names of the editors that are there."""
     return sorted(path.parent.name for path in folder.glob("*/model_index.json"))
+
+
+def check_sums(folder: Path) -> None:
+    """Hold the files of a bundled editor to the SHA-256 that were written with them.
+
+    Raises:
+        InputError: a file is missing or another one; the message names it.
+    """
+    for name, expected in json.loads((folder / SUMS).read_text()).items():
+        path = folder / name
+        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != expected:
+            raise InputError(
+                f"{path}: is missing or damaged: its SHA-256 is not the one in {SUMS}; install the"
+                " package again"
+            )
+
+
+def write_sums(folder: Path) -> None:
+    """Write the SHA-256 of every file of an editor, as :func:`check_sums` reads them."""
+    files = sorted(path for path in folder.rglob("*") if path.suffix in (".json", ".safetensors"))
+    sums = {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+        if path.name != SUMS
+    }
+    (folder / SUMS).write_text(json.dumps(sums, indent=1) + "\n")
 
 
 def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix:
@@ -41,6 +72,7 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix:
 
     names = bundled()
     if name_or_folder in names:
+        check_sums(WEIGHTS / name_or_folder)
         guidance = {"text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE}
         return InstructPix2Pix.from_folder(WEIGHTS / name_or_folder, **{**guidance, **settings})
     folder = Path(name_or_folder).expanduser()

@@ -19,8 +19,8 @@ def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Si
     """(h, w) at which a picture is edited: its longest side, with sides that are multiples.
 
     Example:
-        >>> edit_size(1080, 1920, 512, 64)
-        (320, 512)
+        >>> edit_size(1080, 1920, 512, 32)
+        (288, 512)
         >>> edit_size(64, 64, None, 16)
         (64, 64)
     """

@@ -65,6 +65,17 @@ class Propagation:
         counters: "network_rows" (rows through the UNet), "feature_bytes", "iterations", "splats",
             "injected" (mean share of the targets' pixels that got features).
         seconds: by part, over all sittings.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> from attnwarp import Gaussians
+        >>> from attnwarp.propagate import Plan, Propagation
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> edited = {view: np.zeros((8, 8, 3), np.uint8) for view in (2, 0, 1)}
+        >>> result = Propagation(disc, Plan(2, ((0,), (1,))), edited, {}, {}, {"edit": 2.5})
+        >>> list(result.edited) == list(result.plan.edited)  # the source first
+        True
     """
 
     gaussians: Gaussians
@@ -240,7 +251,9 @@ class _Run:
     # --- editing
 
     def _edited_source(self) -> None:
-        if not self.folder.has("source.json"):
+        if self.folder.has("source.json"):
+            self.done += self.settings.steps
+        else:
             _ = self.source
 
     @cached_property
@@ -248,13 +261,15 @@ class _Run:
         """The source's edit; made anew, to the same bytes, in each sitting that needs it."""
         view = self.plan.source
         text = f"editing the source, {self.names[view]}"
+        # Edited again for its features, it is no progress.
+        step = 0 if self.folder.has("source.json") else 1
         with self._timed("source"):
             source = self.view_editor.source(
                 view,
                 self._guide(view, self.frozen),
                 self._start_picture(view, self.frozen),
                 self.by_hand,
-                watch=lambda: self._tell(text, 1),
+                watch=lambda: self._tell(text, step),
             )
         pixels = to_bytes(self._composite(view, source.picture))
         if source.recording is not None:

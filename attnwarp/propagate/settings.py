@@ -117,7 +117,7 @@ class PropagateSettings:
     text_guidance: float | None = None
     guidance_drop: float = 0.0
     source_text_guidance: float | None = None
-    batch: int = 1
+    batch: int = 4
     warp: WarpSettings = WARP_PRESETS["corrected"]
     mask: bool = True
     depth_from: DepthFrom = "frozen"

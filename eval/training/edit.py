@@ -15,6 +15,8 @@ app = typer.Typer(
 CACHE = Path.home() / ".cache" / "attnwarp" / "training" / "editing"
 WEIGHTS = Path(__file__).parents[2] / "attnwarp" / "editing" / "weights"
 
+REPORTS = Path(__file__).parents[2] / "reports" / "editor"
+
 Out = Annotated[Path, typer.Option(help="Folder of checkpoints.")]
 Data = Annotated[
     Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")
@@ -33,7 +35,7 @@ def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
 
 @app.command()
 def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
-    """Train a stage: plain-64, parts-64, parts-128, features-64, control-64, features-128, control-128."""
+    """Train a stage: plain-64, features-64, control-64, parts-64, parts-128, features-128, control-128."""
     from training.editor import STAGES, train_stage
 
     if stage not in STAGES:
@@ -65,6 +67,27 @@ def assess(
     card = assess_editor(weights / name, data, facts_of(stage, out), worlds=worlds, rounds=rounds)
     (weights / name / "card.md").write_text(card)
     typer.echo(card)
+
+
+@app.command()
+def sheet(
+    name: str, data: Data = CACHE / "data", weights: Annotated[Path, typer.Option()] = WEIGHTS,
+    to: Annotated[Path, typer.Option(help="Folder of the picture.")] = REPORTS,
+) -> None:  # fmt: skip
+    """Draw an exported editor's answers on eight worlds that it has never seen."""
+    import torch
+
+    from attnwarp.editing.small import load_editor
+    from training.editing_pairs import load_pairs
+    from training.editor_assess import answers_of
+    from training.editor_sheets import sheet as draw
+    from training.editor_sheets import write_sheet
+
+    torch.set_num_threads(1)
+    editor = load_editor(str(weights / name), text_guidance=1.5, image_guidance=1.0)
+    size = editor.unet.config.sample_size * editor.factor
+    picture = draw(answers_of(editor), load_pairs(data, "edit-test"), size=size)
+    typer.echo(write_sheet(picture, to / f"{name}.png"))
 
 
 if __name__ == "__main__":

@@ -112,10 +112,10 @@ class Stage:
 
 STAGES = {
     "plain-64": Stage(64, 24_000, 1e-3, 200),
+    "features-64": Stage(64, 4_000, 4e-4, 200, start="plain-64", inject="features", seed=2),
+    "control-64": Stage(64, 4_000, 4e-4, 200, start="plain-64", inject="control", seed=2),
     "parts-64": Stage(64, 16_000, 6e-4, 200, start="plain-64", seed=4, parts=595),
     "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
-    "features-64": Stage(64, 8_000, 4e-4, 200, start="parts-64", inject="features", seed=2, parts=595),
-    "control-64": Stage(64, 8_000, 4e-4, 200, start="parts-64", inject="control", seed=2, parts=595),
     "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
     "control-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="control", seed=3, parts=595),
 }  # fmt: skip

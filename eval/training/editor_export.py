@@ -9,6 +9,7 @@ import torch
 from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
+from attnwarp.editing.small import write_sums
 from training.editor import STAGES, TOKENS, EditorNet, scheduler
 
 
@@ -53,6 +54,7 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
         **parts,
     }
     (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
+    write_sums(folder)
     for path in folder.rglob("*"):  # safetensors makes files that only their owner can read
         path.chmod(0o755 if path.is_dir() else 0o644)
     return folder

@@ -38,6 +38,14 @@ def drawing(
     Args:
         path: of the SVG.
         height, width: of the whole figure, in inches; 5.4 a column if ``width`` is left out.
+
+    Example:
+        >>> from pathlib import Path
+        >>> with drawing(Path("figure.svg"), columns=2) as axes:
+        ...     len(axes)
+        2
+        >>> Path("figure.svg").stat().st_size > 1000
+        True
     """
     import matplotlib
 
@@ -71,7 +79,15 @@ def drawing(
 
 @dataclass
 class Line:
-    """One line of a chart: y (with an optional interval) over x."""
+    """One line of a chart: y (with an optional interval) over x.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> errors = [interval({"bear": [0.5]}), interval({"bear": [0.25]})]
+        >>> line = Line("corrected", [16, 64], errors)
+        >>> [value.mean for value in line.y]
+        [0.5, 0.25]
+    """
 
     name: str
     x: Sequence[float]
@@ -91,6 +107,14 @@ def lines(
 ) -> None:
     """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from
     0 to 1.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> errors = [interval({"bear": [0.5]}), interval({"bear": [0.25]})]
+        >>> line = Line("corrected", [16, 64], errors)
+        >>> with drawing(Path("lines.svg")) as (axes,):
+        ...     lines(axes, [line], x="size, px", y="error, px", title="Warp")
     """
     for i, line in enumerate(series):
         mean = np.array([v.mean for v in line.y])
@@ -140,6 +164,14 @@ def heatmap(
         values: (R, C) in [0, 1], NaN where undefined.
         rows, columns: R and C titles.
         framed: (R, C) cells that get a frame.
+
+    Example:
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> shares = np.array([[0.0, 0.5, np.nan]])
+        >>> with drawing(Path("shares.svg")) as (axes,):
+        ...     names = {"rows": ["bear"], "columns": ["a", "b", "c"], "title": "Wins"}
+        ...     heatmap(axes, shares, framed=shares > 0.4, **names)
     """
     import matplotlib as mpl
     from matplotlib.patches import Rectangle
@@ -191,6 +223,18 @@ def cost_front(
 
     Returns:
         The names on the front, cheapest first.
+
+    Example:
+        >>> from pathlib import Path
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> values = {"fast": (1.0, 0.5), "exact": (2.0, 0.1), "poor": (3.0, 0.4)}
+        >>> points = {
+        ...     name: (interval({"bear": [seconds]}), interval({"bear": [error]}))
+        ...     for name, (seconds, error) in values.items()
+        ... }
+        >>> with drawing(Path("front.svg")) as (axes,):
+        ...     cost_front(axes, points, x="seconds", y="error", title="Cost")
+        ['fast', 'exact']
     """
     names = list(points)
     cost = [points[n][0].mean for n in names]

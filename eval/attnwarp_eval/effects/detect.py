@@ -32,6 +32,11 @@ class Finding:
         source: "detected", "pinned", "said" (the scene's own cap on bounces leaves it out) or
             "absent".
         evidence: what in the file, in Mitsuba's graph and in the loaded scene says so.
+
+    Example:
+        >>> finding = Finding(True, True, "detected", ("lights[0] is a sun",))
+        >>> finding.needed, finding.simulated
+        (True, True)
     """
 
     needed: bool
@@ -46,6 +51,12 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
 
     Raises:
         SceneError: they disagree, so that a plan made from the file would be wrong.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> findings = detect(load_scene("opposed"))
+        >>> findings["shadows"].needed, findings["refraction"].needed
+        (True, False)
     """
     spec_effects = transport.called_for(scene.spec)
     plugins, objects = graph(scene)
@@ -216,6 +227,12 @@ def _varies(texture: Any) -> bool:
 def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
     """Everything about a scene's effects as JSON: ``effects``, ``plan``, ``geometry``,
     ``everything_on``, ``cost``.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> about = report(load_scene("opposed"))
+        >>> about["effects"]["refraction"]["evidence"]
+        ('no glass; no BSDF that transmits',)
     """
     out: dict[str, Any] = {
         "scene": scene.name,
@@ -231,7 +248,14 @@ def report(scene: Scene, *, cost: Cost | None = None) -> dict[str, Any]:
 
 
 def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
-    """The lines of :func:`report` for a person."""
+    """The lines of :func:`report` for a person.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("opposed")
+        >>> next(describe(scene, report(scene)))
+        'opposed: Two sides of a wall'
+    """
     yield f"{scene.name}: {scene.title}"
     yield ""
     for name, finding in about["effects"].items():

@@ -68,6 +68,12 @@ BLOCK = 8
 def blocks(pictures: npt.ArrayLike, size: int = BLOCK) -> Array:
     """Means over blocks of ``size`` x ``size`` pixels: (n, H, W, C) to (n, ceil(H / size), ceil(W /
     size), C).
+
+    Example:
+        >>> pictures = np.arange(16.0).reshape(1, 4, 4, 1)
+        >>> blocks(pictures, 2)[0, :, :, 0]
+        array([[ 2.5,  4.5],
+               [10.5, 12.5]])
     """
     data = np.asarray(pictures, np.float64)
     rows, columns = (np.arange(0, n, size) for n in data.shape[1:3])
@@ -90,6 +96,11 @@ class Level:
         worst: the largest difference in standard errors, as a share of the picture's mean.
         detectable: the difference, as a share of the picture's mean, that a value of median noise
             would have shown with 80 % chance.
+
+    Example:
+        >>> level = Level("pixel", 64, 1e-9, threshold=1e-5, worst=0.02, detectable=0.01)
+        >>> level.differs
+        True
     """
 
     name: str
@@ -112,6 +123,11 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
     Args:
         a, b: (n, H, W, C) and (m, H, W, C) pictures of independent seeds. Channels, which share
             noise, are averaged.
+
+    Example:
+        >>> noise = np.random.default_rng(0).normal(1, 0.1, (2, 12, 8, 8, 3))
+        >>> [level.name for level in levels(noise[0], noise[1] + 0.02) if level.differs]
+        ['block', 'picture']
     """
     from scipy import stats
 
@@ -148,7 +164,12 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
 
 @dataclass(frozen=True)
 class Rung:
-    """One test of the ladder: what it found, in words and numbers."""
+    """One test of the ladder: what it found, in words and numbers.
+
+    Example:
+        >>> Rung("same seed", None, "the pictures differ").passed is None
+        True
+    """
 
     name: str
     passed: bool | None
@@ -171,6 +192,10 @@ class Proof:
         detectable: the smallest difference that could have been seen, a share of the mean, by
             level.
         seconds: spent.
+
+    Example:
+        >>> print(Proof("can't tell", (), {}, 1.0, "certified", ("dispersion",)).words)
+        can't tell: not simulated: dispersion; certified but for that
     """
 
     verdict: Verdict
@@ -231,6 +256,16 @@ def prove(
     Raises:
         ValueError: fewer than 10 seeds a side.
         SceneError: file and loaded scene disagree about the effects.
+
+    Example:
+        A plan that leaves out a light is refused before anything is rendered.
+
+        >>> from dataclasses import replace
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("opposed")
+        >>> whole = plan(scene)
+        >>> prove(scene, replace(whole, passes=whole.passes[:1])).verdict
+        'refused'
     """
     if seeds < 10:
         raise ValueError(f"seeds: got {seeds}, expected at least 10 a side")
@@ -277,7 +312,12 @@ and count.
 
 @dataclass(frozen=True)
 class Climb:
-    """What the rungs after the first say, by pictures alone."""
+    """What the rungs after the first say, by pictures alone.
+
+    Example:
+        >>> Climb("can't tell", (), {"picture": 0.004}).detectable["picture"]
+        0.004
+    """
 
     verdict: Verdict
     rungs: tuple[Rung, ...]
@@ -297,6 +337,13 @@ def climb(
 
     Two of them can refuse, paired bias and Welch's test, and they look at pictures of different
     seeds: each has Sidak's share of ``alpha``.
+
+    Example:
+        >>> def pictures(side, spp, first, count):
+        ...     noise = np.random.default_rng((side, spp, first)).normal(size=(count, 8, 8, 3))
+        ...     return 1 + 0.1 * noise / np.sqrt(spp)
+        >>> climb(pictures).verdict
+        'certified'
     """
     from scipy import stats
 

@@ -35,6 +35,11 @@ class Cap:
         at_equal_error: how many times longer for the same noise, which is the same error, since its
             pictures have the plan's mean; infinite where the plan has no noise.
         interval: 95 % of that; None where the plan has no noise.
+
+    Example:
+        >>> cap = Cap(1, -0.06, (-0.08, -0.04), 0.2, 0.01, 1.5, 1.4, (1.3, 1.5))
+        >>> cap.bounces, cap.bias
+        (1, -0.06)
     """
 
     bounces: int
@@ -68,6 +73,11 @@ class Cost:
         again: 95 % of the ratio of the plan's seconds to its own, as it ran twice a round: inside
             this band nothing is faster or slower.
         cap: None where the scene has no cap.
+
+    Example:
+        >>> cost = Cost(48, 16, 7, (0.1, 0.2), 2.0, (0.01, 0.03), (5.0, 7.0), (0.9, 1.1))
+        >>> cost.at_equal_noise
+        6.0
     """
 
     size: int
@@ -112,6 +122,12 @@ def measure(
     Args:
         size, spp: of the picture; if left out as large as needed for tracing, not starting, to take
             most of the time.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> cost = measure(load_scene("opposed"), size=8, spp=1, rounds=2)
+        >>> cost.rounds, cost.faster > 0
+        (2, True)
     """
     size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
     small = scene.with_size(size, size)

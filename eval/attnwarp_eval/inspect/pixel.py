@@ -24,6 +24,10 @@ class Verdict:
         margin: how far the pixel is from the other verdict, positive where it passes; NaN where
             the quantity is undefined.
         unit: of the margin.
+
+    Example:
+        >>> Verdict("in_front", passed=False, margin=-0.2, unit="scene units").passed
+        False
     """
 
     rule: str
@@ -51,6 +55,16 @@ class PixelReport:
         blocker: (3,) what the source really sees toward the point; equal to ``point`` where the
             way is free.
         blocked_by: name of the object there, or "" where the way is free.
+
+    Example:
+        >>> from attnwarp.warp import PRESETS
+        >>> from attnwarp_eval.splats.surface import surface_splats
+        >>> from attnwarp_eval.world import world
+        >>> scene = world("spheres", 16)
+        >>> model = surface_splats(scene.scene, count=2000)
+        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
+        >>> print(report(pair, 8, 12).lines()[0])
+        pixel (8, 12) marble: visible
     """
 
     column: int
@@ -101,6 +115,16 @@ def report(pair: Pair, column: int, row: int) -> PixelReport:
 
     Raises:
         ValueError: the pixel lies outside the target's image.
+
+    Example:
+        >>> from attnwarp.warp import PRESETS
+        >>> from attnwarp_eval.splats.surface import surface_splats
+        >>> from attnwarp_eval.world import world
+        >>> scene = world("spheres", 16)
+        >>> model = surface_splats(scene.scene, count=2000)
+        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
+        >>> report(pair, 8, 12).endpoint_error < 1
+        True
     """
     truth, view = pair.truth, pair.view
     height, width = truth.label.shape

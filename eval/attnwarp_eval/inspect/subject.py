@@ -28,6 +28,11 @@ class Subject:
         seed: of the splats.
         variants: by name, each with its splats; None stands for the truth's own depth.
         targets: names of the views.
+
+    Example:
+        >>> subject = of_scene("spheres", 16)
+        >>> subject.pair("corrected", "yaw030").target
+        'yaw030'
     """
 
     scene: str
@@ -57,6 +62,10 @@ def of_scene(scene: str, size: int = SIZE) -> Subject:
 
     Raises:
         InputError: there is no such scene.
+
+    Example:
+        >>> sorted(of_scene("spheres", 16).variants)
+        ['corrected', 'paper', 'released']
     """
     model = Splats(position_noise=0.1, normal_noise=3.0)
     variants: dict[str, tuple[Variant, Splats | None]] = {
@@ -76,6 +85,16 @@ def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> S
 
     Raises:
         InputError: the folder is no run, or the run has no such scene or no warps.
+
+    Example:
+        >>> from attnwarp_eval.study import Store, parse_study
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> content = dict(name="my", scenes=["spheres"], size=16, variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> of_run(store.root).scene
+        'spheres'
     """
     study = parse_study(Store(folder).read_study()["study"])
     scene = scene or study.scenes[0]
@@ -98,6 +117,11 @@ def one_of(value: str, choices: list[str], name: str) -> None:
 
     Raises:
         InputError: ``value`` is none of ``choices``.
+
+    Example:
+        >>> one_of("papper", ["corrected", "paper"], "variant")
+        Traceback (most recent call last):
+        attnwarp.errors.InputError: variant: got 'papper'; did you mean 'paper'?; expected ...
     """
     if value not in choices:
         raise InputError(

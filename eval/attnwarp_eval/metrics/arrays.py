@@ -47,6 +47,13 @@ def quantile(values: Array, q: float) -> float:
     return float(np.quantile(values, q)) if values.size else float("nan")
 
 
+def quantiles(values: Array, qs: Sequence[float]) -> list[float]:
+    """Several quantiles of the same values, from one partial sort."""
+    if not values.size:
+        return [float("nan")] * len(qs)
+    return [float(value) for value in np.quantile(values, qs)]
+
+
 def regions(edge: Mask | None, shape: tuple[int, ...]) -> dict[str, Mask]:
     """The parts figures are given for, by suffix: everything and, where edges are known, the
     interior and the band.

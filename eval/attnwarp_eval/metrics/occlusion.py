@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp import check
-from attnwarp_eval.metrics.arrays import mask, regions, share
+from attnwarp_eval.metrics.arrays import Mask, mask, share
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 COUNTS = (
@@ -35,6 +36,7 @@ COUNTS = (
 points behind the camera included; "behind" those alone. "empty" is background."""
 
 Counts = dict[str, int]
+Ints = npt.NDArray[np.int64]
 
 
 def confusion(
@@ -60,32 +62,41 @@ def confusion(
         >>> {name: count for name, count in counts.items() if count}
         {'visible_accepted': 1, 'visible_rejected': 1, 'hidden_accepted': 1}
     """
+    counted = None if among is None else mask(among, np.asarray(label).shape, "among")
+    return _counts(_table(accepted, label, surface, behind, counted)[1])
+
+
+def _table(accepted: Any, label: Any, surface: Any, behind: Any, region: Mask | None) -> Ints:
+    """Pixels by (in the region, accepted, behind, surface, label), counted in one pass."""
     truth = np.asarray(label)
     check.shape(truth, ("H", "W"), "label")
     if not np.isin(truth, (NONE, VISIBLE, HIDDEN, AMBIGUOUS)).all():
         raise ValueError(
             f"label: got values {np.unique(truth).tolist()}, expected 0 to {AMBIGUOUS}"
         )
-    passed = mask(accepted, truth.shape, "accepted")
-    has = mask(surface, truth.shape, "surface")
-    counted = (
-        np.ones(truth.shape, dtype=bool) if among is None else mask(among, truth.shape, "among")
-    )
-    back = (
-        np.zeros(truth.shape, dtype=bool) if behind is None else mask(behind, truth.shape, "behind")
-    )
-    outside = (truth == NONE) & has
+    code = truth.astype(np.uint8)
+    code |= mask(surface, truth.shape, "surface").view(np.uint8) << 2
+    if behind is not None:
+        code |= mask(behind, truth.shape, "behind").view(np.uint8) << 3
+    code |= mask(accepted, truth.shape, "accepted").view(np.uint8) << 4
+    # Without a region every pixel is in it.
+    code |= np.uint8(1 << 5) if region is None else region.view(np.uint8) << 5
+    return np.bincount(code.ravel(), minlength=64).reshape(2, 2, 2, 2, 4)
+
+
+def _counts(table: Ints) -> Counts:
+    """The counts of (accepted, behind, surface, label)."""
+    outside = table[:, :, 1, NONE]
     classes = {
-        "visible": truth == VISIBLE,
-        "hidden": truth == HIDDEN,
-        "outside": outside,
-        "behind": outside & back,
-        "ambiguous": truth == AMBIGUOUS,
+        "visible": table[..., VISIBLE].sum(axis=(1, 2)),
+        "hidden": table[..., HIDDEN].sum(axis=(1, 2)),
+        "outside": outside.sum(axis=1),
+        "behind": outside[:, 1],
+        "ambiguous": table[..., AMBIGUOUS].sum(axis=(1, 2)),
     }
-    counts = {"empty_accepted": int(((truth == NONE) & ~has & passed & counted).sum())}
-    for name, member in classes.items():
-        counts[f"{name}_accepted"] = int((member & passed & counted).sum())
-        counts[f"{name}_rejected"] = int((member & ~passed & counted).sum())
+    counts = {"empty_accepted": int(table[1, :, 0, NONE].sum())}
+    for name, (rejected, passed) in classes.items():
+        counts |= {f"{name}_accepted": int(passed), f"{name}_rejected": int(rejected)}
     return {name: counts[name] for name in COUNTS}
 
 
@@ -141,9 +152,13 @@ def mask_error(
     """
     shape = np.asarray(label).shape
     band = None if edge is None else mask(edge, shape, "edge")
+    table = _table(accepted, label, surface, behind, band)
+    parts = {"": table.sum(axis=0)}
+    if band is not None:
+        parts |= {".interior": table[0], ".edge": table[1]}
     figures: dict[str, float] = {}
-    for suffix, region in regions(band, shape).items():
-        counts = confusion(accepted, label, surface, behind, region)
+    for suffix, part in parts.items():
+        counts = _counts(part)
         figures |= {f"{name}{suffix}": value for name, value in scores(counts).items()}
         figures |= {f"occlusion.{name}{suffix}": value for name, value in counts.items()}
     return figures

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp_eval.metrics.arrays import floats, mask, mean, quantile, regions, share
+from attnwarp_eval.metrics.arrays import floats, mask, mean, quantiles, regions, share
 
 
 def endpoint_error(
@@ -46,22 +46,26 @@ def endpoint_error(
         raise ValueError(
             "true_xy: not finite in a visible pixel; positions and labels do not belong together"
         )
-    offset = estimate - truth
-    layer = np.hypot(offset[..., 0], offset[..., 1])
-    scaled = offset * np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
-    image = np.hypot(scaled[..., 0], scaled[..., 1])
+    offset = (estimate - truth)[seen]
+    layer = np.hypot(offset[:, 0], offset[:, 1])
+    unit = np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
+    one = bool((unit == 1).all())
+    image = layer if one else np.hypot(offset[:, 0] * unit[0], offset[:, 1] * unit[1])
     defined = np.isfinite(layer)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        total = int((seen & region).sum())
-        among = seen & region & defined
-        px, own = image[among], layer[among]
+        inside = region[seen]
+        total = int(inside.sum())
+        among = inside & defined
+        px = image[among]
+        median, p95 = quantiles(px, (0.5, 0.95))
+        layer_quantiles = [median, p95] if one else quantiles(layer[among], (0.5, 0.95))
         figures |= {
-            f"warp.epe_median{suffix}": quantile(px, 0.5),
-            f"warp.epe_p95{suffix}": quantile(px, 0.95),
+            f"warp.epe_median{suffix}": median,
+            f"warp.epe_p95{suffix}": p95,
             f"warp.epe_mean{suffix}": mean(px),
-            f"warp.epe_median_layer{suffix}": quantile(own, 0.5),
-            f"warp.epe_p95_layer{suffix}": quantile(own, 0.95),
+            f"warp.epe_median_layer{suffix}": layer_quantiles[0],
+            f"warp.epe_p95_layer{suffix}": layer_quantiles[1],
             f"warp.below_half_px{suffix}": share(int((px < 0.5).sum()), total),
             f"warp.below_1px{suffix}": share(int((px < 1).sum()), total),
             f"warp.below_2px{suffix}": share(int((px < 2).sum()), total),

@@ -49,6 +49,15 @@ def fit_scene(
         views, spp, points, noise, seed: see :func:`attnwarp_eval.splats.export.export`.
         geometry: ``Geometry(scene)``, if there is one already.
         watch: as in :func:`attnwarp.fit.fit`.
+
+    Example:
+        >>> from attnwarp.fit import FitSettings
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> scene = load_scene("opposed").with_size(16, 16)
+        >>> settings = FitSettings(kind="2d", iterations=2, sh_degree=0)
+        >>> fitted = fit_scene(scene, settings, "fit", views=9, spp=1, points=50)
+        >>> fitted.gaussians.kind
+        '2d'
     """
     from attnwarp.fit import Views, fit, from_points
 

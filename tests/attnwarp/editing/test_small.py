@@ -1,5 +1,7 @@
 """The bundled editors as they ship: sizes, cards, and diffusers' own pipeline on the same folder."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,14 @@ from diffusers import StableDiffusionInstructPix2PixPipeline
 import attnwarp.editing.latents
 import attnwarp.editing.small_unet  # noqa: F401  diffusers imports no module that a folder names
 from attnwarp.editing.editor import edit
-from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, WEIGHTS, bundled, load_editor
+from attnwarp.editing.small import (
+    IMAGE_GUIDANCE,
+    TEXT_GUIDANCE,
+    WEIGHTS,
+    bundled,
+    check_sums,
+    load_editor,
+)
 from attnwarp.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
@@ -41,3 +50,17 @@ def test_small_plain_is_bundled_and_an_unknown_name_is_refused():
         InputError, match="editor 'small-plan': neither bundled.*did you mean 'small-plain'"
     ):
         load_editor("small-plan")
+
+
+@pytest.mark.parametrize("name", bundled())
+def test_a_bundled_editor_with_a_flipped_bit_is_refused_by_the_files_name(name, tmp_path):
+    folder = shutil.copytree(WEIGHTS / name, tmp_path / name)
+    check_sums(folder)
+    path = folder / "unet" / "diffusion_pytorch_model.safetensors"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(
+        InputError, match="diffusion_pytorch_model.safetensors: is missing or damaged"
+    ):
+        check_sums(folder)

@@ -412,3 +412,98 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         propagate(model, views, images, editor, "a bear", QUICK, source=5)
     with pytest.raises(ValueError, match="instruction: is empty"):
         propagate(model, views, images, editor, "  ", QUICK)
+
+
+def guidance_of_passes(editor, name, call):
+    """The text guidance that each pass of the UNet has, without repetitions; and the result."""
+    values = []
+
+    def note(*_):
+        value = getattr(editor, name)
+        if not values or values[-1] != value:
+            values.append(value)
+
+    handle = editor.unet.register_forward_pre_hook(note)
+    try:
+        return values, call()
+    finally:
+        handle.remove()
+
+
+def quick(name, **more):
+    return preset(name, **{"stages": 2, "views_per_stage": 2, "steps": 2, "iterations": 12, **more})
+
+
+def test_released_guidance_falls_by_stage_and_the_editors_own_comes_back(scene, editor):
+    values, _ = guidance_of_passes(
+        editor, "text_guidance", lambda: run(scene, editor, settings=quick("released"))
+    )
+    assert values == [12.5, 11.0]  # source and first stage, second stage
+    assert editor.text_guidance == 3.0
+    values, _ = guidance_of_passes(
+        editor, "text_guidance", lambda: run(scene, editor, settings=quick("corrected"))
+    )
+    assert values == [3.0]
+
+
+def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_guidance(
+    scene, tmp_path
+):
+    from tiny_editors import controlnet
+
+    from attnwarp.editing.controlnet import DepthControlNet
+
+    pipe = controlnet()
+    names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
+    net = DepthControlNet(*(getattr(pipe, name) for name in names))
+    settings = quick("released-controlnet")
+    values, result = guidance_of_passes(
+        net, "guidance", lambda: run(scene, net, tmp_path, settings)
+    )
+    assert values == [7.5, 12.5]
+    source = json.loads((tmp_path / "source.json").read_text())
+    assert source["branches"] == ["uncond", "text"]
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    assert source["feature_bytes"] == (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+    assert len(result.edited) == 5
+
+
+def visits(folder):
+    return set(json.loads((folder / "result.json").read_text())["tuned"])
+
+
+def test_a_stage_tunes_on_the_views_that_the_settings_name(scene, editor, tmp_path):
+    for choice in ("all", "stage"):
+        settings = quick("corrected", training=choice, stages=1)
+        run(scene, editor, tmp_path / choice, settings)
+    drawn = {path.stem for path in (tmp_path / "all" / "views").glob("*.png")}
+    assert visits(tmp_path / "stage") == drawn
+    assert visits(tmp_path / "all") == drawn | {"v0"}
+
+
+def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
+    steps = []
+    run(scene, editor, tmp_path, watch=steps.append)
+    # Five views of two steps, two stages of three iterations.
+    assert {step.total for step in steps} == {5 * 2 + 2 * 3}
+    done = [step.done for step in steps]
+    assert done == sorted(done)
+    # The last is the word that all is done.
+    assert done[-2] == done[-1] == 16
+    assert steps[-1].text == "done"
+
+
+def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor):
+    from attnwarp.propagate.editing import ViewEditor
+
+    whole, half = (
+        ViewEditor(editor, "a bear", replace(QUICK, feature_type=name), (32, 32))
+        .source(0, scene[2][0])
+        .recording
+        for name in ("float32", "float16")
+    )
+    assert whole.bytes == 2 * half.bytes
+    for layer in whole.plan.layers:
+        for timestep in whole.timesteps:
+            exact = whole.features(timestep, layer, "text")
+            assert torch.equal(half.features(timestep, layer, "text"), exact.half())

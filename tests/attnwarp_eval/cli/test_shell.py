@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-STUDIES = [sys.executable, "-m", "attnwarp_eval.cli.main", "studies"]
+PRINTS = [sys.executable, "-m", "attnwarp_eval.cli.main", "cache", "info"]
 
 INTERRUPTED = """
 import os, signal
@@ -39,7 +39,7 @@ def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
 
 def test_output_to_a_full_disk_is_one_line_and_exit_code_2():
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(STUDIES, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+        done = subprocess.run(PRINTS, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1 and "No space left on device" in done.stderr
 
@@ -50,7 +50,7 @@ def test_a_closed_pipe_is_no_regression(buffered):
     os.close(reading)
     environment = {**os.environ, "PYTHONUNBUFFERED": "" if buffered else "1"}
     done = subprocess.run(
-        STUDIES, stdout=writing, stderr=subprocess.PIPE, env=environment, text=True, timeout=60
+        PRINTS, stdout=writing, stderr=subprocess.PIPE, env=environment, text=True, timeout=60
     )
     os.close(writing)
     assert (done.returncode, done.stderr) == (141, "")

@@ -23,6 +23,8 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import mitsuba
 from attnwarp_eval.truth.plan import plan
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 
 @pytest.fixture
 def small(monkeypatch):

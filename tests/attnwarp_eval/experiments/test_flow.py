@@ -15,6 +15,8 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import appearance, to_srgb, two_view
 from attnwarp_eval.truth.edits import edit_mask
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 
 def test_a_turned_camera_keeps_the_point_it_looks_at_and_its_distance():
     scene = load_scene("bear").with_size(64, 64)

@@ -152,6 +152,7 @@ def test_every_figure_is_registered():
     assert all(metric(name).name == ".".join(name.split(".")[:2]) for name in found)
 
 
+@pytest.mark.usefixtures("coarse_textures")
 def test_the_truth_of_an_edit_is_faithful_and_preserves_the_rest_and_the_unedited_view_is_not():
     scene = load_scene("bear").with_size(64, 64)
     hits = Geometry(scene).trace(scene.source)

@@ -1,8 +1,10 @@
 import multiprocessing
+import time
 import warnings
 
 import numpy as np
 import pytest
+from cache_writer import write_again_and_again
 
 from attnwarp_eval import cache
 from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Sphere
@@ -129,24 +131,15 @@ def test_a_damaged_or_unwritable_cache_costs_time_and_nothing_else(monkeypatch, 
     assert np.array_equal(mesh_body(BALL, 0.0, 16).vertices, first.vertices)
 
 
-def write_again_and_again(folder, value):
-    import os
-
-    os.environ["ATTNWARP_CACHE"] = str(folder)
-    for _ in range(60):
-        cache.write_arrays("k", "same", {"x": np.full(20_000, value)})
-
-
 def test_two_processes_that_write_the_same_entry_never_show_half_of_one(monkeypatch, tmp_path):
     monkeypatch.setenv("ATTNWARP_CACHE", str(tmp_path))
     context = multiprocessing.get_context("spawn")
-    writers = [
-        context.Process(target=write_again_and_again, args=(tmp_path, float(k))) for k in (1, 2)
-    ]
+    writers = [context.Process(target=write_again_and_again, args=(float(k),)) for k in (1, 2)]
     for writer in writers:
         writer.start()
     seen = 0
     while any(writer.is_alive() for writer in writers):
+        time.sleep(0.001)  # the cores are the writers'
         if (tmp_path / "k" / "same.npz").exists():
             stored = cache.read_arrays("k", "same")
             assert stored is not None and len(np.unique(stored["x"])) == 1

@@ -12,6 +12,8 @@ from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, VISIBLE, Geometry, render_plan, two_view
 from attnwarp_eval.truth.plan import plan, without
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 SIX = ["bear", "dinosaur", "face", "garden", "person", "stump"]
 HARD = [
     "caustic",

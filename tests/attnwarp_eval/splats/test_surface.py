@@ -10,6 +10,8 @@ from attnwarp_eval.splats.surface import quaternions_from_normals, sample_surfac
 from attnwarp_eval.truth import Geometry, appearance, edge_band
 from attnwarp_eval.truth.shading import buried, frames
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 
 @pytest.fixture(scope="module")
 def scene():

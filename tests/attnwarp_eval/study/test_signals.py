@@ -41,17 +41,22 @@ def workers(pid):
     """Living worker processes below ``pid``."""
     pids = []
     for task in pathlib.Path(f"/proc/{pid}/task").glob("*"):
-        for child in (task / "children").read_text().split():
+        for child in read(task / "children").split():
             pids += [int(child)] if is_worker(child) else []
             pids += workers(child)
     return pids
 
 
 def is_worker(pid):
+    return "spawn_main" in read(pathlib.Path(f"/proc/{pid}/cmdline"))
+
+
+def read(path):
+    """The text of a file of a process; nothing of one that has ended."""
     try:
-        return "spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_text()
+        return path.read_text()
     except OSError:
-        return False
+        return ""
 
 
 def finish(folder, run):
@@ -83,7 +88,7 @@ def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
-    message = process.communicate(timeout=60)[1]
+    message = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").glob("*.json")}
     last = f"interrupted; {len(kept)} cells are kept, the same command goes on from here\n"

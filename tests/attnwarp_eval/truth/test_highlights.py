@@ -18,27 +18,17 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SphereSpec
 from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import Geometry, two_view
-from attnwarp_eval.truth.mitsuba import build, render_plan
+from attnwarp_eval.truth.mitsuba import render_plan
 from attnwarp_eval.truth.plan import plan
 from attnwarp_eval.truth.shading import sun_direction
 
 SIX = ["bear", "dinosaur", "face", "garden", "person", "stump"]
-QUICK = ["bear", "person"]
 PARTLY_SLOW = [
-    pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in SIX
+    pytest.param(name, marks=[] if name == "bear" else [pytest.mark.slow]) for name in SIX
 ]
 SIZE = 160
+pytestmark = pytest.mark.usefixtures("coarse_textures")
 LARGE = 80  # pixels that a ball covers; on smaller ones a highlight is less than a pixel
-
-
-@pytest.fixture(scope="module", autouse=True)
-def coarse_textures():
-    """Textures baked for pictures of 160, not 512 rows, which takes a tenth of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "TEXELS", 640)
-        build.forget()
-        yield
-        build.forget()
 
 
 @functools.lru_cache(maxsize=6)
@@ -109,7 +99,7 @@ def test_the_six_call_for_gloss_and_no_edit_takes_it_away(name):
         assert not shiny & {change.object for change in changes}
 
 
-@pytest.mark.parametrize("name", SIX)
+@pytest.mark.parametrize("name", PARTLY_SLOW)
 def test_a_highlight_is_seen_from_the_source_and_most_targets(name):
     scene, geometry = world(name)
     balls = glossy_balls(scene)
@@ -155,7 +145,7 @@ def test_the_highlight_is_brighter_than_any_paint_and_lies_where_optics_puts_it(
 
 
 # In garden and person no large highlight of these targets lies where the source sees it too.
-@pytest.mark.parametrize("name", ["bear", "stump"])
+@pytest.mark.parametrize("name", ["bear", pytest.param("stump", marks=pytest.mark.slow)])
 def test_the_mask_of_what_depends_on_the_viewer_finds_the_highlight_and_not_the_paint(name):
     scene, geometry = world(name)
     plain = matt(scene)

@@ -20,13 +20,17 @@ from attnwarp_eval.truth.plan import plan
 MODULE = importlib.import_module("attnwarp_eval.truth.mitsuba.appearance")
 
 
+def forget_the_variant(patch):
+    for name in ("ATTNWARP_MITSUBA", "DRJIT_LIBLLVM_PATH"):
+        patch.setenv(name, "")  # so that whatever the test leaves there is undone
+        patch.delenv(name)
+    llvm.variant.cache_clear()
+
+
 @pytest.fixture
 def fresh_probe(monkeypatch):
     """Nothing named, nothing asked yet; afterwards as before."""
-    for name in ("ATTNWARP_MITSUBA", "DRJIT_LIBLLVM_PATH"):
-        monkeypatch.setenv(name, "")  # so that whatever the test leaves there is undone
-        monkeypatch.delenv(name)
-    llvm.variant.cache_clear()
+    forget_the_variant(monkeypatch)
     yield monkeypatch
     llvm.variant.cache_clear()
 
@@ -135,17 +139,24 @@ def test_a_librarys_version_is_read_from_its_name(path, expected):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def both(fresh_probe):
+@pytest.fixture(scope="module")
+def both():
     """The variants that render here."""
-    chosen = llvm.variant()
-    renders = any(llvm.works(library) for library in llvm.libraries()[: llvm.TRIES] or [None])
-    assert chosen == ("llvm_ad_rgb" if renders else "scalar_rgb")
-    return ["scalar_rgb", "llvm_ad_rgb"] if renders else ["scalar_rgb", "scalar_rgb"]
+    with pytest.MonkeyPatch.context() as patch:
+        forget_the_variant(patch)
+        chosen = llvm.variant()
+        renders = any(llvm.works(library) for library in llvm.libraries()[: llvm.TRIES] or [None])
+        assert chosen == ("llvm_ad_rgb" if renders else "scalar_rgb")
+        yield ["scalar_rgb", "llvm_ad_rgb"] if renders else ["scalar_rgb", "scalar_rgb"]
+    llvm.variant.cache_clear()
 
 
 @pytest.mark.parametrize(
-    "name", ["spheres", "refraction", "medium", "subsurface", "depth_of_field", "caustics"]
+    "name",
+    [
+        *("spheres", "refraction", "medium", "subsurface", "depth_of_field"),
+        pytest.param("caustics", marks=pytest.mark.slow),
+    ],
 )
 def test_both_variants_make_the_same_picture_within_noise(both, name):
     scene = (

@@ -14,6 +14,8 @@ from attnwarp_eval.truth import Geometry, appearance, mitsuba
 from attnwarp_eval.truth.plan import Pass, Plan, plan
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 FLOOR = {
     "name": "floor",
     "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [40, 40]},

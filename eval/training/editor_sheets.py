@@ -1,0 +1,80 @@
+"""A sheet of what a bundled editor does: eight worlds that it has never seen, six instructions each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as PillowImage
+from PIL import ImageDraw
+
+from attnwarp.editing.editor import Image
+from training.editing_pairs import GROUPS, SIZE, Worlds
+from training.editor import Pairs, Row
+from training.editor_assess import Answer
+
+INSTRUCTIONS = (
+    "make it red",
+    "paint it blue",
+    "turn it into gold",
+    "make it out of wood",
+    "put it in the snow",
+    "show it at sunset",
+)
+
+ROWS = 8
+SCALE = 2
+"""Pixels of the sheet to one of a picture."""
+
+
+def sheet(
+    answer: Answer, worlds: Worlds, *, size: int, instructions: Sequence[str] = INSTRUCTIONS
+) -> PillowImage.Image:
+    """A picture with a row a world: before, then the answer to each instruction.
+
+    Args:
+        answer: the editor.
+        worlds: of a test split; spread evenly over it.
+        size: of the pictures in px.
+        instructions: one a column.
+    """
+    pairs = Pairs(worlds, size, None)
+    rows = []
+    for world in np.linspace(0, len(worlds) - 1, ROWS).astype(int).tolist():
+        rng = np.random.default_rng([world, 6])
+        color = next(k for k in GROUPS["color"] if worlds.valid[world, k])
+        row = Row(
+            world,
+            0,
+            color,
+            color,
+            "color",
+            False,
+            pairs.corner(world, 0, rng) if size < SIZE else (0, 0, 1),
+            False,
+        )
+        before = np.clip((pairs.picture(row, color) + 1) / 2, 0, 1).astype(np.float32)
+        rows.append([before, *(answer(before, text, world) for text in instructions)])
+    return _arranged(rows, ["before", *instructions])
+
+
+def _arranged(rows: Sequence[Sequence[Image]], titles: Sequence[str]) -> PillowImage.Image:
+    side, head = rows[0][0].shape[0] * SCALE, 14
+    picture = PillowImage.new("RGB", (side * len(titles), head + side * len(rows)), "white")
+    draw = ImageDraw.Draw(picture)
+    for column, title in enumerate(titles):
+        draw.text((column * side + 3, 1), title, fill="black")
+    for y, row in enumerate(rows):
+        for x, image in enumerate(row):
+            tile = PillowImage.fromarray(np.rint(255 * image).astype(np.uint8))
+            tile = tile.resize((side, side), PillowImage.Resampling.NEAREST)
+            picture.paste(tile, (x * side, head + y * side))
+    return picture
+
+
+def write_sheet(picture: PillowImage.Image, path: Path) -> Path:
+    """Write a sheet as PNG; its folder is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.save(path, optimize=True)
+    return path

@@ -1,0 +1,77 @@
+"""Oracles: closed forms, NumPy's singular value decomposition."""
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp.propagate.pictures import (
+    Principal,
+    composite,
+    edit_size,
+    enlarged_change,
+    mask_picture,
+)
+
+
+def test_the_change_of_a_small_edit_is_enlarged_and_the_detail_stays():
+    original = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32) * 0.5
+    small = original.reshape(16, 2, 16, 2, 3).mean((1, 3))  # what averaging leaves
+    result = enlarged_change(original, small + np.float32(0.25))
+    assert np.allclose(result, original + 0.25, rtol=0, atol=1e-6)
+    assert np.allclose(enlarged_change(original, small), original, rtol=0, atol=1e-6)
+
+
+def test_an_edit_of_full_size_is_taken_as_it_is():
+    original, edited = np.random.default_rng(0).random((2, 8, 8, 3)).astype(np.float32)
+    assert np.array_equal(enlarged_change(original, edited), edited)
+
+
+@pytest.mark.parametrize(("how", "outside"), [("none", 0.75), ("black", 0.0), ("original", 0.25)])
+def test_outside_a_segment_stands_what_was_asked_for(how, outside):
+    edited, original = (np.full((8, 8, 3), value, np.float32) for value in (0.75, 0.25))
+    segment = np.zeros((16, 16), bool)  # of the full picture, twice as large
+    segment[:, :8] = True
+    result = composite(edited, original, segment, how, 0.0)
+    assert (result[:, :4] == 0.75).all()
+    assert (result[:, 4:] == np.float32(outside)).all()
+
+
+def test_a_blurred_segment_is_a_gaussian_step():
+    from scipy.stats import norm
+
+    edited, original = np.ones((65, 65, 3), np.float32), np.zeros((65, 65, 3), np.float32)
+    segment = np.zeros((65, 65), bool)
+    segment[:, :32] = True
+    row = composite(edited, original, segment, "original", 1.5)[32, :, 0]
+    # A pixel at distance d from the edge sees the normal tail; sampled at pixels, cut at 4 sigma.
+    expected = norm.cdf((32 - (np.arange(65) + 0.5)) / 1.5)
+    assert np.abs(row - expected)[8:-8].max() < 0.01
+
+
+def test_colours_are_the_first_three_principal_components():
+    random = np.random.default_rng(0)
+    values = (
+        random.normal(size=(500, 6))
+        * [9, 1, 5, 0.5, 3, 0.1]
+        @ np.linalg.qr(random.normal(size=(6, 6)))[0]
+    )
+    centered = values - values.mean(0)
+    _, _, rows = np.linalg.svd(centered, full_matrices=False)
+    colors = Principal(torch.from_numpy(values)).colors(torch.from_numpy(values)).numpy()
+    for k in range(3):
+        expected = centered @ rows[k]
+        low, high = np.quantile(expected, [0.01, 0.99])
+        scaled = np.clip((expected - low) / (high - low), 0, 1)
+        either = min(np.abs(colors[:, k] - scaled).max(), np.abs(colors[:, k] - (1 - scaled)).max())
+        assert either < 1e-9
+
+
+def test_sides_are_the_multiples_nearest_to_the_size_asked_for():
+    assert edit_size(768, 1024, 512, 64) == (384, 512)
+    assert edit_size(100, 70, None, 16) == (96, 64)
+    assert edit_size(3, 300, 64, 16) == (16, 64)  # never empty
+
+
+def test_a_mask_is_white_where_it_is_true():
+    mask = torch.tensor([[True, False]])
+    assert mask_picture(mask).tolist() == [[[255] * 3, [0] * 3]]
