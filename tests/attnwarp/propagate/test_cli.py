@@ -174,7 +174,7 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path):
 def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):
     result = run(place, tmp_path, "--ply", place / "splats.ply", "--where", "snowman")
     assert result.exit_code == 2
-    assert "no 'snowman' was detected in view v0.png" in result.output
+    assert "no 'snowman' was detected in view images/v0.png" in result.output
     assert not (tmp_path / "edited.ply").exists()
 
 
