@@ -28,6 +28,8 @@ DOORS = [
     "attnwarp.propagate",
     "attnwarp.render",
     "attnwarp.warp",
+    "attnwarp_eval.compare",
+    "attnwarp_eval.compare.write",
     "attnwarp_eval.document.charts",
     "attnwarp_eval.document.model",
     "attnwarp_eval.document.numbers",

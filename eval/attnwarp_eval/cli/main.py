@@ -6,12 +6,13 @@ import sys
 
 import typer
 
-from attnwarp_eval.cli import cache, inspect, metrics, run, scenes
+from attnwarp_eval.cli import cache, compare, inspect, metrics, run, scenes
 from attnwarp_eval.cli.shell import (
     CLOSED_PIPE,
     CRASH,
     REGRESSION,
     USAGE,
+    Regression,
     closed_pipe,
     fail,
     file_error,
@@ -36,6 +37,7 @@ for command in (
     run.report,
     run.verify,
     run.studies,
+    compare.compare,
     metrics.metrics,
     metrics.encoders,
     inspect.inspect,
@@ -61,8 +63,10 @@ def main() -> None:
     except OSError as error:  # output that cannot be written
         closed_pipe()
         sys.exit(fail(file_error(error)).exit_code)
+    except Regression:
+        raise
     except SystemExit as done:
-        # Typer's own code for a closed pipe is that of a regression, which no command gives yet.
+        # Typer's own code for a closed pipe is that of a regression, which has its own exception.
         sys.exit(CLOSED_PIPE if done.code == REGRESSION else done.code)
     except Exception as error:
         explained = missing_extra(error) if isinstance(error, ImportError) else None

@@ -22,6 +22,17 @@ little, or with an instrument that is not calibrated, is 3. A fault of this prog
 sysexits; Ctrl-C or a polite kill is 130, output that nobody reads 141, as in shells."""
 
 
+class Regression(SystemExit):
+    """The end of a command that has seen a regression, with its exit code.
+
+    Typer ends a command whose output pipe is closed with the same code; only the type tells the
+    two apart.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(REGRESSION)
+
+
 def fail(message: str, code: int = USAGE) -> typer.Exit:
     """Print an error on stderr; raise what this returns."""
     typer.echo(f"attnwarp-eval: {message}", err=True)

@@ -1,0 +1,136 @@
+"""The command that compares a run with a baseline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, clear_errors, fail
+
+if TYPE_CHECKING:
+    from attnwarp_eval.compare import Snapshot
+    from attnwarp_eval.compare.judge import Comparison
+
+
+def compare(
+    baseline: Annotated[
+        Path, typer.Argument(help="A baseline's file (.jsonl), or the folder of another run.")
+    ],
+    run: Annotated[Path, typer.Argument(help="The run's folder.")],
+    markdown: Annotated[
+        Path | None, typer.Option(help="Write the comparison here, for the summary of a CI.")
+    ] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write every verdict here, for a program.")
+    ] = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Rewrite the baseline's file from the run.")
+    ] = False,
+) -> None:
+    """Did my change make anything worse? Exit code 1 if so, 3 if too little can be compared."""
+    from attnwarp_eval.canonical_json import write_json
+    from attnwarp_eval.compare import compare, read_snapshot
+    from attnwarp_eval.compare.write import as_json, document
+    from attnwarp_eval.document import write
+    from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.study.store import Store
+
+    with clear_errors():
+        measured = read_snapshot(Store(run))
+        if update:
+            _update(baseline, measured)
+            return
+        result = compare(_baseline(baseline, measured), measured)
+        if markdown is not None:
+            write_atomic(markdown, write.markdown(document(result)).encode())
+        if json is not None:
+            write_json(json, as_json(result))
+        _print(result)
+    if result.regressed:
+        typer.echo(
+            f"attnwarp-eval: {run}: a regression against {baseline}; if the change is meant,"
+            " accept it with --update",
+            err=True,
+        )
+        raise Regression
+    if result.too_little:
+        raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
+
+
+def _baseline(path: Path, run: Snapshot) -> Snapshot:
+    from attnwarp.errors import InputError
+    from attnwarp_eval.compare import read_baseline, read_snapshot
+    from attnwarp_eval.study.store import Store
+
+    if path.is_dir():
+        snapshot = read_snapshot(Store(path))
+        if snapshot.missing:
+            raise InputError(
+                f"{path}: {len(snapshot.missing)} cells are missing, so it is no baseline; run its"
+                " study again to measure them"
+            )
+    elif not path.exists():
+        raise InputError(
+            f"{path}: no such baseline; write it from a run that you trust with --update"
+        )
+    else:
+        snapshot = read_baseline(path)
+    if snapshot.study != run.study:
+        raise InputError(
+            f"{path}: a baseline of study {snapshot.study!r}, expected {run.study!r} as the run's;"
+            " name another baseline or run"
+        )
+    return snapshot
+
+
+def _update(path: Path, run: Snapshot) -> None:
+    """Write the baseline, and say what changed."""
+    from attnwarp.errors import InputError
+    from attnwarp_eval.compare import compare, read_baseline, write_baseline
+
+    if path.is_dir():
+        raise InputError(f"{path}: a folder, expected a baseline's file to write")
+    if run.missing:
+        raise fail(
+            f"{path}: not written, as {len(run.missing)} cells of the run are missing; run the"
+            " study again to measure them",
+            TOO_LITTLE,
+        )
+    former = read_baseline(path) if path.exists() else None
+    if former is not None and former.study != run.study:
+        raise InputError(
+            f"{path}: a baseline of study {former.study!r}, not written from a run of"
+            f" {run.study!r}; name another file, or delete this one first"
+        )
+    before = path.read_bytes().splitlines()[1:] if former else []
+    write_baseline(path, run)
+    now = path.read_bytes().splitlines()[1:]
+    if former is not None:
+        _print(compare(former, run))
+    new, gone = len(set(now) - set(before)), len(set(before) - set(now))
+    typer.echo(f"{path}: {len(now)} lines; {new} are new or changed, {gone} are gone or changed")
+
+
+def _print(comparison: Comparison) -> None:
+    """The comparison on a terminal, or as plain lines where there is none."""
+    from attnwarp_eval.compare.write import document, summary
+
+    for section in document(comparison).sections:
+        typer.echo(f"{section.title}:")
+        for line in section.text:
+            typer.echo(f"  {line}")
+        for table in section.tables:
+            for row in table.rows:
+                named = zip(table.columns, row, strict=True)
+                typer.echo("  " + _line(list(named)))
+    typer.echo(summary(comparison))
+
+
+def _line(cells: list[tuple[str, str]]) -> str:
+    """A row of a table as a line that a log file can hold."""
+    plain = ("what", "verdict", "probe", "variant", "metric", "name", "detail")
+    return "  ".join(
+        text if column in plain else f"{column} {text}" for column, text in cells if text
+    )

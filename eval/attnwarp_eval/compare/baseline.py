@@ -1,0 +1,161 @@
+"""The baseline's file: sorted JSON lines, one a cell for its counters and one a (cell, metric)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import canonical_json, without_nan
+from attnwarp_eval.compare.snapshot import Figure, Measured, Snapshot
+from attnwarp_eval.files import write_atomic
+
+FORMAT = 1
+"""Version of the file's layout; a reader refuses others."""
+
+REMEDY = "take the file from version control again, or delete it and write it anew with --update"
+
+
+class BaselineError(InputError):
+    """A baseline that cannot be used; the message says which and what to do."""
+
+
+def write_baseline(path: Path, snapshot: Snapshot) -> None:
+    """Write a baseline atomically.
+
+    Args:
+        path: of the file.
+        snapshot: of a complete run.
+
+    Raises:
+        BaselineError: cells of the run are missing.
+
+    Example:
+        >>> from pathlib import Path
+        >>> write_baseline(Path("baseline.jsonl"), Snapshot("my", "0" * 64, ()))
+        >>> read_baseline(Path("baseline.jsonl")).study
+        'my'
+    """
+    if snapshot.missing:
+        raise BaselineError(
+            f"{path}: not written, as {len(snapshot.missing)} cells of the run are missing; run"
+            " the study again to measure them"
+        )
+    lines = list(_lines(snapshot))
+    header = {
+        "baseline": FORMAT,
+        "study": snapshot.study,
+        "digest": snapshot.digest,
+        "lines": len(lines),
+    }
+    header["sha256"] = _seal(header, lines)
+    write_atomic(path, "".join(f"{line}\n" for line in (canonical_json(header), *lines)).encode())
+
+
+def _seal(header: dict[str, Any], lines: list[str]) -> str:
+    """The checksum over the first line, but for the checksum itself, and all that follow."""
+    first = canonical_json({key: value for key, value in header.items() if key != "sha256"})
+    return hashlib.sha256("\n".join([first, *lines]).encode()).hexdigest()
+
+
+def _lines(snapshot: Snapshot) -> Iterator[str]:
+    for cell in snapshot.cells:
+        name = {
+            "scene": cell.scene,
+            "probe": cell.probe,
+            "variants": list(cell.variants),
+            "seed": cell.seed,
+        }
+        yield canonical_json(
+            {**name, "counters": dict(cell.counters), "definition": cell.definition}
+        )
+        for key, figure in sorted(cell.figures.items()):
+            values = without_nan(figure.values)
+            yield canonical_json(
+                {**name, "metric": key, "version": figure.version, "values": values}
+            )
+
+
+def read_baseline(path: Path) -> Snapshot:
+    """Read a baseline's file.
+
+    Raises:
+        BaselineError: it is not a baseline, or was changed since it was written.
+        OSError: it cannot be read.
+
+    Example:
+        >>> from pathlib import Path
+        >>> _ = Path("baseline.jsonl").write_text("")
+        >>> try:
+        ...     read_baseline(Path("baseline.jsonl"))
+        ... except BaselineError as error:
+        ...     print(error)
+        baseline.jsonl: not a baseline (empty); take the file...
+    """
+    try:
+        text = path.read_bytes().decode()
+    except UnicodeDecodeError:
+        raise BaselineError(f"{path}: not a baseline (no text); {REMEDY}") from None
+    first, *lines = text.split("\n")
+    if lines and lines[-1] == "":
+        lines.pop()
+    try:
+        return _parse(first, lines)
+    except ValueError as error:
+        raise BaselineError(f"{path}: {error}; {REMEDY}") from None
+
+
+def _parse(first: str, lines: list[str]) -> Snapshot:
+    if not first:
+        raise ValueError("not a baseline (empty)")
+    header = _object(first, 1)
+    if "baseline" not in header:
+        raise ValueError("not a baseline (its first line has no key 'baseline')")
+    if header["baseline"] != FORMAT:
+        raise ValueError(f"layout {header['baseline']!r}, expected {FORMAT}")
+    if len(lines) != header.get("lines"):
+        raise ValueError(f"{len(lines)} lines behind the first, which says {header.get('lines')!r}")
+    if _seal(header, lines) != header.get("sha256"):
+        raise ValueError("its checksum does not fit its content")
+    cells: list[Measured] = []
+    for number, line in enumerate(lines, 2):
+        data = _object(line, number)
+        try:
+            _add(cells, data)
+        except (AttributeError, LookupError, TypeError, ValueError) as error:
+            raise ValueError(f"line {number}: {type(error).__name__}: {error}") from None
+    keys = [cell.key for cell in cells]
+    if keys != sorted(set(keys)):
+        raise ValueError("its cells are not sorted, or one stands there twice")
+    return Snapshot(str(header.get("study")), str(header.get("digest")), tuple(cells))
+
+
+def _add(cells: list[Measured], data: dict[str, Any]) -> None:
+    """Add a line to the cells: its own cell, or a figure of the last one."""
+    name = (data["scene"], data["probe"], tuple(map(str, data["variants"])), int(data["seed"]))
+    if "counters" in data:
+        counters = {key: int(value) for key, value in data["counters"].items()}
+        cells.append(Measured(*name, data["definition"], counters, {}))
+        return
+    if not cells or cells[-1].key != name:
+        raise ValueError("a figure without its cell's line before it")
+    values = {
+        view: math.nan if value is None else float(value) for view, value in data["values"].items()
+    }
+    figure = Figure(int(data["version"]), values)
+    cells[-1] = replace(cells[-1], figures={**cells[-1].figures, data["metric"]: figure})
+
+
+def _object(line: str, number: int) -> dict[str, Any]:
+    try:
+        value = json.loads(line)
+    except (ValueError, RecursionError):
+        raise ValueError(f"not a baseline (line {number} is not JSON)") from None
+    if not isinstance(value, dict):
+        raise ValueError(f"not a baseline (line {number} is no object)")
+    return value

@@ -1,0 +1,377 @@
+"""Verdicts of a run against a baseline. Pure: two snapshots in, one comparison out.
+
+Two cells of one definition and one seed are the same computation, so their figures are compared
+view by view. Where the seeds differ they are samples, and the difference is tested over scenes,
+with the p-values of all tests adjusted together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from attnwarp_eval.compare.snapshot import Measured, Snapshot
+from attnwarp_eval.metrics.gates import Margin, margin
+from attnwarp_eval.metrics.registry import METRICS, Metric
+from attnwarp_eval.statistics.intervals import (
+    ByView,
+    Interval,
+    benjamini_hochberg,
+    paired,
+    verdict,
+)
+
+Verdict = Literal["worse", "better", "equal", "can't tell"]
+
+FEWEST_SCENES = 6
+"""A test over fewer pairs of scenes flags nothing."""
+
+FaultKind = Literal["missing", "redefined", "counter"]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What fails without a figure.
+
+    Attributes:
+        kind: ``missing``: the baseline has it and the run lacks it; ``redefined``: the cell
+            computes something else; ``counter``: its work is another.
+        name: of the cell, metric or view.
+        detail: what was expected and what came.
+    """
+
+    kind: FaultKind
+    name: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """The verdict on one metric of one variant over all scenes and views.
+
+    Attributes:
+        probe, variant, metric: what it is of.
+        verdict: "equal" only where the margin shows it.
+        baseline, run: means over scenes of the means over views.
+        difference: run - baseline, paired on scene and view; of absolute values where a figure is
+            best at 0.
+        adjusted_p: of the difference, for all tests of the comparison; NaN where none was made.
+        worst: the view that got worse most (``scene/view/seed``), with its two values.
+        undefined: views whose value was defined in the baseline only.
+    """
+
+    probe: str
+    variant: str
+    metric: str
+    verdict: Verdict
+    baseline: float
+    run: float
+    difference: Interval
+    adjusted_p: float
+    worst: tuple[str, float, float] | None
+    undefined: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The outcome of a comparison.
+
+    Attributes:
+        study: name of the run's study.
+        exact: whether both sides have the same seeds, so that views are compared one by one.
+        scenes: how many both sides have.
+        rows: one a (probe, variant, metric) that both sides have.
+        faults: what fails without a figure.
+        added: what only the run has; it passes until ``--update`` takes it into the baseline.
+    """
+
+    study: str
+    exact: bool
+    scenes: int
+    rows: tuple[Row, ...]
+    faults: tuple[Fault, ...]
+    added: tuple[str, ...] = field(default=())
+
+    @property
+    def regressed(self) -> bool:
+        """Whether anything got worse, is missing, or is no longer the same."""
+        return bool(self.faults) or any(row.verdict == "worse" for row in self.rows)
+
+    @property
+    def too_little(self) -> str:
+        """Why nothing can be said; empty where something can."""
+        if not self.rows:
+            return "both sides share no gated figure"
+        if not self.exact and self.scenes < FEWEST_SCENES:
+            return (
+                f"the seeds differ, and a test over {self.scenes} scenes says nothing; expected at"
+                f" least {FEWEST_SCENES}, or the baseline's seeds"
+            )
+        return ""
+
+
+Key = tuple[str, ...]
+"""(scene, probe, variant), with the seed behind it where the seeds are the same."""
+
+
+def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
+    """Compare a run with a baseline over the union of their cells, metrics and views.
+
+    Example:
+        >>> from attnwarp_eval.compare.snapshot import Figure
+        >>> def measured(value):
+        ...     figures = {"depth.abs_rel": Figure(1, {"yaw010": value})}
+        ...     return Snapshot("my", "", (Measured("bear", "depth", ("a",), 0, "", {}, figures),))
+        >>> compare(measured(0.01), measured(0.01)).rows[0].verdict
+        'equal'
+        >>> compare(measured(0.01), measured(0.02)).rows[0].verdict
+        'worse'
+    """
+    exact = baseline.seeds == run.seeds
+    left, right = _by_key(baseline.cells, exact), _by_key(run.cells, exact)
+    faults, added = _missing_cells(left, right, run, exact)
+    for key in sorted(left.keys() & right.keys()):
+        first, second = left[key], right[key]
+        name = " / ".join(key)
+        if {c.definition for c in first} != {c.definition for c in second}:
+            detail = "another scene, setting, encoder or protocol than the baseline's"
+            faults.append(Fault("redefined", name, detail))
+        if exact:
+            faults += _counters(name, first[0].counters, second[0].counters)
+        missing, new = _missing_figures(name, first, second)
+        faults += missing
+        added += new
+    rows = _rows(left, right, exact)
+    scenes = {key[0] for key in left.keys() & right.keys()}
+    return Comparison(run.study, exact, len(scenes), rows, tuple(faults), tuple(added))
+
+
+def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:
+    """The cells of every key; variants that share a cell each have it, since they may part."""
+    table: dict[Key, list[Measured]] = {}
+    for cell in cells:
+        for variant in cell.variants:
+            table.setdefault(_key(cell.scene, cell.probe, variant, cell.seed, exact), []).append(
+                cell
+            )
+    return table
+
+
+def _key(scene: str, probe: str, variant: str, seed: int, exact: bool) -> Key:
+    return (scene, probe, variant, f"seed {seed}") if exact else (scene, probe, variant)
+
+
+def _missing_cells(
+    left: Mapping[Key, object], right: Mapping[Key, object], run: Snapshot, exact: bool
+) -> tuple[list[Fault], list[str]]:
+    reasons: dict[Key, str] = {key: "not in the run's study" for key in left.keys() - right.keys()}
+    # A run that lacks one of its own cells is incomplete, whatever the baseline has.
+    for (scene, probe, variant, seed), reason in run.missing.items():
+        reasons[_key(scene, probe, variant, seed, exact)] = reason
+    faults = [Fault("missing", " / ".join(key), reason) for key, reason in sorted(reasons.items())]
+    return faults, [" / ".join(key) for key in sorted(right.keys() - left.keys())]
+
+
+def _counters(name: str, first: Mapping[str, int], second: Mapping[str, int]) -> list[Fault]:
+    return [
+        Fault("counter", f"{name} / {counter}", f"{before} in the baseline, {now} in the run")
+        for counter in sorted(first.keys() | second.keys())
+        if (before := first.get(counter, "none")) != (now := second.get(counter, "none"))
+    ]
+
+
+def _missing_figures(
+    name: str, first: list[Measured], second: list[Measured]
+) -> tuple[list[Fault], list[str]]:
+    faults, added = [], []
+    before, now = _figures(first), _figures(second)
+    for metric in sorted(before.keys() | now.keys()):
+        if metric not in now:
+            faults.append(Fault("missing", f"{name} / {metric}", "the run has no such figure"))
+        elif metric not in before:
+            added.append(f"{name} / {metric}")
+        else:
+            versions, views = before[metric]
+            if versions != now[metric][0]:
+                detail = "the metric's version is another than the baseline's"
+                faults.append(Fault("redefined", f"{name} / {metric}", detail))
+            for view in sorted(views - now[metric][1]):
+                faults.append(
+                    Fault("missing", f"{name} / {metric} / {view}", "the run has no such view")
+                )
+            added += [f"{name} / {metric} / {view}" for view in sorted(now[metric][1] - views)]
+    return faults, added
+
+
+def _figures(cells: list[Measured]) -> dict[str, tuple[set[int], set[str]]]:
+    """Versions and views of every metric of the cells."""
+    table: dict[str, tuple[set[int], set[str]]] = {}
+    for cell in cells:
+        for key, figure in cell.figures.items():
+            versions, views = table.setdefault(key, (set(), set()))
+            versions.add(figure.version)
+            views.update(figure.values)
+    return table
+
+
+def _rows(
+    left: Mapping[Key, list[Measured]], right: Mapping[Key, list[Measured]], exact: bool
+) -> tuple[Row, ...]:
+    names = sorted(
+        {
+            (key[1], key[2], metric)
+            for key in left.keys() & right.keys()
+            for metric in _figures(left[key]).keys() & _figures(right[key]).keys()
+        }
+    )
+    groups = [_Group.of(*name, left, right, exact) for name in names]
+    # Without enough scenes a test has no say, so it must not cost the others their power either.
+    adjusted = benjamini_hochberg(
+        [g.difference.p if g.difference.scenes >= FEWEST_SCENES else math.nan for g in groups]
+    )
+    return tuple(g.row(p, exact) for g, p in zip(groups, adjusted, strict=True))
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The values of one metric of one variant on both sides, by scene and view (and seed).
+
+    Attributes:
+        before, now: as measured.
+        difference: paired.
+        worsening: scene/view -> how much worse the run is, in the metric's unit.
+    """
+
+    probe: str
+    variant: str
+    metric: Metric
+    key: str
+    before: ByView
+    now: ByView
+    difference: Interval
+    worsening: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        probe: str,
+        variant: str,
+        key: str,
+        left: Mapping[Key, list[Measured]],
+        right: Mapping[Key, list[Measured]],
+        exact: bool,
+    ) -> _Group:
+        metric = METRICS[key]
+        shared = sorted(k for k in left.keys() & right.keys() if k[1:3] == (probe, variant))
+        before, now = (_values(side, shared, key, exact) for side in (left, right))
+        size = abs if metric.direction == "zero" else float
+        first, second = (
+            {s: {v: float(size(x)) for v, x in views.items()} for s, views in side.items()}
+            for side in (before, now)
+        )
+        sign = -1.0 if metric.direction == "higher" else 1.0
+        worsening = {
+            f"{scene}/{view}": sign * (second[scene][view] - value)
+            for scene, views in first.items()
+            for view, value in views.items()
+            if view in second.get(scene, {})
+        }
+        return cls(probe, variant, metric, key, before, now, paired(first, second), worsening)
+
+    def row(self, adjusted_p: float, exact: bool) -> Row:
+        """The group's verdict."""
+        flat_before, flat_now = _flat(self.before), _flat(self.now)
+        undefined = sum(
+            math.isfinite(value) and math.isnan(flat_now.get(name, 0.0))
+            for name, value in flat_before.items()
+        )
+        defined = {name: w for name, w in self.worsening.items() if math.isfinite(w)}
+        worst = max(defined, key=lambda name: defined[name], default=None)
+        judged = self._exactly(flat_before, undefined) if exact else None
+        return Row(
+            self.probe,
+            self.variant,
+            self.key,
+            judged or self._by_scenes(flat_before, adjusted_p, undefined),
+            _mean(self.before),
+            _mean(self.now),
+            self.difference,
+            adjusted_p,
+            (worst, flat_before[worst], flat_now[worst]) if worst else None,
+            undefined,
+        )
+
+    def _exactly(self, before: Mapping[str, float], undefined: int) -> Verdict | None:
+        """The verdict on equal computations, view by view; None where only a test can tell."""
+        allowed = Margin(self.metric.atol, self.metric.rtol)
+        limit = margin(self.key)
+        if undefined or any(w > limit.around(before[n]) for n, w in self.worsening.items()):
+            return "worse"
+        now = _flat(self.now)
+        if any(math.isnan(before[name]) and math.isfinite(now[name]) for name in self.worsening):
+            return "can't tell"  # defined in the run only: neither better nor worse
+        changes = [
+            (w, allowed.around(before[name]), limit.around(before[name]))
+            for name, w in self.worsening.items()
+            if math.isfinite(w)
+        ]
+        if all(abs(w) <= tolerance for w, tolerance, _ in changes):
+            return "equal"
+        gained = any(w < -most for w, _, most in changes)
+        lost = any(w > tolerance for w, tolerance, _ in changes)
+        return "better" if gained and not lost else None
+
+    def _by_scenes(self, before: Mapping[str, float], adjusted_p: float, undefined: int) -> Verdict:
+        """The verdict of a test over scenes."""
+        difference = self.difference
+        if difference.scenes < FEWEST_SCENES:
+            return "can't tell"
+        values = [value for value in before.values() if math.isfinite(value)]
+        allowed = Margin(self.metric.atol, self.metric.rtol)
+        told = verdict(
+            difference,
+            "higher" if self.metric.direction == "higher" else "lower",
+            atol=float(np.mean([allowed.around(value) for value in values])),
+            adjusted_p=adjusted_p,
+        )
+        reach = float(np.mean([margin(self.key).around(value) for value in values]))
+        within = max(abs(difference.low), abs(difference.high)) < reach
+        if told == "can't tell" and within and not undefined and not difference.undefined:
+            return "equal"
+        return told
+
+
+def _values(
+    side: Mapping[Key, list[Measured]], keys: list[Key], metric: str, exact: bool
+) -> dict[str, dict[str, float]]:
+    """Scene -> view (and seed) -> value; the mean over seeds where these differ."""
+    table: dict[str, dict[str, list[float]]] = {}
+    for key in keys:
+        for cell in side[key]:
+            figure = cell.figures.get(metric)
+            for view, value in figure.values.items() if figure else ():
+                name = f"{view}/{cell.seed}" if exact else view
+                table.setdefault(key[0], {}).setdefault(name, []).append(value)
+    return {
+        scene: {view: float(np.mean(values)) for view, values in views.items()}
+        for scene, views in table.items()
+    }
+
+
+def _flat(table: ByView) -> dict[str, float]:
+    return {
+        f"{scene}/{view}": value for scene, views in table.items() for view, value in views.items()
+    }
+
+
+def _mean(table: ByView) -> float:
+    means = [
+        float(np.mean(defined))
+        for views in table.values()
+        if (defined := [value for value in views.values() if math.isfinite(value)])
+    ]
+    return float(np.mean(means)) if means else math.nan

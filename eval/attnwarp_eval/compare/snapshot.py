@@ -1,0 +1,161 @@
+"""What of a run a comparison reads: gated figures view by view, counters, and what each cell is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.metrics.gates import gated
+from attnwarp_eval.report.results import read_results
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.record import Record
+from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.store import Store
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One gated metric of one cell.
+
+    Attributes:
+        version: of the metric.
+        values: by view, to nine significant digits; NaN where undefined.
+    """
+
+    version: int
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One measured cell.
+
+    Attributes:
+        scene, probe, seed: of the cell.
+        variants: every name that the study gives to its content.
+        definition: hash of all that decides its figures but the seed.
+        counters: of work.
+        figures: gated metrics by key.
+    """
+
+    scene: str
+    probe: str
+    variants: tuple[str, ...]
+    seed: int
+    definition: str
+    counters: Mapping[str, int]
+    figures: Mapping[str, Figure]
+
+    @property
+    def key(self) -> tuple[str, str, tuple[str, ...], int]:
+        """What sorts cells, and tells them apart."""
+        return self.scene, self.probe, self.variants, self.seed
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """One side of a comparison.
+
+    Attributes:
+        study: its name.
+        digest: hash of the resolved study.
+        cells: sorted by their key.
+        missing: expected cells without a record -> the reason.
+
+    Example:
+        >>> Snapshot("my", "", ()).seeds
+        frozenset()
+    """
+
+    study: str
+    digest: str
+    cells: tuple[Measured, ...]
+    missing: Mapping[tuple[str, str, str, int], str] = field(default_factory=dict)
+
+    @property
+    def seeds(self) -> frozenset[int]:
+        """Of the expected cells."""
+        return frozenset(cell.seed for cell in self.cells) | {key[3] for key in self.missing}
+
+
+def read_snapshot(store: Store) -> Snapshot:
+    """The snapshot of a run's folder, whose sealed cells are read through the report's reader.
+
+    Raises:
+        StoreError: the folder is no run, or its study cannot be read.
+
+    Example:
+        >>> from attnwarp_eval.study import parse_study
+        >>> from attnwarp_eval.study.run import expected, plan
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> sorted(read_snapshot(store).missing)
+        [('spheres', 'calibration', 'calibration', 0), ('spheres', 'depth', 'a', 0)]
+    """
+    return snapshot(read_results(store))
+
+
+def snapshot(results: Results) -> Snapshot:
+    """The snapshot of results that have been read."""
+    reasons = {(f.scene, f.probe, f.variant): f.error for f in results.failures}
+    cells, missing = [], {}
+    for cell in results.cells:
+        if cell.record is not None:
+            cells.append(_measured(cell, cell.record))
+            continue
+        reason = reasons.get((cell.scene, cell.probe, cell.variants[0]), "not measured")
+        for variant in cell.variants:
+            missing[cell.scene, cell.probe, variant, cell.seed] = reason
+    return Snapshot(
+        results.study.name,
+        digest(results.study.model_dump(mode="json")),
+        tuple(sorted(cells, key=lambda cell: cell.key)),
+        missing,
+    )
+
+
+def _measured(cell: Outcome, record: Record[Any]) -> Measured:
+    keys = sorted({key for view in record.views for key in view.metrics if gated(key)})
+    figures = {
+        key: Figure(
+            probe(cell.probe).metric(key).version,
+            {
+                view.name: shortened(view.metrics[key])
+                for view in record.views
+                if key in view.metrics
+            },
+        )
+        for key in keys
+    }
+    return Measured(
+        cell.scene,
+        cell.probe,
+        cell.variants,
+        cell.seed,
+        digest(without_seed(record.spec))[:16],
+        dict(record.cost.counters),
+        figures,
+    )
+
+
+def shortened(value: float) -> float:
+    """Nine significant digits, more than any tolerance asks for; NaN for the infinities."""
+    return float(f"{value:.9g}") if math.isfinite(value) else math.nan
+
+
+def without_seed(value: Any) -> Any:
+    """A cell's spec without its seeds, at whatever depth they stand.
+
+    >>> without_seed({"seed": 1, "fit": {"iterations": 4, "seed": 1}})
+    {'fit': {'iterations': 4}}
+    """
+    if isinstance(value, dict):
+        return {key: without_seed(item) for key, item in value.items() if key != "seed"}
+    if isinstance(value, list):
+        return [without_seed(item) for item in value]
+    return value

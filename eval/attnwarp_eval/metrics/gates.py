@@ -1,0 +1,91 @@
+"""Which figures a comparison of two runs is gated on, and how much worse each may get.
+
+The direction of a figure and what counts as no change at all stand in the registry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from attnwarp_eval.metrics.registry import METRICS
+
+
+@dataclass(frozen=True)
+class Margin:
+    """The largest worsening of one view that is no regression by itself.
+
+    A margin is wider than the registry's tolerance: another processor rounds a few pixels of a
+    small picture to the other side of a threshold.
+
+    Attributes:
+        absolute: in the metric's unit.
+        relative: a share of the baseline's value, added to ``absolute``.
+
+    Example:
+        >>> GATES["warp.epe_median"].around(2.0)  # 0.02 px and 2 %
+        0.06
+    """
+
+    absolute: float
+    relative: float = 0.0
+
+    def around(self, value: float) -> float:
+        """The margin around a value of the baseline."""
+        return self.absolute + self.relative * abs(value)
+
+
+GATES: Mapping[str, Margin] = {
+    "calibration.mitsuba_agrees": Margin(5e-3),
+    "warp.epe_median": Margin(0.02, 0.02),
+    "warp.epe_p95": Margin(0.1, 0.05),
+    "warp.epe_median_layer": Margin(0.005, 0.02),
+    "warp.below_1px": Margin(5e-3),
+    "warp.coverage": Margin(5e-3),
+    "warp.feature_all_accepted": Margin(1e-3, 0.02),
+    "occlusion.precision": Margin(5e-3),
+    "occlusion.recall": Margin(5e-3),
+    "fit.mse": Margin(1e-5, 0.05),
+    "fit.ssim": Margin(2e-3),
+    "depth.abs_rel": Margin(1e-4, 0.05),
+    "depth.bias_relative": Margin(1e-4, 0.05),
+    "depth.delta_1_01": Margin(5e-3),
+    "depth.normal_median": Margin(0.05, 0.02),
+    "depth.coverage": Margin(5e-3),
+    "embedding.clip_directional": Margin(5e-3),
+    "embedding.dino_image": Margin(5e-3),
+    "perceptual.distance": Margin(1e-3, 0.02),
+    "consistency.delta_e": Margin(0.01, 0.02),
+    "fidelity.mse": Margin(1e-5, 0.05),
+    "fidelity.preserved_mse": Margin(1e-5, 0.05),
+}
+"""Margins by metric. Figures that are infinite for equal pictures, such as PSNR, are left to their
+mean squared error, which is always defined.
+"""
+
+
+def gated(key: str) -> bool:
+    """Whether a result's key is gated: a metric of :data:`GATES`, over the whole picture or on a
+    feature grid. Regions of a picture follow from the whole; keys of known flaws rate a metric, not
+    the code.
+
+    Example:
+        >>> [gated(key) for key in ("depth.abs_rel", "warp.epe_median_layer.64", "depth.rmse")]
+        [True, True, False]
+        >>> gated("depth.abs_rel.edge")
+        False
+    """
+    if key not in METRICS:
+        base, _, tail = key.rpartition(".")
+        return base in GATES and tail.isdecimal()
+    return key in GATES
+
+
+def margin(key: str) -> Margin:
+    """The margin behind a gated key. KeyError: it is not gated.
+
+    Example:
+        >>> margin("warp.epe_median_layer.64").absolute
+        0.005
+    """
+    return GATES[METRICS[key].name]

@@ -1,0 +1,394 @@
+"""A run against a baseline. Oracles: planted changes whose size is known, SciPy's tests, and the
+binomial distribution of runs of equal code.
+
+The run is the stored one of ``data/runs.tar.xz``: two scenes, 24 x 24 px.
+"""
+
+import dataclasses
+import json
+import math
+import pathlib
+import shutil
+import tarfile
+
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from attnwarp_eval import metrics
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
+from attnwarp_eval.compare.judge import FEWEST_SCENES
+from attnwarp_eval.compare.snapshot import Figure, Measured
+from attnwarp_eval.metrics.gates import GATES, gated
+from attnwarp_eval.metrics.registry import METRICS
+from attnwarp_eval.study import Store
+
+DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("compare")
+    with tarfile.open(DATA) as archive:
+        archive.extractall(folder, filter="data")
+    write_baseline(folder / "baseline.jsonl", read_snapshot(Store(folder / "variants")))
+    return folder
+
+
+@pytest.fixture
+def run(stored, tmp_path):
+    shutil.copytree(stored / "variants", tmp_path / "run")
+    return tmp_path / "run"
+
+
+def gate(*arguments):
+    return CliRunner().invoke(app, ["compare", *map(str, arguments)])
+
+
+def change(run, probe, alter):
+    """Alter the record of the first cell of a probe, and seal it again."""
+    store = Store(run)
+    cell = next(c for c in store.read_study()["cells"] if c["probe"] == probe)
+    record = store.read(cell["id"])
+    del record["sha256"]
+    alter(record)
+    store.write(record)
+
+
+def test_a_run_passes_against_itself_and_its_own_baseline(stored, run):
+    for baseline in (stored / "baseline.jsonl", stored / "variants"):
+        done = gate(baseline, run)
+        assert done.exit_code == 0, done.output
+        assert done.stdout.startswith("pass: 0 worse, 0 can't tell, 0 better, ")
+    result = compare(read_baseline(stored / "baseline.jsonl"), read_snapshot(Store(run)))
+    assert {row.verdict for row in result.rows} == {"equal"}
+    # Every gated figure that the records have was read.
+    keys = {
+        (cell["probe"], variant, key)
+        for cell in Store(run).read_study()["cells"]
+        for variant in cell["variants"]
+        for view in Store(run).read(cell["id"])["views"]
+        for key in view["metrics"]
+        if gated(key)
+    }
+    assert {(row.probe, row.variant, row.metric) for row in result.rows} == keys
+    assert len(keys) > 20
+
+
+def add_half_a_pixel(record):
+    for view in record["views"]:
+        view["metrics"]["warp.epe_median"] += 0.5
+
+
+def drop_a_metric(record):
+    for view in record["views"]:
+        del view["metrics"]["warp.epe_median"]
+
+
+def drop_a_view(record):
+    del record["views"][0]
+
+
+def undefine(record):
+    record["views"][0]["metrics"]["warp.epe_median"] = None
+
+
+def double_a_counter(record):
+    record["cost"]["counters"]["pairs"] *= 2
+
+
+PLANTED = {
+    "half a pixel": (add_half_a_pixel, "worse  warp  corrected  warp.epe_median"),
+    "a dropped metric": (drop_a_metric, "missing  spheres / warp / corrected / seed 0 / warp.epe"),
+    "a dropped view": (drop_a_view, "warp.epe_median / yaw030  the run has no such view"),
+    "an undefined value": (undefine, "1 views are undefined now"),
+    "a doubled counter": (double_a_counter, "pairs  51328 in the baseline, 102656 in the run"),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_regression_is_exit_code_1_and_named(stored, run, name):
+    alter, expected = PLANTED[name]
+    change(run, "warp", alter)
+    done = gate(stored / "baseline.jsonl", run)
+    assert done.exit_code == 1, done.output
+    assert expected in done.stdout
+    assert done.stdout.splitlines()[-1].startswith("regression: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_depth_that_is_1_percent_off_is_a_regression(stored, run):
+    generator = np.random.default_rng(0)
+    truth = generator.uniform(2.0, 3.0, (64, 64))
+    noise = generator.standard_normal(truth.shape)
+
+    def measure(scale, spread=0.002):
+        figures = metrics.depth_error(scale * truth * (1 + spread * noise), truth)
+
+        def alter(record):
+            for view in record["views"]:
+                for name, value in figures.items():
+                    view["metrics"][name] = None if math.isnan(value) else value
+
+        change(run, "depth", alter)
+        return read_snapshot(Store(run))
+
+    before = measure(1.0)
+    assert not compare(before, measure(1.0)).regressed
+    worse = {r.metric for r in compare(before, measure(1.01)).rows if r.verdict == "worse"}
+    assert worse >= {"depth.abs_rel", "depth.bias_relative", "depth.delta_1_01"}
+    # Depth with half the noise is better, and passes.
+    nearer = compare(before, measure(1.0, spread=0.001))
+    assert not nearer.regressed
+    better = {row.metric for row in nearer.rows if row.verdict == "better"}
+    assert better == {"depth.abs_rel"}  # the bias of the noise is within its margin
+
+
+@pytest.mark.parametrize("damage", ["removed", "truncated"])
+def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
+    store = Store(run)
+    cell = next(c for c in store.read_study()["cells"] if c["probe"] == "depth")
+    if damage == "removed":
+        store.path(cell["id"]).unlink()
+    else:
+        store.path(cell["id"]).write_bytes(b"{")
+    done = gate(stored / "baseline.jsonl", run)
+    assert done.exit_code == 1
+    assert "missing  spheres / depth / corrected / seed 0" in done.stdout
+    assert ("not JSON" in done.stdout) == (damage == "truncated")
+    # An incomplete run is no baseline, neither as a folder nor to be written.
+    assert gate(run, stored / "variants").exit_code == 2
+    path = run.parent / "new.jsonl"
+    assert gate(path, run, "--update").exit_code == 3
+    assert not path.exists()
+
+
+def test_a_cell_that_computes_something_else_is_a_regression(stored, run):
+    # Equal figures of another setting (a mask rule lost, another encoder) are no proof of anything.
+    baseline = read_baseline(stored / "baseline.jsonl")
+    first = next(cell for cell in baseline.cells if cell.probe == "warp")
+    other = dataclasses.replace(first, definition=digest("another"))
+    cells = tuple(other if cell is first else cell for cell in baseline.cells)
+    result = compare(dataclasses.replace(baseline, cells=cells), baseline)
+    assert [(f.kind, f.name) for f in result.faults] == [
+        ("redefined", "bear / warp / corrected / seed 0")
+    ]
+    assert result.regressed
+
+
+def test_noise_in_seconds_and_memory_never_fails(stored, run):
+    generator = np.random.default_rng(1)
+
+    def alter(record):
+        cost = record["cost"]
+        cost["seconds"] = {k: 1e3 * float(generator.random()) for k in cost["seconds"]}
+        cost["peak_memory_mb"] *= 100
+        cost["threads"] += 7
+
+    for probe in ("warp", "depth", "fit", "timing", "calibration"):
+        change(run, probe, alter)
+    assert gate(stored / "baseline.jsonl", run).exit_code == 0
+    assert "seconds" not in (stored / "baseline.jsonl").read_text()
+
+
+def test_an_added_cell_passes_and_is_named(stored):
+    whole = read_baseline(stored / "baseline.jsonl")
+    part = dataclasses.replace(whole, cells=whole.cells[1:])
+    result = compare(part, whole)
+    first = whole.cells[0]
+    assert result.added == (f"{first.scene} / {first.probe} / {first.variants[0]} / seed 0",)
+    assert not result.regressed
+    assert compare(whole, part).regressed
+
+
+def test_update_says_what_changed_and_then_the_run_passes(stored, run, tmp_path):
+    path = tmp_path / "baseline.jsonl"
+    shutil.copy(stored / "baseline.jsonl", path)
+    change(run, "warp", add_half_a_pixel)
+    assert gate(path, run).exit_code == 1
+    done = gate(path, run, "--update")
+    assert done.exit_code == 0, done.output
+    assert "worse  warp  corrected  warp.epe_median" in done.stdout
+    assert "1 are new or changed, 1 are gone or changed" in done.stdout
+    assert gate(path, run).exit_code == 0
+    assert gate(path, stored / "variants").exit_code == 0  # half a pixel better
+    before, now = (p.read_text().splitlines() for p in (stored / "baseline.jsonl", path))
+    # The first line holds the checksum; one other differs.
+    assert sum(a != b for a, b in zip(before, now, strict=True)) == 2
+    bytes_of_the_run = path.read_bytes()
+    gate(path, run, "--update")
+    assert path.read_bytes() == bytes_of_the_run
+
+
+def test_a_baseline_is_sorted_small_and_holds_what_was_measured(stored):
+    lines = (stored / "baseline.jsonl").read_text().splitlines()
+    header, *rows = map(json.loads, lines)
+    assert header["study"] == "stored" and header["lines"] == len(rows)
+    keys = [(r["scene"], r["probe"], r["variants"], r["seed"], r.get("metric", "")) for r in rows]
+    assert keys == sorted(keys) and len({json.dumps(key) for key in keys}) == len(keys)
+    store = Store(stored / "variants")
+    cells = {(c["scene"], c["probe"], tuple(c["variants"])): c for c in store.read_study()["cells"]}
+    for row in rows:
+        record = store.read(cells[row["scene"], row["probe"], tuple(row["variants"])]["id"])
+        if "counters" in row:
+            assert row["counters"] == record["cost"]["counters"]
+            continue
+        values = {
+            view["view"]: view["metrics"][row["metric"]]
+            for view in record["views"]
+            if row["metric"] in view["metrics"]
+        }
+        assert row["values"].keys() == values.keys()
+        for view, value in values.items():
+            written = row["values"][view]
+            assert written == (None if value is None else pytest.approx(value, rel=1e-8))
+    assert (stored / "baseline.jsonl").stat().st_size < 64_000
+
+
+def malformed(text):
+    lines = text.splitlines(keepends=True)
+    number = next(i for i, line in enumerate(lines) if '"metric":"depth.abs_rel"' in line)
+    edited = [*lines]
+    edited[number] = lines[number].replace('"version":1', '"version":2')
+    return {
+        "empty": "",
+        "truncated": text[: len(text) // 2],
+        "a line lost": "".join(lines[:-1]),
+        "an edited value": "".join(edited),
+        "another study's name": text.replace('"study":"stored"', '"study":"quick"', 1),
+        "no JSON": "# a baseline\n",
+        "no object": "[]\n",
+        "another file": '{"scene":"bear"}\n',
+        "another layout": text.replace('"baseline":1', '"baseline":9', 1),
+        "two lines swapped": "".join([lines[0], lines[2], lines[1], *lines[3:]]),
+        "bytes": "\ud800",
+    }
+
+
+@pytest.mark.parametrize("name", malformed('{"metric":"depth.abs_rel"}\n' * 4))
+def test_a_malformed_baseline_is_one_line_and_exit_code_2(stored, tmp_path, name):
+    text = malformed((stored / "baseline.jsonl").read_text())[name]
+    path = tmp_path / "baseline.jsonl"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    for arguments in ([], ["--update"]):  # what may be somebody's file is never overwritten
+        done = gate(path, stored / "variants", *arguments)
+        assert (done.exit_code, done.stdout) == (2, ""), done.output
+        assert done.stderr.count("\n") == 1 and str(path) in done.stderr
+    assert path.read_bytes() == text.encode("utf-8", "surrogatepass")
+
+
+def test_missing_files_and_runs_of_other_studies_are_exit_code_2(stored, tmp_path):
+    for arguments, message in (
+        ((tmp_path / "none.jsonl", stored / "variants"), "no such baseline"),
+        ((stored / "baseline.jsonl", tmp_path), "not a run's folder"),
+        ((stored / "baseline.jsonl", stored / "edits"), "expected 'stored-edits' as the run's"),
+        ((stored / "baseline.jsonl", stored / "edits", "--update"), "a baseline of study"),
+        ((stored / "variants", stored / "variants", "--update"), "a folder"),
+    ):
+        done = gate(*arguments)
+        assert done.exit_code == 2 and done.stderr.count("\n") == 1, done.output
+        assert message in done.stderr
+
+
+def test_markdown_and_json_hold_the_verdicts(stored, run, tmp_path):
+    change(run, "warp", add_half_a_pixel)
+    markdown, data = tmp_path / "a" / "summary.md", tmp_path / "compare.json"
+    done = gate(stored / "baseline.jsonl", run, "--markdown", markdown, "--json", data)
+    assert done.exit_code == 1
+    assert "| worse | warp | corrected | warp.epe_median |" in markdown.read_text()
+    result = json.loads(data.read_text())
+    assert result["regressed"] is True and result["faults"] == []
+    (row,) = [row for row in result["rows"] if row["verdict"] == "worse"]
+    name, before, now = row["worst"]
+    assert name.startswith("spheres/") and now - before == pytest.approx(0.5)
+
+
+# Samples: other seeds, so that figures differ without a change of code.
+
+METRIC_NAMES = ("depth.abs_rel", "warp.below_1px", "depth.bias_relative", "occlusion.precision")
+
+
+def samples(seed, first_seed, scenes=10, shift=0.0, noise=0.1):
+    """Three seeds of every scene; views share their scene's noise, and scenes differ widely."""
+    generator = np.random.default_rng(seed)
+    truth = np.random.default_rng(7).uniform(0.2, 0.8, (scenes, len(METRIC_NAMES)))
+    cells = []
+    for scene in range(scenes):
+        for number in range(first_seed, first_seed + 3):
+            figures = {}
+            for j, key in enumerate(METRIC_NAMES):
+                sign = -1 if METRICS[key].direction == "higher" else 1
+                common = truth[scene, j] + noise * generator.standard_normal() + sign * shift
+                values = common + 0.3 * noise * generator.standard_normal(4)
+                figures[key] = Figure(1, {f"yaw{i}": float(v) for i, v in enumerate(values)})
+            name = f"scene{scene}"
+            cells.append(Measured(name, "depth", ("a",), number, "same", {"n": number}, figures))
+    return Snapshot("noise", "", tuple(cells))
+
+
+def test_200_runs_of_equal_code_with_other_seeds_fail_at_most_at_the_stated_rate():
+    baselines = (samples(1000 + i, 0) for i in range(200))
+    results = [compare(before, samples(5000 + i, 3)) for i, before in enumerate(baselines)]
+    assert not any(result.exact or result.faults or result.too_little for result in results)
+    failed = sum(result.regressed for result in results)
+    # 5 % for all tests of a run together; 0.1 % that a gate that keeps it fails this test.
+    assert failed <= stats.binom.ppf(0.999, 200, 0.05)
+    # Noise of this size shows no equality, and none is claimed.
+    assert "equal" not in {row.verdict for result in results for row in result.rows}
+    # A change that is larger than the noise is seen by the same test.
+    seen = [compare(samples(1, 0), samples(10 + i, 3, shift=0.3)).regressed for i in range(20)]
+    assert all(seen)
+
+
+def test_small_noise_is_shown_to_be_equal():
+    result = compare(samples(1, 0, noise=1e-4), samples(2, 3, noise=1e-4))
+    assert {row.verdict for row in result.rows} == {"equal"}
+    assert any(row.difference.mean != 0 for row in result.rows)
+
+
+def test_corrected_p_values_are_scipys():
+    before, now = samples(1, 0), samples(2, 3, shift=0.05)
+    rows = compare(before, now).rows
+
+    def by_scene(side, key):
+        table = {}
+        for cell in side.cells:
+            values = np.array(list(cell.figures[key].values.values()))
+            table.setdefault(cell.scene, []).append(values)
+        return np.array([np.abs(np.mean(v, axis=0)).mean() for _, v in sorted(table.items())])
+
+    p = [
+        stats.ttest_rel(by_scene(now, row.metric), by_scene(before, row.metric)).pvalue
+        for row in rows
+    ]
+    expected = stats.false_discovery_control(p, method="bh")
+    np.testing.assert_allclose([row.adjusted_p for row in rows], expected, rtol=1e-9)
+    assert min(p) < 0.05
+
+
+def test_few_scenes_with_other_seeds_are_too_little_and_never_equal():
+    for scenes in (1, FEWEST_SCENES - 1):
+        result = compare(samples(1, 0, scenes), samples(2, 3, scenes, shift=5.0))
+        assert {row.verdict for row in result.rows} == {"can't tell"}
+        assert result.too_little and not result.regressed
+    assert not compare(samples(1, 0, 6), samples(2, 3, 6)).too_little
+
+
+def test_nothing_in_common_is_exit_code_3(stored, tmp_path):
+    run = stored / "variants"
+    whole = read_snapshot(Store(run))
+    empty = dataclasses.replace(whole, cells=())
+    write_baseline(tmp_path / "empty.jsonl", empty)
+    done = gate(tmp_path / "empty.jsonl", run)
+    assert done.exit_code == 3 and "share no gated figure" in done.stderr
+
+
+def test_every_gate_is_a_registered_metric_with_a_direction_and_a_wider_margin():
+    for name, margin in GATES.items():
+        metric = METRICS[name]
+        assert metric.direction != "none" and metric.name == name
+        for value in (0.0, 0.01, 1.0):
+            assert margin.around(value) >= metric.atol + metric.rtol * value
