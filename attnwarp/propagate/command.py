@@ -104,10 +104,9 @@ def edit_dataset(
     images = [views.target(k, black).numpy() for k in range(len(views))]
     segments = None if masks is None else _masks(masks, views.cameras)
     if words is not None:
+        by_words = load_segmenter(segmenter, device=device)
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
-        segments = _masks_by_words(
-            load_segmenter(segmenter, device=device), words, images, views, out / SEGMENTS_FOLDER
-        )
+        segments = _masks_by_words(by_words, words, images, views, out / SEGMENTS_FOLDER)
     by_hand = None if source_picture is None else _rgb(read_image(source_picture))
     editor = load_editor(editor_name, device=device)
     if settings.size is None:
