@@ -65,8 +65,8 @@ def variant() -> str:
     """The variant that pictures are made with: ``llvm_ad_rgb`` where it works, else ``scalar_rgb``.
 
     Asked once in the life of a process. ``ATTNWARP_MITSUBA`` names the variant and saves the try;
-    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. A library found here is
-    put into ``DRJIT_LIBLLVM_PATH``, where Dr.Jit and child processes find it.
+    ``DRJIT_LIBLLVM_PATH`` names the library, and then no other is tried. What is found here is put
+    into these two, where Dr.Jit and child processes find it.
     """
     named = os.environ.get("ATTNWARP_MITSUBA")
     if named:
@@ -78,7 +78,9 @@ def variant() -> str:
         if works(library):
             if library:
                 os.environ["DRJIT_LIBLLVM_PATH"] = library
+            os.environ["ATTNWARP_MITSUBA"] = LLVM
             return LLVM
+    os.environ["ATTNWARP_MITSUBA"] = SCALAR
     return SCALAR
 
 

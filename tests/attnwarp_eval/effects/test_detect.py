@@ -25,6 +25,8 @@ from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.plan import Pass, Plan, beam, plan
 from attnwarp_eval.truth.shading import emitted, irradiance, object_albedo
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 EXPECTED = {
     "diffuse": ("direct", "perspective"),
     "interreflection": ("path", "perspective"),

@@ -19,6 +19,8 @@ from attnwarp_eval.truth.plan import plan
 
 MODULE = importlib.import_module("attnwarp_eval.truth.mitsuba.appearance")
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 
 def forget_the_variant(patch):
     for name in ("ATTNWARP_MITSUBA", "DRJIT_LIBLLVM_PATH"):
@@ -159,12 +161,8 @@ def both():
     ],
 )
 def test_both_variants_make_the_same_picture_within_noise(both, name):
-    scene = (
-        load_scene("spheres").with_size(32, 32)
-        if name == "spheres"
-        else SCENES[name]().with_size(32, 32)
-    )
-    made = plan(scene, 64)
+    scene = (load_scene("spheres") if name == "spheres" else SCENES[name]()).with_size(16, 16)
+    made = plan(scene, 32)
     a, b = (
         np.stack(
             [

@@ -228,7 +228,8 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
         object_id: (H, W) index of the object, -1 where nothing is hit.
     """
     mi = library(variant())
-    world, center, _ = load_world(scene, (), False, False)
+    # Textures show in no position: of the fewest texels.
+    world, center, _ = load_world(scene, (), False, False, texel=math.inf)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
     # lie nowhere.

@@ -28,7 +28,7 @@ from attnwarp_eval.scene.materials import (
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.scene.spec import ObjectSpec, SkySpec, SunSpec
-from attnwarp_eval.scene.textures import albedo
+from attnwarp_eval.scene.textures import Plain, albedo
 from attnwarp_eval.truth.llvm import SCALAR, variant
 from attnwarp_eval.truth.plan import Plan, beam
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
@@ -91,13 +91,21 @@ def library(name: str | None = None) -> Any:
 
 
 def load_world(
-    scene: Scene, lights: tuple[int, ...], lamps: bool, media: bool, narrow: bool = False
+    scene: Scene,
+    lights: tuple[int, ...],
+    lamps: bool,
+    media: bool,
+    narrow: bool = False,
+    texel: float | None = None,
 ) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and
     the fog or None.
+
+    Args:
+        texel: size of a baked texel in scene units; :func:`texel_size` if left out.
     """
     mi = library()
-    texel = texel_size(scene)
+    texel = texel_size(scene) if texel is None else texel
     base = (mi.variant(), scene.world_hash, texel)
     forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
     shone = {
@@ -277,7 +285,13 @@ def _shapes(
         texture = item.texture
 
         def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
-            color = albedo(texture, points.reshape(-1, 3)).reshape(points.shape).astype(np.float32)
+            if isinstance(texture, Plain) and not texture.variation:
+                # One colour for millions of texels.
+                color = np.empty(points.shape, dtype=np.float32)
+                color[:] = albedo(texture, points[0, :1])
+            else:
+                color = albedo(texture, points.reshape(-1, 3)).reshape(points.shape)
+                color = color.astype(np.float32)
             bitmap = mi.Bitmap(np.ascontiguousarray(color))
             return {
                 "type": "bitmap",
