@@ -1,17 +1,64 @@
-"""Compile the kernels of the renderer and of the warp: numba caches them on disk, so that neither a
-test nor a user's first call waits, and workers of the tests do not compile the same ones at once.
+"""Compile the numba kernels, which numba caches on disk, so that neither a test nor a user's first
+call waits, and workers of the tests do not compile the same ones at once.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from attnwarp.gaussians import Gaussians
 from benchmarks import render, warp
+
+STUDY = {
+    "name": "kernels",
+    "size": 16,
+    "scenes": ["spheres"],
+    "views": ["yaw030"],
+    "feature_sizes": [16],
+    "spp": 1,
+    "splats": {"count": 200},
+    "variants": {"corrected": {"preset": "corrected"}},
+    "probes": {"depth": ["corrected"], "warp": ["corrected"]},
+}
 
 
 def main() -> None:
     """Call every kernel once, on a small case."""
     for kind in ("2d", "3d"):
-        render.time_once(render.scene(kind, 100, 0.1), render.camera(32))
+        splats = render.scene(kind, 100, 0.1)
+        for each in (splats, in_double(splats)):
+            render.time_once(each, render.camera(32))
     warp.pair_case(64).round()
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["ATTNWARP_CACHE"] = str(Path(folder) / "derived")
+        scenes_and_truth(Path(folder))
+
+
+def in_double(splats: Gaussians) -> Gaussians:
+    """The same splats in float64, which has kernels of its own."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return dataclasses.replace(splats, **{name: getattr(splats, name).double() for name in names})
+
+
+def scenes_and_truth(folder: Path) -> None:
+    """Kernels of scenes and of the truth: a body, a polygon, and a small study."""
+    from attnwarp_eval.scene.meshes.polygons import triangulate
+    from attnwarp_eval.scene.solids import Ellipsoid, mesh_body
+    from attnwarp_eval.study import Store, load_study
+    from attnwarp_eval.study.run import execute, plan
+
+    mesh_body([Ellipsoid((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))], 0.1, 16)
+    arrow = np.array([[0, 0, 0], [2, 1, 0], [0, 2, 0], [1, 1, 0.0]])  # concave, so not a fan
+    triangulate(arrow, np.arange(4), np.array([4]))
+    (folder / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    store = Store(folder / "run")
+    execute(plan(load_study(str(folder / "study.yaml")), store), store)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,8 @@ from attnwarp_eval.statistics.equivalence import equivalence
 from attnwarp_eval.truth.mitsuba import render_plan
 from attnwarp_eval.truth.plan import DROPPABLE, Lens, everything_on, plan, without
 
+pytestmark = pytest.mark.usefixtures("coarse_textures")
+
 SHAPE = (12, 16, 16, 3)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from attnwarp.camera import Camera
+from attnwarp_eval.scene import solids
 from attnwarp_eval.scene.file import list_scenes, load_scene
 from attnwarp_eval.scene.textures import albedo
 from attnwarp_eval.truth import AMBIGUOUS, HIDDEN, VISIBLE, Geometry, render_plan, two_view
@@ -40,9 +41,23 @@ CONTENT = {
 
 
 @functools.lru_cache(maxsize=8)
-def world(name, size=32):
+def world(name, size=32, meshes="as shipped"):
+    """A scene and its geometry, its bodies "coarse" (a third of the cells along each axis) or "as
+    shipped".
+    """
     scene = load_scene(name).with_size(size, size)
-    return scene, Geometry(scene)
+    mesh_body = solids.mesh_body
+
+    def coarse(parts, blend, resolution, relief):
+        return mesh_body(parts, blend, resolution // 3, relief)
+
+    with pytest.MonkeyPatch.context() as patch:
+        if meshes == "coarse":
+            patch.setattr(solids, "mesh_body", coarse)
+        return scene, Geometry(scene)
+
+
+MESHES = ["coarse", pytest.param("as shipped", marks=pytest.mark.slow)]
 
 
 def shifted(camera, scale, offset):
@@ -61,9 +76,10 @@ def test_the_scenes_of_the_reference_results_are_still_the_same_content(name):
     assert load_scene(name).content_hash == CONTENT[name]
 
 
+@pytest.mark.parametrize("meshes", MESHES)
 @pytest.mark.parametrize("name", SIX + HARD)
-def test_every_scene_loads_and_its_truth_is_finite_in_every_view(name):
-    scene, geometry = world(name)
+def test_every_scene_loads_and_its_truth_is_finite_in_every_view(name, meshes):
+    scene, geometry = world(name, meshes=meshes)
     assert scene.name == name and scene.title and scene.description
     shown = set()
     for camera in scene.cameras:
@@ -88,9 +104,10 @@ def test_every_scene_loads_and_its_truth_is_finite_in_every_view(name):
     )
 
 
+@pytest.mark.parametrize("meshes", MESHES)
 @pytest.mark.parametrize("name", SIX)
-def test_the_six_hide_parts_of_themselves_and_look_back_at_the_source(name):
-    scene, geometry = world(name)
+def test_the_six_hide_parts_of_themselves_and_look_back_at_the_source(name, meshes):
+    scene, geometry = world(name, meshes=meshes)
     assert len(scene.targets) >= 10
     pair = two_view(geometry, scene.source, scene.camera("yaw045"))
     assert pair.visible.mean() > 0.1 and (pair.label == HIDDEN).mean() > 0.01

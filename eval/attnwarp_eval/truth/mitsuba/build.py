@@ -285,14 +285,12 @@ def _shapes(
         texture = item.texture
 
         def bake(points: Array, texture: Any = texture) -> dict[str, Any]:
+            color = np.empty(points.shape, dtype=np.float32)
             if isinstance(texture, Plain) and not texture.variation:
-                # One colour for millions of texels.
-                color = np.empty(points.shape, dtype=np.float32)
-                color[:] = albedo(texture, points[0, :1])
+                color[:] = albedo(texture, points[0, :1])  # one colour for millions of texels
             else:
-                color = albedo(texture, points.reshape(-1, 3)).reshape(points.shape)
-                color = color.astype(np.float32)
-            bitmap = mi.Bitmap(np.ascontiguousarray(color))
+                color[:] = albedo(texture, points.reshape(-1, 3)).reshape(points.shape)
+            bitmap = mi.Bitmap(color)
             return {
                 "type": "bitmap",
                 "bitmap": bitmap,
