@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -53,10 +53,9 @@ class Way:
         return dtype
 
     @property
-    def numpy(self) -> type:
+    def numpy(self) -> np.dtype[Any]:
         """The precision as numpy's type."""
-        kind: type = getattr(np, self.precision)
-        return kind
+        return np.dtype(self.precision)
 
 
 def ways(*backends: str, precisions: tuple[str, ...] = ("float64", "float32")) -> tuple[Way, ...]:

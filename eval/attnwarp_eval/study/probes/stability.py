@@ -292,7 +292,8 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         number(worst.margin, 2),
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
-        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "nothing that was swept",
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items())
+        or "nothing that was swept",
     ]
 
 
