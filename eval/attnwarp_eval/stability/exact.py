@@ -8,7 +8,7 @@ float64 has.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,8 @@ FIELDS = ("means", "quats", "scales", "opacities")
 
 Number = Any  # mpmath.mpf
 Vector = list[Number]
+Drawn = tuple[Number, Number, Number]
+"""Of one splat at one pixel: depth of its centre, alpha before the cut-offs, depth."""
 
 
 @dataclass(frozen=True)
@@ -81,20 +83,7 @@ class ExactSplats:
     def pixel(self, x: float, y: float) -> Pixel:
         """The splats composited at pixel coordinates (centres at +0.5)."""
         with mpmath.workdps(DIGITS):
-            drawn = [self._splat(k, x, y) for k in range(len(self.values["means"]))]
-            drawn.sort(key=lambda splat: splat[0])
-            before, total, weighted = mpmath.mpf(1), mpmath.mpf(0), mpmath.mpf(0)
-            threshold = mpmath.mpf(constants.ALPHA_MIN)
-            nearest = mpmath.inf
-            for _, raw, z in drawn:
-                nearest = min(nearest, abs(raw - threshold))
-                if raw < threshold or before <= mpmath.mpf(constants.TRANSMITTANCE_STOP):
-                    continue
-                alpha = min(raw, mpmath.mpf(constants.ALPHA_MAX))
-                total += before * alpha
-                weighted += before * alpha * z
-                before *= 1 - alpha
-            return Pixel(total, weighted / total if total > 0 else None, nearest)
+            return _composite(self._splats(x, y))
 
     def gradient(
         self, pixels: Sequence[tuple[float, float]], weights: Sequence[tuple[float, float]]
@@ -106,36 +95,34 @@ class ExactSplats:
             weights: (a, b) of each.
         """
         with mpmath.workdps(DIGITS):
+            # One splat moves at a time; the others stay as they are drawn here.
+            still = [self._splats(x, y) for x, y in pixels]
             gradient = {}
             for name in FIELDS:
                 rows = []
-                for values in self.values[name]:
+                for splat, values in enumerate(self.values[name]):
                     row = []
                     step = STEP * (max(map(abs, values)) or 1)
                     for k, value in enumerate(values):
                         ends = []
                         for moved in (value + step, value - step):
                             values[k] = moved
-                            ends.append(self._loss(pixels, weights))
+                            drawn = [
+                                [*others[:splat], self._splat(splat, x, y), *others[splat + 1 :]]
+                                for others, (x, y) in zip(still, pixels, strict=True)
+                            ]
+                            ends.append(_loss(map(_composite, drawn), weights))
                         values[k] = value
                         row.append(float((ends[0] - ends[1]) / (2 * step)))
                     rows.append(row)
                 gradient[name] = np.array(rows)
             return gradient
 
-    def _loss(
-        self, pixels: Sequence[tuple[float, float]], weights: Sequence[tuple[float, float]]
-    ) -> Number:
-        loss = mpmath.mpf(0)
-        for (x, y), (a, b) in zip(pixels, weights, strict=True):
-            pixel = self.pixel(x, y)
-            loss += a * pixel.alpha
-            if b and pixel.depth is not None:
-                loss += b * pixel.depth
-        return loss
+    def _splats(self, x: float, y: float) -> list[Drawn]:
+        return [self._splat(k, x, y) for k in range(len(self.values["means"]))]
 
-    def _splat(self, k: int, x: float, y: float) -> tuple[Number, Number, Number]:
-        """Depth of the centre, alpha before its cut-offs (0 where not drawn), and depth."""
+    def _splat(self, k: int, x: float, y: float) -> Drawn:
+        """One splat at a pixel; its alpha is 0 where it is not drawn."""
         mean, quat, scale = (self.values[name][k] for name in ("means", "quats", "scales"))
         opacity = self.values["opacities"][k][0]
         center = [a + b for a, b in zip(_apply(self.R, mean), self.shift, strict=True)]
@@ -240,6 +227,31 @@ class ExactSplats:
     def _extent(self, z: Number, variance: Number) -> tuple[Number, Number]:
         reach = mpmath.sqrt(2 * mpmath.log(255)) * mpmath.sqrt(variance)
         return max(z - reach, self.near), max(z + reach, self.near)
+
+
+def _composite(splats: Sequence[Drawn]) -> Pixel:
+    """Front to back by the depth of the centres, with the declared cut-offs."""
+    before, total, weighted = mpmath.mpf(1), mpmath.mpf(0), mpmath.mpf(0)
+    threshold = mpmath.mpf(constants.ALPHA_MIN)
+    nearest = mpmath.inf
+    for _, raw, z in sorted(splats, key=lambda splat: splat[0]):
+        nearest = min(nearest, abs(raw - threshold))
+        if raw < threshold or before <= mpmath.mpf(constants.TRANSMITTANCE_STOP):
+            continue
+        alpha = min(raw, mpmath.mpf(constants.ALPHA_MAX))
+        total += before * alpha
+        weighted += before * alpha * z
+        before *= 1 - alpha
+    return Pixel(total, weighted / total if total > 0 else None, nearest)
+
+
+def _loss(pixels: Iterable[Pixel], weights: Sequence[tuple[float, float]]) -> Number:
+    loss = mpmath.mpf(0)
+    for pixel, (a, b) in zip(pixels, weights, strict=True):
+        loss += a * pixel.alpha
+        if b and pixel.depth is not None:
+            loss += b * pixel.depth
+    return loss
 
 
 def _array(tensor: Any) -> np.ndarray:

@@ -39,16 +39,19 @@ class Shot:
         pixels: (row, column) of each.
         options: of :func:`attnwarp.render.render` beside the backend: ``near``, ``antialiased``
             and ``depth``.
+        unmoved: the same shot where it is not hard, for the oracle; itself if None.
     """
 
     gaussians: Gaussians
     camera: Camera
     pixels: Sequence[tuple[int, int]]
     options: dict[str, Any] = field(default_factory=dict)
+    unmoved: Shot | None = None
 
     def exact(self, dtype: torch.dtype) -> ExactSplats:
         """The oracle of the values as ``dtype`` stores them."""
-        return ExactSplats(self.gaussians.to(dtype=dtype), self.camera, **self.options)
+        made = self.unmoved or self
+        return ExactSplats(made.gaussians.to(dtype=dtype), made.camera, **made.options)
 
     def render(self, way: Way, gaussians: Gaussians | None = None) -> Render:
         """The picture by a way."""
@@ -128,17 +131,15 @@ def against_exact(
     def gradient(level: float, precision: str) -> dict[str, np.ndarray]:
         made = shot(level)
         exact = made.exact(getattr(torch, precision))
-        points = [(column + 0.5, row + 0.5) for row, column in made.pixels]
-        drawn = [pixel.depth is not None for pixel in truth(level, precision)]
-        return exact.gradient(points, _weights(drawn, outputs))
+        points = [(column + 0.5, row + 0.5) for row, column in made.pixels[::2]]
+        return exact.gradient(points, _weights(truth(level, precision)[::2], outputs))
 
     def measure(level: float, way: Way) -> float:
         made = shot(level)
         pixels = truth(level, way.precision)
         if way.direction == "forward":
             return _difference(made.render(way), made, pixels, outputs)
-        drawn = [pixel.depth is not None for pixel in pixels]
-        result = _backward(made, way, _weights(drawn, outputs))
+        result = _backward(made, way, _weights(pixels[::2], outputs))
         return relative_gradient(result, gradient(level, way.precision))
 
     return measure
@@ -161,14 +162,16 @@ def relative_gradient(result: dict[str, np.ndarray], exact: dict[str, np.ndarray
     )
 
 
-def _weights(drawn: Sequence[bool], outputs: Sequence[str]) -> list[tuple[float, float]]:
-    """Weights of the loss: other ones for each pixel, so that no two errors cancel."""
+def _weights(pixels: Sequence[Pixel], outputs: Sequence[str]) -> list[tuple[float, float]]:
+    """Weights of the loss: other ones for each pixel, so that no two errors cancel. Every second
+    pixel takes part, since the exact gradient costs most of a sweep.
+    """
     return [
         (
             1.0 + 0.25 * k if "alpha" in outputs else 0.0,
-            0.5 - 0.125 * k if "depth" in outputs and seen else 0.0,
+            0.5 - 0.125 * k if "depth" in outputs and pixel.depth is not None else 0.0,
         )
-        for k, seen in enumerate(drawn)
+        for k, pixel in enumerate(pixels)
     ]
 
 
@@ -195,7 +198,7 @@ def _backward(
     leafy = Gaussians(base.kind, **leaves, sh=base.sh, origin=base.origin)
     view = made.render(way, leafy)
     loss = torch.zeros((), dtype=torch.float64)
-    for (row, column), (a, b) in zip(made.pixels, weights, strict=True):
+    for (row, column), (a, b) in zip(made.pixels[::2], weights, strict=True):
         loss = loss + a * view.alpha[row, column].double().cpu()
         if b:
             loss = loss + b * view.depth[row, column].double().cpu()

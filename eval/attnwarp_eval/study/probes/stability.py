@@ -277,11 +277,10 @@ def _row(swept: Sequence[Swept]) -> list[str]:
     for sweep in swept:
         end = sweep.end
         if end is not None:
-            verb = "refused" if end.refusal else "breaks"
-            level = f"{verb} at {level_name(end.level)}"
-            if not end.refusal:
-                level += f" ({_error(end.error)})"
-            ends.setdefault(level, []).append(f"{sweep.way.backend} {sweep.way.precision}")
+            level = f"{'refused' if end.refusal else 'breaks'} at {level_name(end.level)}"
+            error = "" if end.refusal else f" ({_error(end.error)})"
+            side = f"{sweep.way.backend} {sweep.way.precision}{error}"
+            ends.setdefault(level, []).append(side)
     last = level_name(max(required, key=lambda outcome: hard.levels.index(outcome.level)).level)
     return [
         str(hard.number),
@@ -292,8 +291,7 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         number(worst.margin, 2),
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
-        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items())
-        or "nothing that was swept",
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "no level swept",
     ]
 
 
@@ -302,35 +300,36 @@ def _tolerance(unit: str, tolerance: float) -> str:
 
 
 def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
-    """Errors in units of their tolerance against hardness, a panel a case."""
+    """Errors in units of their tolerance against hardness, a panel a case that ends somewhere."""
     pictures = []
-    for group, members in groupby(
-        sorted(swept, key=lambda sweep: sweep.case.group), key=lambda sweep: sweep.case.group
-    ):
-        panels = [
-            list(of_case)
-            for _, of_case in groupby(
-                sorted(members, key=lambda sweep: (sweep.case.number, sweep.case.name)),
-                key=lambda sweep: sweep.case.name,
-            )
-        ]
+    panels = [
+        list(of_case)
+        for _, of_case in groupby(
+            sorted(swept, key=lambda sweep: (sweep.case.number, sweep.case.name)),
+            key=lambda sweep: sweep.case.name,
+        )
+    ]
+    ending = [panel for panel in panels if any(sweep.end for sweep in panel)]
+    for group in dict.fromkeys(panel[0].case.group for panel in ending):
+        members = [panel for panel in ending if panel[0].case.group == group]
         path = layout.figure(f"stability-{group}.svg")
-        columns = min(4, len(panels))
-        rows = -(-len(panels) // columns)
-        with charts.drawing(
-            path, columns, 2.5 * rows + 0.4, rows=rows, width=3.2 * columns
-        ) as axes:
+        columns = min(3, len(members))
+        rows = -(-len(members) // columns)
+        width = 3.3 * columns
+        with charts.drawing(path, columns, 2.3 * rows, rows=rows, width=width) as axes:
             for index, axis in enumerate(axes):
-                if index < len(panels):
-                    _panel(axis, panels[index])
+                if index < len(members):
+                    _panel(axis, members[index])
                 else:
                     axis.set_visible(False)
-        pictures.append(Picture(f"figures/{path.name}", f"Hard cases of {group}."))
+        caption = f"Hard cases of {group} that break, or are refused, at some level."
+        pictures.append(Picture(f"figures/{path.name}", caption))
     text = [
         (
-            "Error over tolerance, from 0.001 to 1000, against hardness; the first wrong digit is"
-            " where a line crosses 1. What is required is left of the dotted line. Solid lines are"
-            " values, dashed ones gradients; a cross at the top is a refusal."
+            "Decades of error over tolerance, from -3 to 3, against hardness: the first wrong digit"
+            " is where a line crosses 0. What must hold is left of the dotted line (of the dashed"
+            " one for gradients). Solid lines are values, dashed ones gradients; a cross at the top"
+            f" is a refusal. {len(panels) - len(ending)} other cases hold at every level."
         ),
     ]
     return Section("Error against hardness", text, figures=pictures)
@@ -338,43 +337,37 @@ def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
 
 def _panel(axes: Any, swept: Sequence[Swept]) -> None:
     hard = swept[0].case
-    levels = [outcome.level for outcome in max(swept, key=lambda s: len(s.outcomes)).outcomes]
-    colors = dict.fromkeys((s.way.backend, s.way.precision) for s in swept)
-    for index, key in enumerate(colors):
-        for sweep in swept:
-            if (sweep.way.backend, sweep.way.precision) != key:
-                continue
-            color = charts.PALETTE[index % len(charts.PALETTE)]
-            shift = 0.06 * (index - (len(colors) - 1) / 2)
-            x = [shift + k for k in range(len(levels))]
-            # A refusal where one is due is no error; it stands with the other refusals.
-            y = [math.nan if o.refusal else 10**-o.margin for o in sweep.outcomes]
-            forward = sweep.way.direction == "forward"
-            axes.plot(
-                x,
-                y,
-                color=color,
-                linestyle="-" if forward else "--",
-                marker=charts.MARKERS[index % len(charts.MARKERS)],
-                markersize=3 if forward else 2,
-                linewidth=1,
-                label=f"{key[0]} {key[1]}" if forward else None,
-            )
-            refused = [a for a, o in zip(x, sweep.outcomes, strict=True) if o.refusal]
-            axes.plot(refused, [500.0] * len(refused), "x", color=color, markersize=5)
-    axes.axhline(1, color="black", linewidth=0.7)
+    levels = [outcome.level for outcome in swept[0].outcomes]
+    sides = list(dict.fromkeys((s.way.backend, s.way.precision) for s in swept))
+    for sweep in swept:
+        side = (sweep.way.backend, sweep.way.precision)
+        index = sides.index(side)
+        forward = sweep.way.direction == "forward"
+        # Lines that lie on each other stand side by side.
+        x = [0.06 * (index - (len(sides) - 1) / 2) + k for k in range(len(levels))]
+        axes.plot(
+            x,
+            [math.nan if o.refusal else -o.margin for o in sweep.outcomes],
+            color=charts.PALETTE[index],
+            linestyle="-" if forward else "--",
+            marker=charts.MARKERS[index],
+            markersize=3 if forward else 2,
+            linewidth=1,
+            label=" ".join(side) if forward else None,
+        )
+        refused = [place for place, o in zip(x, sweep.outcomes, strict=True) if o.refusal]
+        axes.plot(refused, [DECADES] * len(refused), "x", color=charts.PALETTE[index], markersize=5)
+    axes.axhline(0, color="black", linewidth=0.7)
     for way in {s.way.direction: s.way for s in swept}.values():
         last = sum(hard.is_required(level, way.direction) for level in levels)
-        style = ":" if way.direction == "forward" else (0, (1, 4))
-        axes.axvline(last - 0.5, color="black", linewidth=0.8, linestyle=style)
-    axes.set_yscale("log")
-    axes.set_ylim(10**-DECADES / 2, 10**DECADES * 2)
-    step = -(-len(levels) // 6)
-    axes.set_xticks(range(0, len(levels), step), [level_name(v) for v in levels[::step]])
-    axes.tick_params(labelsize=6.5)
-    axes.set_xlabel(hard.hardness, fontsize=7.5)
-    axes.set_title(f"{hard.number} {hard.name}", loc="left", fontsize=8)
-    axes.legend(fontsize=5.5, loc="lower right")
+        style = ":" if way.direction == "forward" else "--"
+        axes.axvline(last - 0.5, color="black", linewidth=0.7, linestyle=style)
+    axes.set_ylim(-DECADES - 0.3, DECADES + 0.3)
+    axes.set_yticks([-DECADES, 0, DECADES])
+    axes.set_xticks(range(len(levels)), [level_name(v) for v in levels], rotation=40, ha="right")
+    axes.tick_params(labelsize=6)
+    axes.set_title(f"{hard.number} {hard.name}: {hard.hardness}", loc="left", fontsize=7)
+    axes.legend(fontsize=5, loc="lower right")
 
 
 def _every_error(swept: Sequence[Swept]) -> Section:
