@@ -4,12 +4,20 @@ import numpy as np
 import torch
 
 from attnwarp import Camera, Gaussians
+from attnwarp_eval.stability.closed_forms import faces, orbit, plane_depth, sphere
 
-
-def orbit(yaw, *, size=64, distance=4.0, fov=45.0, height=0.0, width=None):
-    angle = np.radians(yaw)
-    position = (distance * np.cos(angle), distance * np.sin(angle), height)
-    return Camera.look_at(position, (0, 0, 0), width=width or size, height=size, fov_y=fov)
+__all__ = [
+    "apply",
+    "area",
+    "faces",
+    "homography",
+    "orbit",
+    "plane_depth",
+    "rolled",
+    "shell",
+    "skewed",
+    "sphere",
+]
 
 
 def rolled(camera, degrees):
@@ -17,26 +25,6 @@ def rolled(camera, degrees):
     turn = np.eye(4)
     turn[:2, :2] = [[c, -s], [s, c]]
     return Camera(camera.K, turn @ camera.world_to_camera, camera.width, camera.height)
-
-
-def plane_depth(camera, normal, offset):
-    """Depth of the plane normal . X = offset, from rays in world axes."""
-    rays = camera.directions() @ camera.rotation
-    with np.errstate(divide="ignore"):
-        z = (offset - np.dot(normal, camera.position)) / (rays @ np.asarray(normal, float))
-    return np.where(z > 0, z, np.nan)
-
-
-def sphere(camera, radius=1.0):
-    """Depth and outward normals of a sphere at the origin."""
-    rays = camera.directions() @ camera.rotation
-    length = np.linalg.norm(rays, axis=-1)
-    unit = rays / length[..., None]
-    along = unit @ camera.position
-    # r^2 - |oc - (oc.d) d|^2 keeps its digits at the outline, where b^2 - c does not.
-    half = radius**2 - ((camera.position - along[..., None] * unit) ** 2).sum(-1)
-    t = np.where(half > 0, -along - np.sqrt(np.maximum(half, 0)), np.nan)
-    return t / length, (camera.position + t[..., None] * unit) / radius
 
 
 def homography(source, target, normal, offset):
@@ -61,13 +49,6 @@ def skewed(camera):
     K = camera.K.copy()
     K[0] = [1.3 * K[0, 0], 0.1 * K[0, 0], -0.4 * camera.width]
     return Camera(K, camera.world_to_camera, camera.width, camera.height)
-
-
-def faces(camera, points, normals):
-    """The closed form for a convex body: a point is seen exactly where its outward normal looks at
-    the camera.
-    """
-    return ((camera.position - points) * normals).sum(-1) > 0
 
 
 def area(camera, normal):

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from attnwarp_eval.cli import cache, compare, inspect, metrics, run, scenes
+from attnwarp_eval.cli import cache, compare, inspect, metrics, run, scenes, stability
 from attnwarp_eval.cli.shell import (
     CLOSED_PIPE,
     CRASH,
@@ -38,6 +38,7 @@ for command in (
     run.verify,
     run.studies,
     compare.compare,
+    stability.stability,
     metrics.metrics,
     metrics.encoders,
     inspect.inspect,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,9 @@ from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progr
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
+    from attnwarp_eval.study.parts import Study
     from attnwarp_eval.study.record import Failure
+    from attnwarp_eval.study.results import Results
     from attnwarp_eval.study.run import Plan, Summary
     from attnwarp_eval.study.store import Store
 
@@ -38,15 +41,30 @@ def run(
 ) -> None:
     """Run a study and write its report. Killed half-way and started again, it goes on where it
     was."""
+    from attnwarp_eval.study.study import load_study
+
+    run_study(lambda: load_study(study, scenes=names(scenes), size=size), out, jobs, keep_going)
+
+
+def run_study(
+    load: Callable[[], Study], out: Path | None, jobs: int = 1, keep_going: bool = True
+) -> Results:
+    """Run a study and write its report; return what was measured.
+
+    Args:
+        load: reads the study, and says in one line what is wrong with it.
+        out: the run's folder; ``runs/<study>`` if None.
+        jobs: worker processes.
+        keep_going: after a failed cell.
+    """
     from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
     from attnwarp_eval.study.run import plan
     from attnwarp_eval.study.store import Store
-    from attnwarp_eval.study.study import load_study
 
     with clear_errors():
         limit_bytes()  # a limit that is no number would make every cell fail
-        loaded = load_study(study, scenes=names(scenes), size=size)
+        loaded = load()
         store = Store(out or Path("runs") / loaded.name)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
@@ -60,7 +78,8 @@ def run(
                     )
                 summary = _watch(planned, store, jobs, keep_going)
                 _write_report(store)
-                uncalibrated = problems(read_results(store))
+                results = read_results(store)
+                uncalibrated = problems(results)
     _print_failures(summary)
     if not summary.complete:
         missing = summary.expected - summary.reused - summary.computed
@@ -70,6 +89,7 @@ def run(
         )
     if uncalibrated:
         raise fail("the instrument is not calibrated: " + "; ".join(uncalibrated), TOO_LITTLE)
+    return results
 
 
 def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:

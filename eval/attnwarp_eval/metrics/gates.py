@@ -58,6 +58,7 @@ GATES: Mapping[str, Margin] = {
     "consistency.delta_e": Margin(0.01, 0.02),
     "fidelity.mse": Margin(1e-5, 0.05),
     "fidelity.preserved_mse": Margin(1e-5, 0.05),
+    "stability.margin": Margin(0.5),
 }
 """Margins by metric. Figures that are infinite for equal pictures, such as PSNR, are left to their
 mean squared error, which is always defined.

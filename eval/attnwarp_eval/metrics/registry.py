@@ -20,7 +20,8 @@ class Metric:
         name: ``check.figure``, such as ``warp.epe_median``. A result's key may carry further parts behind it: a region
             (``depth.bias.edge``) or a feature size (``warp.epe_median.64``).
         unit: "px" (of the image), "layer px", "scene" (scene units), "deg", "dB", "dE00" (CIEDE2000), "share" (of 1),
-            "ratio", "cosine" (of embeddings, -1 to 1), "pixels" or "views" (counts).
+            "ratio", "cosine" (of embeddings, -1 to 1), "decades" (of 10), "own" (the unit of a hard case's tolerance),
+            "pixels" or "views" (counts).
         direction: which values are better; "zero" for signed figures that are best at 0, "none" for counts that
             describe.
         atol, rtol: a change of at most ``atol + rtol * |value|`` between two runs is no change.
@@ -209,6 +210,10 @@ _SPECS = (
         "distance to the unedited picture, outside the object",
     ),
     Metric("fidelity.pixels", "pixels", "none", 0, 0, "pixels compared"),
+    # Hard cases: attnwarp_eval.stability, docs/hard-cases.md.
+    Metric("stability.margin", "decades", "higher", 1e-2, 0, "log10 of tolerance over error, cut at 3 and -3"),
+    Metric("stability.error", "own", "lower", 0, 1e-2, "error of a hard case, in the unit of its tolerance"),
+    Metric("stability.refused", "share", "none", 0, 0, "1 where a hard input was refused with an error, else 0"),
 )
 
 METRICS = Registry({metric.name: metric for metric in _SPECS})

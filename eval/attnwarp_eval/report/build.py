@@ -29,23 +29,29 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     lead = [
         (
             f"Study `{study.name}`: {results.measured} of {total} cells measured,"
-            f" {len(results.failures)} failed; scenes {', '.join(study.scenes)}; {study.size}"
-            f" x {study.size} px; seeds {study.seeds}."
+            f" {len(results.failures)} failed"
+            + (
+                f"; scenes {', '.join(study.scenes)}; {study.size} x {study.size} px; seeds"
+                f" {study.seeds}."
+                if study.scenes
+                else "."
+            )
         ),
-        (
+    ]
+    if study.scenes:
+        lead.append(
             f"Figures are means over {len(study.scenes)} scenes of means over their views, ±"
             " half of the 95 % interval (Student's t over scenes). Differences are paired on scene"
             " and view; verdicts are adjusted for the number of tests in their table. \"can't"
             ' tell" is not "equal".'
-        ),
-    ]
+        )
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for probe in probes():
         for place, section in probe.sections(results, layout):
             of_probes[place].append(section)
     sections = [
-        claims(results),
+        *([claims(results)] if study.scenes else []),
         *of_probes[Place.INSTRUMENT],
         *ablations(results),
         *of_probes[Place.RESULT],

@@ -40,9 +40,10 @@ def read_results(store: Store) -> Results:
             f"{store.root / 'study.json'}: {explain(error)}; run the study again with --out"
             f" {store.root}, which writes it anew"
         ) from None
-    available = {p.name for p in probes()}
+    needs_scenes = {p.name: p.needs_scenes for p in probes()}
     for cell in stored["cells"]:
-        if cell["probe"] not in available or cell["scene"] not in study.scenes:
+        on_scene = needs_scenes.get(cell["probe"], True)
+        if cell["probe"] not in needs_scenes or (on_scene and cell["scene"] not in study.scenes):
             raise StoreError(
                 f"{store.root / 'study.json'}: cell {cell['title']!r} names a probe or a scene"
                 f" that the study lacks; run the study again with --out {store.root}, which"

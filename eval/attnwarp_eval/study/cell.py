@@ -17,7 +17,8 @@ class Cell:
     Attributes:
         spec: everything that decides the result, and nothing else: scene content, variant content,
             seed, views, image size, protocol versions. Names that people gave are not in it.
-        scene, variant, probe, seed: labels for tables and error messages.
+        scene, variant, probe, seed: labels for tables and error messages. A probe that needs no
+            scenes has the name of its own subject in ``scene``, such as a hard case.
         labels: every variant name that leads to this same content.
         pictures: views of which pictures are wanted.
         sources: where the computation finds what ``spec`` names by content, such as encoders.

@@ -125,7 +125,7 @@ class Study(Part):
     title: str = ""
     description: str = ""
     size: Annotated[int, Field(ge=16, le=4096)] = 512
-    scenes: Annotated[list[str], Field(min_length=1)]
+    scenes: list[str] = Field(default_factory=list)
     views: list[str] = Field(
         default_factory=list, description="target views by name; all of them if empty"
     )

@@ -40,7 +40,7 @@ class View:
 
     Attributes:
         name: the target's; an edit or another task may stand before it, as ``task/target``.
-        yaw: degrees from the source, in [0, 180].
+        yaw: degrees from the source, in [0, 180]; 0 where nothing is seen by a camera.
         metrics: figures by name; NaN where undefined.
     """
 

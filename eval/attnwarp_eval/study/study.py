@@ -52,6 +52,9 @@ class _Joined(Study):
         for name in self.probes:
             if name not in available:
                 raise ValueError(f"probes: no probe {name!r}{did_you_mean(name, available)}")
+        judged_on = [name for name in self.probes if available[name].needs_scenes]
+        if judged_on and not self.scenes:
+            raise ValueError(f"scenes: got none, expected at least 1 for probes.{judged_on[0]}")
         judging = [name for name in self.probes if available[name].judges_variants]
         if judging and not self.variants:
             raise ValueError(f"variants: got none, expected at least one for probes.{judging[0]}")
@@ -163,7 +166,8 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
         for cell in probe(name).cells(study, variants, ordered)
     ]
     place = {name: i for i, name in enumerate(ordered)}
-    return merged(sorted(cells, key=lambda cell: place[cell.scene]))
+    # What has no scene comes last, in its own order.
+    return merged(sorted(cells, key=lambda cell: place.get(cell.scene, len(place))))
 
 
 def shipped_studies() -> dict[str, Path]:

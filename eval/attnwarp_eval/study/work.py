@@ -36,12 +36,14 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     torch.set_num_threads(1)
     set_thread_count(threads or len(os.sched_getaffinity(0)))
     meter = Meter()
-    with meter.stage("setup"):
-        scene_world = world(cell.scene, cell.spec["size"])
-    if scene_world.content_hash != cell.spec["scene"]:
-        raise InputError(
-            f"scene {cell.scene!r} has changed since the run was planned; start the run again"
-        )
+    scene_world = None
+    if probe.needs_scenes:
+        with meter.stage("setup"):
+            scene_world = world(cell.scene, cell.spec["size"])
+        if scene_world.content_hash != cell.spec["scene"]:
+            raise InputError(
+                f"scene {cell.scene!r} has changed since the run was planned; start the run again"
+            )
     work = Work(cell, root, scene_world, meter)
     extra = probe.compute(work)
     _check_metrics(probe, work)

@@ -79,17 +79,24 @@ class Work:
     Attributes:
         cell: what is computed.
         root: the run's folder.
-        world: of the scene at the study's size.
+        scene_world: of the scene at the study's size; None for a probe that needs no scenes.
         meter: of seconds and counters.
         views, pictures: results so far.
     """
 
     cell: Cell
     root: Path
-    world: World
+    scene_world: World | None
     meter: Meter
     views: list[View] = field(default_factory=list)
     pictures: list[PictureFile] = field(default_factory=list)
+
+    @property
+    def world(self) -> World:
+        """Of the scene. LookupError: the probe needs no scenes, so it has none."""
+        if self.scene_world is None:
+            raise LookupError(f"probe {self.cell.probe!r} needs no scenes, so it has no world")
+        return self.scene_world
 
     @property
     def spec(self) -> Json:
@@ -133,6 +140,7 @@ class Probe(ABC, Generic[E]):
         study_part: keys of a study's YAML that only this probe reads.
         variant_part: keys of a variant that only this probe reads.
         metrics: specification of every figure of its records.
+        needs_scenes: whether its cells are of scenes; else ``cells`` names subjects of its own.
         judges_variants: whether it has cells for each variant.
         always: whether every run has its cells, with or without the study's asking.
         main: whether tables of a report speak of it where they name no probe.
@@ -149,6 +157,7 @@ class Probe(ABC, Generic[E]):
     study_part: ClassVar[type[Part] | None] = None
     variant_part: ClassVar[type[Part] | None] = None
     metrics: ClassVar[Registry] = Registry({})
+    needs_scenes: ClassVar[bool] = True
     judges_variants: ClassVar[bool] = True
     always: ClassVar[bool] = False
     main: ClassVar[bool] = False

@@ -161,6 +161,8 @@ class Calibration(Probe[Extra]):
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The calibration, and the light transport of the scenes."""
+        if not results.study.scenes:
+            return
         yield Place.INSTRUMENT, self._calibration(results)
         yield from ((Place.APPENDIX, section) for section in self._transport(results))
 

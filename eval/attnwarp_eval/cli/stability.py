@@ -1,0 +1,102 @@
+"""The command that sweeps the hard cases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from attnwarp_eval.cli.shell import Regression, clear_errors, progress
+
+if TYPE_CHECKING:
+    from attnwarp_eval.stability import Case
+
+
+def stability(
+    case: Annotated[
+        list[str] | None, typer.Option(help="Show one case with its sweep, and run no other.")
+    ] = None,
+    list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Three levels of each case.")] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="The run's folder; runs/stability if left out.")
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")
+    ] = 1,
+) -> None:
+    """Sweep numerically hard inputs until the numerics break. Exit code 1 if one breaks too early.
+
+    Without options the study `stability` is run and its report written; killed half-way and started
+    again, it goes on where it was.
+    """
+    from attnwarp_eval import stability
+
+    with clear_errors():
+        if list_:
+            for hard in stability.hard_cases().values():
+                typer.echo(f"{hard.number:2}  {hard.name:24} {hard.title}")
+            return
+        chosen = [stability.hard_case(name) for name in case or ()]
+    failed = _show(chosen, quick) if chosen else _study(quick, out, jobs)
+    for line in failed:
+        typer.echo(f"attnwarp-eval: {line}", err=True)
+    if failed:
+        raise Regression
+
+
+def _show(chosen: list[Case], quick: bool) -> list[str]:
+    """Print the sweeps of these cases; return what fails."""
+    import textwrap
+
+    from rich.console import Console
+
+    from attnwarp_eval.document.write import terminal
+    from attnwarp_eval.study.probes.stability import Swept, case_table, verdict_lines
+
+    console = Console()
+    lines: list[str] = []
+    for hard in chosen:
+        levels = hard.quick if quick else hard.levels
+        offered = [way for way in hard.ways if way.backend != "cuda" or has_cuda()]
+        swept = []
+        with progress(len(offered)) as show:
+            for done, way in enumerate(offered):
+                show(done, len(offered), f"{hard.name} / {way.name}")
+                swept.append(Swept(hard, way, tuple(hard.outcome(level, way) for level in levels)))
+        about = case_table(swept).caption.replace("`", "")
+        for line in textwrap.wrap(about, width=min(console.width, 100)):
+            typer.echo(line)
+        for direction in hard.bounds:
+            table = case_table([sweep for sweep in swept if sweep.way.direction == direction])
+            table.caption = ""
+            console.print(terminal(table))
+        for message in dict.fromkeys(o.refusal for s in swept for o in s.outcomes if o.refusal):
+            typer.echo(f"refused: {message}")
+        lines += verdict_lines(swept)
+    return lines
+
+
+def _study(quick: bool, out: Path | None, jobs: int) -> list[str]:
+    """Run the study; return what fails."""
+    from attnwarp_eval.cli.run import run_study
+    from attnwarp_eval.study.probes.stability import read_sweeps, verdict_lines
+    from attnwarp_eval.study.study import load_study
+
+    changes: dict[str, Any] = {
+        "stability": {"levels": "quick" if quick else "all", "cuda": has_cuda()}
+    }
+    if quick:
+        changes["name"] = "stability-quick"
+    results = run_study(lambda: load_study("stability", **changes), out, jobs)
+    return verdict_lines(read_sweeps(results))
+
+
+def has_cuda() -> bool:
+    """Whether backend cuda can run here: a GPU, and gsplat for its kernels."""
+    import importlib.util
+
+    import torch
+
+    return torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None

@@ -1,0 +1,61 @@
+"""Numerically hard cases, each swept over its hardness until what is computed breaks.
+
+A case names its input, an oracle that shares no code with what is tested, a tolerance with its
+reason, and the level up to which it must hold. The study's probe, the command and the tests all
+call the same cases.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+from attnwarp.errors import InputError, suggest
+from attnwarp_eval.stability.case import DECADES, Bound, Case, Outcome, Verdict, Way, level_name
+
+__all__ = [
+    "DECADES",
+    "Bound",
+    "Case",
+    "Outcome",
+    "Verdict",
+    "Way",
+    "hard_case",
+    "hard_cases",
+    "level_name",
+]
+
+
+@cache
+def hard_cases() -> dict[str, Case]:
+    """Every case by its name, in the order of their numbers.
+
+    Example:
+        >>> from attnwarp_eval.stability import hard_cases
+        >>> hard_cases()["zero_baseline"].number
+        6
+    """
+    from attnwarp_eval.stability.cases import EVERY
+
+    table = {item.name: item for item in sorted(EVERY, key=lambda item: item.number)}
+    if len(table) != len(EVERY):
+        raise ValueError("two hard cases have the same name")
+    return table
+
+
+def hard_case(name: str) -> Case:
+    """The case of a name.
+
+    Raises:
+        InputError: there is none.
+
+    Example:
+        >>> from attnwarp_eval.stability import Way, hard_case
+        >>> hard = hard_case("focal_length")
+        >>> hard.outcome(1e5, Way("cpu", "float64")).verdict
+        'holds'
+    """
+    table = hard_cases()
+    if name not in table:
+        hint = suggest(name, list(table)) or "; `attnwarp-eval stability --list` names them all"
+        raise InputError(f"case: no hard case {name!r}{hint}")
+    return table[name]

@@ -1,0 +1,236 @@
+"""What a hard case is, and its outcome at one level of hardness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+Direction = Literal["forward", "backward"]
+Verdict = Literal["holds", "breaks", "refused"]
+
+DECADES = 3.0
+"""Margins are cut here: a factor of 1000 on either side of a tolerance tells enough, and rounding
+errors far below a tolerance differ between processors."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """One implementation of what a case asks for.
+
+    Attributes:
+        backend: ``reference``, ``cpu`` or ``cuda`` for what the library computes with several;
+            else the module that answers, such as ``raycast`` or ``metrics``.
+        precision: type of the input: ``float64``, ``float32``, ``float16`` or ``bfloat16``.
+        direction: the values, or their gradient.
+
+    Example:
+        >>> Way("cpu", "float32").name
+        'cpu float32 forward'
+    """
+
+    backend: str
+    precision: str = "float64"
+    direction: Direction = "forward"
+
+    @property
+    def name(self) -> str:
+        """Backend, precision and direction."""
+        return f"{self.backend} {self.precision} {self.direction}"
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision as torch's type."""
+        import torch
+
+        dtype: torch.dtype = getattr(torch, self.precision)
+        return dtype
+
+    @property
+    def numpy(self) -> np.dtype[Any]:
+        """The precision as numpy's type."""
+        return np.dtype(self.precision)
+
+
+def ways(*backends: str, precisions: tuple[str, ...] = ("float64", "float32")) -> tuple[Way, ...]:
+    """Every backend in every precision, forward.
+
+    Example:
+        >>> [way.name for way in ways("cpu")]
+        ['cpu float64 forward', 'cpu float32 forward']
+    """
+    return tuple(Way(backend, precision) for backend in backends for precision in precisions)
+
+
+def both_directions(forward: tuple[Way, ...]) -> tuple[Way, ...]:
+    """The same ways with their gradients."""
+    return forward + tuple(Way(way.backend, way.precision, "backward") for way in forward)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """How large an error may be.
+
+    Attributes:
+        unit: of the error.
+        tolerance: in that unit; a function of the level where it depends on it.
+        reason: for the tolerance.
+    """
+
+    unit: str
+    tolerance: float | Callable[[float], float]
+    reason: str
+
+    def at(self, level: float) -> float:
+        """The tolerance at a level."""
+        return self.tolerance(level) if callable(self.tolerance) else self.tolerance
+
+
+def exact(unit: str, reason: str = "a label, a mask or a bit is right or wrong") -> Bound:
+    """A bound on a count of wrong things: none may be wrong, so half of one is the limit."""
+    return Bound(unit, 0.5, reason)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A numerically hard input, swept over its hardness until what is computed breaks.
+
+    Attributes:
+        number: of docs/hard-cases.md; several cases may share one.
+        name: for commands and records.
+        title: one line for people.
+        input: what is built.
+        oracle: what the result is held against; no code under test.
+        hardness: what is swept, with its unit.
+        levels: of hardness, the easiest first.
+        required: the last level whose values must hold; what comes after it is there to break.
+        quick: the levels of a short sweep.
+        bounds: by direction.
+        ways: the implementations.
+        measure: the error of a way at a level, in the bound's unit; raises ValueError where the
+            input is refused.
+        must_refuse: whether a way must refuse a level.
+        required_backward: the last level whose gradients must hold, ``required`` if left out.
+        group: which figure shows it.
+        version: raise it when the errors change meaning.
+    """
+
+    number: int
+    name: str
+    title: str
+    input: str
+    oracle: str
+    hardness: str
+    levels: tuple[float, ...]
+    required: float
+    quick: tuple[float, ...]
+    bounds: Mapping[Direction, Bound]
+    ways: tuple[Way, ...]
+    measure: Callable[[float, Way], float] = field(repr=False)
+    must_refuse: Callable[[float, Way], bool] = field(default=lambda level, way: False, repr=False)
+    required_backward: float | None = None
+    group: str = ""
+    version: int = 1
+
+    def __post_init__(self) -> None:
+        ends = (self.required, self._required("backward"))
+        for level in (*ends, *self.quick):
+            if level not in self.levels:
+                raise ValueError(f"{self.name}: {level:g} is none of its levels")
+        for way in self.ways:
+            if way.direction not in self.bounds:
+                raise ValueError(f"{self.name}: no bound for {way.name}")
+
+    def is_required(self, level: float, direction: Direction = "forward") -> bool:
+        """Whether this level must hold."""
+        return self.levels.index(level) <= self.levels.index(self._required(direction))
+
+    def _required(self, direction: Direction) -> float:
+        if direction == "backward" and self.required_backward is not None:
+            return self.required_backward
+        return self.required
+
+    def outcome(self, level: float, way: Way) -> Outcome:
+        """Evaluate one way at one level.
+
+        Args:
+            level: one of ``levels``.
+            way: one of ``ways``.
+        """
+        error, refusal = math.nan, ""
+        try:
+            with np.errstate(all="ignore"):
+                error = float(self.measure(level, way))
+        except ValueError as problem:  # attnwarp.errors.InputError is one
+            refusal = str(problem)
+        return Outcome(
+            level,
+            self.is_required(level, way.direction),
+            math.inf if math.isnan(error) and not refusal else error,
+            self.bounds[way.direction].at(level),
+            refusal,
+            self.must_refuse(level, way),
+        )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one way gives at one level.
+
+    Attributes:
+        level: of hardness.
+        required: whether it must hold.
+        error: in the bound's unit; infinite where the result is not finite, NaN where refused.
+        tolerance: in the same unit.
+        refusal: the error message where the input was refused, else empty.
+        must_refuse: whether it had to be.
+
+    Example:
+        >>> Outcome(1.0, True, 1e-7, 1e-5, "", False).verdict
+        'holds'
+        >>> Outcome(1.0, True, 1e-4, 1e-5, "", False).margin
+        -1.0
+    """
+
+    level: float
+    required: bool
+    error: float
+    tolerance: float
+    refusal: str
+    must_refuse: bool
+
+    @property
+    def margin(self) -> float:
+        """Decades between the error and its tolerance, cut at :data:`DECADES`; negative where the
+        tolerance is exceeded, NaN where a level that need not hold is refused.
+        """
+        if self.refusal or self.must_refuse:
+            if bool(self.refusal) == self.must_refuse:
+                return DECADES
+            return -DECADES if self.required or self.must_refuse else math.nan
+        if not math.isfinite(self.error):
+            return -DECADES
+        if self.error == 0:
+            return DECADES
+        return min(max(math.log10(self.tolerance / self.error), -DECADES), DECADES)
+
+    @property
+    def verdict(self) -> Verdict:
+        """In one word; what must be refused and is holds."""
+        margin = self.margin
+        return "refused" if math.isnan(margin) else "holds" if margin >= 0 else "breaks"
+
+
+def level_name(level: float) -> str:
+    """A level as records and tables name it.
+
+    >>> level_name(89.9999), level_name(1e6)
+    ('89.9999', '1e+06')
+    """
+    return f"{level:.10g}"

@@ -1,0 +1,303 @@
+"""Hard cases of editing: attention features that are warped, masked and blended."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import Layer, RecordingPlan, constant, inject, record
+from attnwarp.warp import FeatureWarp, Surface, preset, warp_surfaces
+from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways
+from attnwarp_eval.stability.cases.warps import (
+    HALVES,
+    Pair,
+    engine_of,
+    grid_sampled,
+    positions,
+)
+from attnwarp_eval.stability.closed_forms import orbit, plane_depth
+
+EVERY_TYPE = ways("reference", "cpu", precisions=("float64", "float32", *HALVES))
+SIZE = 16
+
+
+def _layer(way: Way, mask: torch.Tensor | None = None) -> FeatureWarp:
+    source, target = orbit(0, size=SIZE, height=1), orbit(25, size=SIZE, height=1)
+    pair = Pair(source, target, plane_depth(target, (1, 0, 0), 0.0))
+    result = positions(pair, Way(way.backend))
+    return FeatureWarp(result, result.defined if mask is None else mask, engine_of(way))
+
+
+def _tokens(way: Way, magnitude: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """(1, H W, 4) source and target tokens between half of a magnitude and the whole."""
+    generator = torch.Generator().manual_seed(2)
+    uniform = torch.rand(2, SIZE * SIZE, 4, generator=generator, dtype=torch.float64)
+    values = ((0.5 + uniform / 2) * magnitude).to(way.dtype)
+    return values[:1], values[1:]
+
+
+def _exact_blend(
+    layer: FeatureWarp, source: torch.Tensor, new: torch.Tensor, weight: float
+) -> torch.Tensor:
+    """a (M warp(source) + (1 - M) new) + (1 - a) new in float64, sampled by torch."""
+    maps = source[0].T.reshape(4, SIZE, SIZE)
+    warped = grid_sampled(layer.correspondence, maps).reshape(4, -1).T
+    blended = weight * warped + (1 - weight) * new[0].double()
+    return torch.where(layer.mask.reshape(-1, 1), blended, new[0].double())
+
+
+def _magnitude(magnitude: float, way: Way) -> float:
+    """Error of blended tokens in steps of their type."""
+    layer, (source, new) = _layer(way), _tokens(way, magnitude)
+    result = layer.blend_tokens(source, new, 0.7)[0].double()
+    expected = _exact_blend(layer, source, new, 0.7)
+    step = torch.finfo(way.dtype).eps * expected.abs()
+    return float(((result - expected).abs() / step).max())
+
+
+def _weight(weight: float, way: Way) -> float:
+    """Error in steps of the type; at 0 and 1 the bits must be those of the two sides."""
+    layer, (source, new) = _layer(way), _tokens(way)
+    result = layer.blend_tokens(source, new, weight)
+    if weight in (0, 1):
+        side = layer.warp_tokens(source) if weight else new
+        inside = layer.mask.reshape(-1)
+        return 0.0 if torch.equal(result[:, inside], side[:, inside]) else math.inf
+    expected = _exact_blend(layer, source, new, weight)
+    step = torch.finfo(way.dtype).eps * expected.abs()
+    return float(((result[0].double() - expected).abs() / step).max())
+
+
+def _outside(share: float, way: Way) -> float:
+    """Values outside a mask that a blend changes, and values inside that it leaves."""
+    chosen = np.random.default_rng(0).permutation(SIZE * SIZE)[: round(SIZE * SIZE * share)]
+    mask = torch.zeros(SIZE * SIZE, dtype=torch.bool)
+    mask[torch.from_numpy(chosen)] = True
+    layer = _layer(way, mask.reshape(SIZE, SIZE))
+    source, new = _tokens(way)
+    result = layer.blend_tokens(source + 2, new, 1.0)
+    return float(
+        (result[:, ~mask] != new[:, ~mask]).sum() + (result[:, mask] == new[:, mask]).sum()
+    )
+
+
+class _Unet(torch.nn.Module):
+    """What hooks need of a UNet: an attention module by its name, called with latents and a
+    timestep.
+    """
+
+    def __init__(self, channels: int, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.attn1 = torch.nn.Linear(channels, channels, dtype=dtype)
+        generator = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            values = torch.randn(channels, channels + 1, generator=generator)
+            self.attn1.weight.copy_(values[:, :-1])
+            self.attn1.bias.copy_(values[:, -1])
+
+    def forward(self, sample: torch.Tensor, timestep: float) -> torch.Tensor:
+        tokens: torch.Tensor = self.attn1(sample.flatten(2).transpose(1, 2))
+        return tokens
+
+
+def _views_of_a_batch(views: float, way: Way) -> float:
+    """Values of a view's features that depend on how many views are injected with it."""
+    count, channels = int(views), 4
+    unet = _Unet(channels, way.dtype)
+    layer = Layer("attn1", "self", 0, channels)
+    source, targets = (
+        orbit(0, size=SIZE, height=1),
+        [orbit(8.0 * k, size=SIZE, height=1) for k in range(count)],
+    )
+    warps = [
+        warp_surfaces(
+            source,
+            target,
+            Surface(torch.from_numpy(plane_depth(target, (1, 0, 0), 0.0))),
+            None,
+            preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
+            backend=engine_of(way),
+        )
+        for target in targets
+    ]
+    generator = torch.Generator().manual_seed(1)
+    latents = torch.randn(
+        count + 1, channels, SIZE, SIZE, generator=generator, dtype=torch.float64
+    ).to(way.dtype)
+    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), ("text",), 1, dtype=way.dtype)
+    with torch.no_grad():
+        with record(unet, plan) as recording:
+            unet(latents[-1:], 0.0)
+        with inject(unet, recording, branches=("text",), warps=warps, weight=constant(0.6)):
+            together = unet(latents[:count], 0.0)
+        alone = []
+        for k, warp in enumerate(warps):
+            with inject(unet, recording, branches=("text",), warps=[warp], weight=constant(0.6)):
+                alone.append(unet(latents[k : k + 1], 0.0))
+    # The layer itself multiplies matrices, whose rounding may depend on the size of a batch.
+    tolerance = 4 * torch.finfo(way.dtype).eps * float(together.abs().max())
+    return float(((together - torch.cat(alone)).abs() > tolerance).sum())
+
+
+def _apart(yaw: float, way: Way) -> float:
+    """Tokens accepted though the source camera, which only turned, does not show them; and bits
+    outside the mask that a blend changes.
+    """
+    K = orbit(0, size=SIZE).K
+    target = Camera(K, np.eye(4), SIZE, SIZE)
+    angle = math.radians(yaw)
+    pose = np.eye(4)
+    pose[0, 0] = pose[2, 2] = math.cos(angle)
+    pose[0, 2], pose[2, 0] = -math.sin(angle), math.sin(angle)
+    source = Camera(K, pose, SIZE, SIZE)
+    depth = np.full((SIZE, SIZE), 4.0)
+    view = warp_surfaces(
+        source,
+        target,
+        Surface(torch.from_numpy(depth)),
+        None,
+        preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
+        backend=engine_of(way),
+    )
+    # A turn moves a direction's azimuth by the yaw, whatever its depth.
+    x, y, _ = np.moveaxis(target.directions(), -1, 0)
+    azimuth = np.arctan2(x, 1) - angle
+    u = np.tan(azimuth)
+    v = y * np.cos(np.arctan2(x, 1)) / np.cos(azimuth)
+    px, py = u * K[0, 0] + K[0, 2], v * K[1, 1] + K[1, 2]
+    ahead = np.abs(azimuth) < math.pi / 2
+    shown = ahead & (px >= 0) & (px <= SIZE) & (py >= 0) & (py <= SIZE)
+    layer = view.at((SIZE, SIZE))
+    source_tokens, new = _tokens(way)
+    blended = layer.blend_tokens(source_tokens + 2, new, 1.0)
+    untouched = torch.from_numpy(~shown).reshape(-1)
+    wrong = int((layer.mask.numpy() != shown).sum())
+    return float(wrong + (blended[:, untouched] != new[:, untouched]).sum())
+
+
+def _latents(size: float, way: Way) -> float:
+    """Distance in px of the layer's positions from where they must be, and finite tokens."""
+    n = int(size)
+    K = np.array([[80.0, 0, 32], [0, 80.0, 32], [0, 0, 1]])
+    near = np.eye(4)
+    near[2, 3] = -1.0
+    source, target = Camera(K, near, 64, 64), Camera(K, np.eye(4), 64, 64)
+    view = warp_surfaces(
+        source,
+        target,
+        Surface(torch.from_numpy(np.full((64, 64), 2.0))),
+        None,
+        preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
+        backend=engine_of(way),
+    )
+    layer = view.at((n, n))
+    # A step along the axis by half of the depth doubles the offsets from the middle.
+    expected = 2 * (target.resize(n, n).pixel_centers() - n / 2) + n / 2
+    tokens = torch.ones(1, n * n, 3, dtype=way.dtype)
+    warped = layer.warp_tokens(tokens)
+    if not torch.equal(warped, tokens):
+        return math.inf
+    return float(np.abs(layer.correspondence.xy.numpy() - expected).max())
+
+
+ROUNDED = Bound("steps of the type", 0.51, "half precision is summed in float32, rounded once")
+
+CASES = [
+    Case(
+        41,
+        "half_attention",
+        "Attention features in half precision",
+        input="tokens of a 16 x 16 layer, blended at a = 0.7",
+        oracle="torch's grid_sample and the blend's formula in float64",
+        hardness="magnitude of the features",
+        levels=(1e-3, 1, 1e2, 1e4, 6e4, 1e30),
+        required=6e4,
+        quick=(1, 6e4),
+        bounds={"forward": ROUNDED},
+        ways=ways("reference", "cpu", precisions=HALVES),
+        measure=_magnitude,
+        group="editing",
+    ),
+    Case(
+        42,
+        "blend_weight",
+        "Blends of weight 0 and 1",
+        input="tokens of a 16 x 16 layer",
+        oracle="the formula in float64; at 0 and 1 the bits of the two sides",
+        hardness="a",
+        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
+        required=0,
+        quick=(0.5, 1, 0),
+        bounds={
+            "forward": Bound(
+                "steps of the type", 4, "four taps and two products, each rounded in float32"
+            )
+        },
+        ways=tuple(way for way in EVERY_TYPE if way.precision != "float64"),
+        measure=_weight,
+        group="editing",
+    ),
+    Case(
+        43,
+        "empty_mask_of_tokens",
+        "Masks of a few tokens, and of none",
+        input="tokens of a 16 x 16 layer, blended at a = 1",
+        oracle="the target's own bits outside the mask",
+        hardness="share of tokens in the mask",
+        levels=(1, 0.5, 0.1, 0.01, 0.004, 0),
+        required=0,
+        quick=(0.5, 0),
+        bounds={"forward": exact("changed values")},
+        ways=EVERY_TYPE,
+        measure=_outside,
+        group="editing",
+    ),
+    Case(
+        44,
+        "one_view",
+        "Views edited together, and one alone",
+        input="recorded features injected into batches of views",
+        oracle="each view injected alone, up to four steps of the type",
+        hardness="views in a batch",
+        levels=(4, 3, 2, 1),
+        required=1,
+        quick=(2, 1),
+        bounds={"forward": exact("changed values")},
+        ways=ways("reference", "cpu"),
+        measure=_views_of_a_batch,
+        group="editing",
+    ),
+    Case(
+        45,
+        "views_apart",
+        "Views that share little, and nothing",
+        input="a camera with a field of view of 45 degrees that turns away",
+        oracle="azimuths of the rays, in closed form; the target's own bits elsewhere",
+        hardness="turn, degrees",
+        levels=(0, 20, 40, 44, 46, 90, 135, 180),
+        required=180,
+        quick=(20, 46, 180),
+        bounds={"forward": exact("wrong tokens")},
+        ways=EVERY_TYPE,
+        measure=_apart,
+        group="editing",
+    ),
+    Case(
+        46,
+        "one_latent",
+        "Latents of a few pixels, and of one",
+        input="a step along the axis by half of the depth, at 64 px",
+        oracle="offsets from the middle double; constant tokens stay",
+        hardness="side of the latents, px",
+        levels=(64, 16, 8, 4, 2, 1),
+        required=1,
+        quick=(8, 1),
+        bounds={"forward": Bound("px of the layer", 1e-4, "numerics of the warp")},
+        ways=EVERY_TYPE,
+        measure=_latents,
+        group="editing",
+    ),
+]

@@ -1,0 +1,473 @@
+"""Hard cases of rendering: splats edge-on, tiny, huge, opaque, invisible, in great numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mpmath
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.gaussians import Gaussians
+from attnwarp.render import constants
+from attnwarp_eval.stability.case import Bound, Case, Way, exact
+from attnwarp_eval.stability.rendered import (
+    ALPHA,
+    RENDERERS,
+    Shot,
+    against_exact,
+    front_camera,
+    render_bounds,
+    splats,
+)
+
+CROSS = [(16, 16), (16, 17), (15, 16), (17, 18), (19, 16), (16, 13)]
+"""Pixels around the middle of a picture of 33 x 33."""
+
+MP = "the renderer's formulas in mpmath with 50 digits, gradients by central differences"
+
+
+def _edge_on(tilt: float) -> Shot:
+    angle = math.radians(tilt)
+    splat = splats([[0, 0, 4]], 0.1, 0.9, normals=[[math.sin(angle), 0, -math.cos(angle)]])
+    pixels = [(10, 10), (10, 11), (9, 10), (12, 9), (10, 9), (13, 10)]
+    return Shot(splat, front_camera(21, 100.0), pixels)
+
+
+def _far_world(offset: float) -> Shot:
+    shift = [offset, -offset, offset / 2]
+    base = splats([[0, 0, 0], [0.2, 0.1, -1]], 0.3, [0.6, 0.8], normals=[[0.6, 0, -0.8]] * 2)
+    camera = Camera.look_at([1.1, 2.3, 3], [0, 0, 0], width=33, height=33, fov_y=45)
+    moved = dataclasses.replace(base, origin=np.array(shift))
+    return Shot(moved, camera.moved(shift), CROSS, unmoved=Shot(base, camera, CROSS))
+
+
+def _quaternion(length: float) -> Shot:
+    turn = np.array([math.cos(0.4), 0, math.sin(0.4), 0]) * length
+    return Shot(splats([[0, 0, 4]], [0.5, 0.2], 0.8, quats=[turn]), front_camera(), CROSS)
+
+
+def _opacity(kind: str):  # type: ignore[no-untyped-def]
+    def build(opacity: float) -> Shot:
+        made = splats([[0, 0, 3], [0, 0, 4]], 0.3, [opacity, 0.5], kind=kind)
+        return Shot(made, front_camera(), CROSS)
+
+    return build
+
+
+def _needle(thickness: float) -> Shot:
+    scales = torch.tensor([thickness, 0.3, thickness], dtype=torch.float64)
+    turn = [math.cos(0.2), 0.1, 0.05, math.sin(0.2)]
+    return Shot(splats([[0, 0, 4]], scales, 0.8, kind="3d", quats=[turn]), front_camera(), CROSS)
+
+
+def _floor(sigma: float) -> Shot:
+    camera = Camera.look_at([0, 0, 1], [0, 5, 1], width=48, height=40, fov_y=80)
+    floor = Gaussians(
+        "2d",
+        torch.zeros(1, 3, dtype=torch.float64),
+        torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        torch.full((1, 2), sigma, dtype=torch.float64),
+        torch.full((1,), 0.9, dtype=torch.float64),
+        torch.zeros(1, 1, 3, dtype=torch.float64),
+    )
+    return Shot(floor, camera, [(19, 24), (20, 24), (21, 10), (25, 40), (39, 24), (0, 24)])
+
+
+def _faint(opacity: float) -> Shot:
+    made = splats([[0, 0, 4], [0.05, 0, 6]], 0.1, opacity, normals=[[0.6, 0, -0.8]] * 2)
+    return Shot(made, front_camera(), CROSS)
+
+
+def _scale(exponent: float) -> Shot:
+    scale = 2.0**exponent
+    base = splats([[0, 0, 4], [0.2, 0.1, 5]], 0.3, [0.6, 0.8], normals=[[0.6, 0, -0.8]] * 2)
+    large = dataclasses.replace(base, means=base.means * scale, scales=base.scales * scale)
+    return Shot(large, front_camera(), CROSS, {"near": 0.01 * scale})
+
+
+def _ratio(ratio: float) -> Shot:
+    # The row of pixel centres lies 0.7 sigma from the disc's long axis, where alpha is steepest.
+    thin = 0.3 / ratio
+    made = splats([[0, -0.7 * thin, 4]], [0.3, thin], 0.8)
+    return Shot(made, front_camera(), [(16, 16), (16, 17), (16, 14)])
+
+
+def _near(near: float) -> Shot:
+    made = _floor(100.0)
+    return dataclasses.replace(made, options={"near": near})
+
+
+def _antialiased(sigma: float) -> Shot:
+    made = splats([[0.01, 0.02, 4]], sigma * 4 / 40, 1.0, kind="3d")
+    return Shot(made, front_camera(), CROSS, {"antialiased": True})
+
+
+def _duplicates(count: float) -> Shot:
+    made = splats([[0.05, 0, 4]] * int(count), 0.3, 0.1, normals=[[0.6, 0, -0.8]] * int(count))
+    return Shot(made, front_camera(), CROSS[:3])
+
+
+def _deep_ray(count: float, way: Way) -> float:
+    """Transmittance of equal splats on one ray, and its gradient, against powers of 1 - a."""
+    n, opacity = int(count), 0.005
+    means = np.zeros((n, 3))
+    means[:, 2] = np.linspace(2, 6, n)
+    made = Shot(splats(means, 1.0, opacity), front_camera(1, 30.0), [(0, 0)])
+    base = made.gaussians.to(dtype=way.dtype)
+    alpha = float(base.opacities[0].double())
+    # The ray ends behind the splat that brings the transmittance to the declared limit.
+    stop = math.ceil(math.log(constants.TRANSMITTANCE_STOP) / math.log1p(-alpha))
+    drawn = min(n, stop)
+    if way.direction == "forward":
+        view = made.render(way, base)
+        exact = -math.expm1(drawn * math.log1p(-alpha))
+        total = float(view.weight.double().sum())
+        return max(abs(float(view.alpha[0, 0]) - exact), abs(total - float(view.alpha[0, 0])) / 2)
+    opacities = base.opacities.clone().requires_grad_()
+    view = made.render(way, dataclasses.replace(base, opacities=opacities))
+    view.alpha.sum().backward()
+    assert opacities.grad is not None
+    expected = np.where(np.arange(n) < drawn, math.exp((drawn - 1) * math.log1p(-alpha)), 0)
+    error = np.linalg.norm(opacities.grad.double().cpu().numpy() - expected)
+    return float(error / np.linalg.norm(expected))
+
+
+def _opaque_stack(opacity: float, way: Way) -> float:
+    """Coverage of 40 splats, against a product that no rule ends."""
+    means = np.zeros((40, 3))
+    means[:, 2] = np.linspace(2, 6, 40)
+    made = Shot(splats(means, 1.0, opacity), front_camera(1, 30.0), [(0, 0)])
+    with mpmath.workdps(50):
+        stored = mpmath.mpf(float(made.gaussians.to(dtype=way.dtype).opacities[0].double()))
+        exact = 1 - (1 - min(stored, mpmath.mpf(constants.ALPHA_MAX))) ** 40
+        return float(abs(exact - mpmath.mpf(float(made.render(way).alpha[0, 0]))))
+
+
+def _permuted(count: float, way: Way) -> float:
+    """Values of the picture that change with the order of splats of equal depth in memory."""
+    n = int(count)
+    rng = np.random.default_rng(n)
+    means = np.c_[rng.uniform(-1, 1, (n, 2)), np.full(n, 4.0)]
+    made = splats(means, rng.uniform(0.1, 0.6, (n, 2)), 0.4, colors=rng.uniform(0, 1, (n, 3)))
+    shot = Shot(made.to(dtype=way.dtype), front_camera(), CROSS)
+    first = shot.render(way)
+    changed = 0
+    for seed in range(3):
+        order = torch.from_numpy(np.random.default_rng(seed).permutation(n))
+        other = shot.render(way, shot.gaussians.select(order))
+        for name in ("color", "alpha", "depth", "median_depth"):
+            a, b = (getattr(view, name).nan_to_num(-1) for view in (first, other))
+            changed += int((a != b).sum())
+    return changed
+
+
+def _coverage(sigma: float, way: Way) -> float:
+    """Mean coverage of a splat over the places of its centre in a pixel, against its integral."""
+    steps, apart, focal, depth = 6, 12, 40.0, 4.0
+    size = steps * apart
+    place = (np.arange(steps) + 0.5) * apart + (np.arange(steps) + 0.5) / steps
+    x, y = np.meshgrid(place, place)
+    pixels = np.stack([x.ravel() - size / 2, y.ravel() - size / 2], -1)
+    means = np.c_[pixels * depth / focal, np.full(len(pixels), depth)]
+    # Flat across the view: a splat as deep as wide is magnified toward the picture's border.
+    made = splats(means, torch.tensor([1, 1, 1e-9]) * sigma * depth / focal, 1.0, kind="3d")
+    shot = Shot(made, front_camera(size, focal), [], {"antialiased": True})
+    mean = float(shot.render(way).alpha.double().sum()) / len(means)
+    integral = 2 * math.pi * sigma**2
+    lost = 2 * math.pi * (sigma**2 + constants.BLUR_3D) * constants.ALPHA_MIN
+    return abs(mean - max(integral - lost, 0.0)) / integral
+
+
+FORWARD = tuple(way for way in RENDERERS if way.direction == "forward")
+
+CASES = [
+    Case(
+        2,
+        "edge_on_splat",
+        "A flat splat seen edge-on",
+        input="a disc of sigma 0.1 at depth 4, turned away from the camera",
+        oracle=MP,
+        hardness="tilt, degrees",
+        levels=(0, 60, 80, 89, 89.9, 89.99, 89.999, 89.9999, 89.99999),
+        required=89.99,
+        required_backward=80,
+        quick=(60, 89, 89.999),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_edge_on, ("alpha",)),
+        group="splats",
+    ),
+    Case(
+        2,
+        "edge_on_depth",
+        "The depth of a flat splat seen edge-on",
+        input="the disc of `edge_on_splat`",
+        oracle=MP,
+        hardness="tilt, degrees",
+        levels=(0, 60, 80, 89, 89.9, 89.99, 89.999, 89.9999, 89.99999),
+        required=89.9,
+        required_backward=80,
+        quick=(60, 89, 89.999),
+        bounds=render_bounds(
+            Bound("relative depth", 1e-5, "the tilted plane's slope multiplies rounding errors")
+        ),
+        ways=RENDERERS,
+        measure=against_exact(_edge_on, ("depth",)),
+        group="splats",
+    ),
+    Case(
+        9,
+        "far_world_splats",
+        "Splats in a world far from its origin",
+        input="two discs whose origin, and the camera's, are moved",
+        oracle=MP + ", where the world was not moved",
+        hardness="offset of the world, scene units",
+        levels=(0, 1e2, 1e4, 1e6, 1e7, 1e8, 1e9, 1e11, 1e13),
+        required=1e9,
+        quick=(1e2, 1e6, 1e9),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_far_world),
+        group="splats",
+    ),
+    Case(
+        16,
+        "short_quaternion",
+        "A quaternion of length almost 0",
+        input="a turned disc whose quaternion is scaled",
+        oracle=MP,
+        hardness="length of the quaternion",
+        levels=(1, 1e-3, 1e-6, 1e-12, 1e-18, 1e-22, 1e-30, 1e-38, 1e-44, 0),
+        required=1e-18,
+        quick=(1, 1e-12, 0),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_quaternion),
+        must_refuse=lambda level, way: level == 0,
+        group="splats",
+    ),
+    *(
+        Case(
+            18,
+            f"opacity_to_0_{kind}",
+            f"A {kind.upper()} splat whose opacity goes to 0",
+            input="a splat before another one of opacity 0.5",
+            oracle=MP,
+            hardness="opacity",
+            levels=(0.5, 0.1, 0.01, 0.004, 1e-3, 1e-6, 1e-12, 0),
+            required=0,
+            quick=(0.5, 0.004, 0),
+            bounds=render_bounds(),
+            ways=RENDERERS,
+            measure=against_exact(_opacity(kind)),
+            group="splats",
+        )
+        for kind in ("2d", "3d")
+    ),
+    *(
+        Case(
+            19,
+            f"opacity_to_1_{kind}",
+            f"A {kind.upper()} splat whose opacity goes to 1",
+            input="a splat before another one of opacity 0.5",
+            oracle=MP,
+            hardness="opacity",
+            levels=(0.9, 0.98, 0.995, 0.9999, 1),
+            required=1,
+            quick=(0.9, 1),
+            bounds=render_bounds(),
+            ways=RENDERERS,
+            measure=against_exact(_opacity(kind)),
+            group="splats",
+        )
+        for kind in ("2d", "3d")
+    ),
+    Case(
+        22,
+        "faint_depth",
+        "Expected depth where alpha is almost 0",
+        input="two faint discs, one behind the other",
+        oracle=MP,
+        hardness="opacity of both",
+        levels=(0.5, 0.1, 0.02, 0.008, 0.005, 0.0045, 0.003),
+        required=0.003,
+        quick=(0.5, 0.005, 0.003),
+        bounds=render_bounds(
+            Bound("relative depth", 1e-5, "a weight clamped from below would read half of it")
+        ),
+        ways=RENDERERS,
+        measure=against_exact(_faint, ("depth",)),
+        group="splats",
+    ),
+    Case(
+        24,
+        "needle",
+        "A needle, whose covariance is almost singular",
+        input="a 3D splat 0.3 long at depth 4",
+        oracle=MP,
+        hardness="thickness, scene units",
+        levels=(0.1, 1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-20, 1e-30),
+        required=1e-12,
+        quick=(0.1, 1e-6, 1e-12),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_needle),
+        group="splats",
+    ),
+    Case(
+        10,
+        "scene_scale_splats",
+        "Splats in a world in other units",
+        input="two discs, their camera and the near plane, scaled by a power of two",
+        oracle=MP,
+        hardness="log2 of the scale",
+        levels=(0, -20, 20, -60, 60, -100, 100),
+        required=20,
+        quick=(-20, 20),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_scale),
+        group="splats",
+    ),
+    Case(
+        20,
+        "deep_ray",
+        "A great number of splats on one ray",
+        input="discs of opacity 0.005, one behind the other",
+        oracle="log1p of the opacity, summed in float64",
+        hardness="number of splats",
+        levels=(10, 100, 1e3, 1e4, 1e5, 3e5),
+        required=1e5,
+        quick=(10, 1e3, 1e4),
+        bounds=render_bounds(
+            Bound("transmittance", 1e-4, "the declared limit at which a ray ends"),
+            Bound("relative", 1e-3, "of a gradient's length"),
+        ),
+        ways=RENDERERS,
+        measure=_deep_ray,
+        group="splats",
+    ),
+    Case(
+        21,
+        "opaque_stack",
+        "Transmittance that underflows",
+        input="40 splats of equal opacity, one behind the other",
+        oracle="their product in mpmath, which no rule ends",
+        hardness="opacity",
+        levels=(0.1, 0.3, 0.5, 0.7, 0.9, 0.98, 1),
+        required=1,
+        quick=(0.1, 0.5, 1),
+        bounds={"forward": Bound("alpha", 1.01e-4, "the declared limit, and rounding of 1 - 1e-4")},
+        ways=FORWARD,
+        measure=_opaque_stack,
+        group="splats",
+    ),
+    Case(
+        23,
+        "equal_depth",
+        "Splats of equal depth in another order in memory",
+        input="discs that face the camera at one depth, three times shuffled",
+        oracle="the picture of the first order",
+        hardness="number of splats",
+        levels=(2, 8, 64, 512, 2048),
+        required=512,
+        quick=(2, 64),
+        bounds={"forward": exact("changed values", "the order has a definition: the content")},
+        ways=tuple(way for way in FORWARD if way.backend != "cuda"),
+        measure=_permuted,
+        group="splats",
+    ),
+    Case(
+        23,
+        "duplicates",
+        "The same splat several times",
+        input="tilted discs of opacity 0.1 in one place",
+        oracle=MP,
+        hardness="number of splats",
+        levels=(1, 2, 4, 8),
+        required=8,
+        quick=(1, 4),
+        bounds={"forward": ALPHA},
+        ways=FORWARD,
+        measure=against_exact(_duplicates),
+        group="splats",
+    ),
+    Case(
+        24,
+        "thin_disc",
+        "A 2D splat of unequal scales",
+        input="a disc of sigma 3 px along a row of pixel centres",
+        oracle=MP,
+        hardness="ratio of its scales",
+        levels=(1, 10, 100, 1e3, 1e4, 1e6, 1e9, 1e12),
+        required=100,
+        quick=(1, 100, 1e6),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_ratio),
+        group="splats",
+    ),
+    Case(
+        25,
+        "below_a_pixel",
+        "An antialiased splat smaller than a pixel",
+        input="a ball at depth 4",
+        oracle=MP,
+        hardness="sigma, px",
+        levels=(1, 0.3, 0.1, 0.05, 0.03, 0.01, 1e-3, 1e-6),
+        required=1e-6,
+        quick=(1, 0.1, 0.01),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_antialiased),
+        group="splats",
+    ),
+    Case(
+        25,
+        "coverage_below_a_pixel",
+        "The coverage of an antialiased splat, wherever it falls in a pixel",
+        input="36 places of a centre in a pixel",
+        oracle="the integral of the splat, less what lies under the cut-off 1/255",
+        hardness="sigma, px",
+        levels=(1, 0.5, 0.2, 0.1, 0.07, 0.05, 0.02, 0.01),
+        required=0.1,
+        quick=(1, 0.5, 0.1),
+        bounds={"forward": Bound("share of the integral", 0.01, "a quadrature of 36 places")},
+        ways=FORWARD,
+        measure=_coverage,
+        group="splats",
+    ),
+    Case(
+        39,
+        "near_plane",
+        "A near plane that cuts a splat, pixel by pixel",
+        input="the floor of `crossing_floor`, sigma 100 m",
+        oracle=MP,
+        hardness="near plane, m",
+        levels=(3, 1, 0.1, 1e-2, 1e-4, 1e-8, 1e-12, 1e-30),
+        required=1e-12,
+        quick=(3, 1e-2, 1e-8),
+        bounds=render_bounds(),
+        ways=RENDERERS,
+        measure=against_exact(_near),
+        group="splats",
+    ),
+    Case(
+        39,
+        "crossing_floor",
+        "A splat that reaches behind the camera",
+        input="a disc on the floor, 1 m under the camera",
+        oracle=MP,
+        hardness="sigma of the disc, m",
+        levels=(1, 10, 100, 1e3, 1e4, 1e6, 1e8),
+        required=1e4,
+        quick=(1, 100, 1e4),
+        bounds=render_bounds(ALPHA),
+        ways=RENDERERS,
+        measure=against_exact(_floor),
+        group="splats",
+    ),
+]

@@ -1,0 +1,418 @@
+"""Hard cases swept over their hardness: where the numerics hold, break, or refuse."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from attnwarp_eval.document import charts
+from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.stability import (
+    DECADES,
+    Case,
+    Outcome,
+    Way,
+    hard_case,
+    hard_cases,
+    level_name,
+)
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.parts import Part, Study
+from attnwarp_eval.study.probes import register
+from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.record import Json, Record, View
+from attnwarp_eval.study.results import Results
+
+
+class Sweep(Part):
+    """Which hard cases a study sweeps."""
+
+    cases: list[str] = Field(default_factory=list, description="by name; all of them if empty")
+    levels: Literal["all", "quick"] = "all"
+    cuda: Annotated[bool, Field(description="also backend cuda, which needs a GPU")] = False
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads."""
+
+    stability: Sweep | None = Field(default=None, exclude_if=lambda value: value is None)
+
+
+@dataclass(frozen=True)
+class Extra:
+    """The error messages of the levels that were refused."""
+
+    refusals: Mapping[str, str]
+
+    def to_json(self) -> Json:
+        """The record's entry ``refusals``."""
+        return {"refusals": dict(self.refusals)}
+
+
+@dataclass(frozen=True)
+class Swept:
+    """One way of one case, as it was measured.
+
+    Attributes:
+        case, way: what was swept.
+        outcomes: the easiest level first.
+    """
+
+    case: Case
+    way: Way
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """Levels that had to hold and do not."""
+        return [o for o in self.outcomes if o.verdict == "breaks" and _must_hold(o)]
+
+    @property
+    def end(self) -> Outcome | None:
+        """The first level that breaks or is refused; None where all hold."""
+        return next((o for o in self.outcomes if o.verdict != "holds"), None)
+
+
+def _must_hold(outcome: Outcome) -> bool:
+    return outcome.required or outcome.must_refuse
+
+
+@register
+class Stability(Probe[Extra]):
+    """Numerically hard inputs against independent oracles."""
+
+    name = "stability"
+    study_part = StudyPart
+    metrics = metrics_of("stability.")
+    needs_scenes = False
+    judges_variants = False
+
+    def check(self, study: Study) -> None:
+        """Cases have names; variants change none of them."""
+        sweep = study.part(StudyPart).stability
+        if study.probes.get(self.name):
+            raise ValueError(
+                "probes.stability: got variants, expected []; a hard case has ways of its own"
+            )
+        if sweep is not None and self.name not in study.probes:
+            raise ValueError("stability: this study has no probe of that name; add it to probes")
+        for name in sweep.cases if sweep else ():
+            try:
+                hard_case(name)
+            except ValueError as error:
+                raise ValueError(f"stability.cases: {error}") from None
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each way of each case."""
+        sweep = study.part(StudyPart).stability or Sweep()
+        for hard in [hard_case(name) for name in sweep.cases] or hard_cases().values():
+            levels = hard.levels if sweep.levels == "all" else hard.quick
+            for way in hard.ways:
+                if way.backend == "cuda" and not sweep.cuda:
+                    continue
+                spec = {
+                    "probe": self.name,
+                    "protocol": self.protocol,
+                    "case": hard.name,
+                    "version": hard.version,
+                    "backend": way.backend,
+                    "precision": way.precision,
+                    "direction": way.direction,
+                    "levels": [level_name(level) for level in levels],
+                }
+                yield Cell(spec, hard.name, way.name, self.name, 0, (way.name,))
+
+    def compute(self, work: Work) -> Extra:
+        """Evaluate one way of one case at each of its levels."""
+        hard, way, levels = _definition(work.spec)
+        refusals = {}
+        for level in levels:
+            with work.meter.view():
+                outcome = hard.outcome(level, way)
+            name = level_name(level)
+            if outcome.refusal:
+                refusals[name] = outcome.refusal
+            work.views.append(
+                View(
+                    name,
+                    0.0,
+                    {
+                        "stability.margin": outcome.margin,
+                        "stability.error": outcome.error,
+                        "stability.refused": float(bool(outcome.refusal)),
+                    },
+                )
+            )
+        return Extra(refusals)
+
+    def read_extra(self, data: Json) -> Extra:
+        """From the record's entry ``refusals``."""
+        return Extra(data["refusals"])
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """The verdicts, the errors against hardness, and every error."""
+        swept = read_sweeps(results)
+        if not swept:
+            return
+        yield Place.RESULT, _verdicts(swept)
+        yield Place.RESULT, _figures(swept, layout)
+        yield Place.APPENDIX, _every_error(swept)
+
+
+def _definition(spec: Json) -> tuple[Case, Way, list[float]]:
+    hard = hard_case(spec["case"])
+    by_name = {level_name(level): level for level in hard.levels}
+    way = Way(spec["backend"], spec["precision"], spec["direction"])
+    return hard, way, [by_name[name] for name in spec["levels"]]
+
+
+def read_sweeps(results: Results) -> list[Swept]:
+    """The sweeps of a run, as its records hold them, in the order of the cases."""
+    swept = []
+    for _, record in results.finished(Stability.name):
+        hard, way, levels = _definition(record.spec)
+        outcomes = [
+            _outcome(hard, way, level, view, record)
+            for level, view in zip(levels, record.views, strict=True)
+        ]
+        swept.append(Swept(hard, way, tuple(outcomes)))
+    return swept
+
+
+def _outcome(hard: Case, way: Way, level: float, view: View, record: Record[Extra]) -> Outcome:
+    error = view.metrics["stability.error"]
+    refusal = record.extra.refusals.get(view.name, "")
+    return Outcome(
+        level,
+        hard.is_required(level, way.direction),
+        # JSON has no infinity; an error that is not finite and no refusal was one.
+        math.inf if math.isnan(error) and not refusal else error,
+        hard.bounds[way.direction].at(level),
+        refusal,
+        hard.must_refuse(level, way),
+    )
+
+
+def verdict_lines(swept: Sequence[Swept]) -> list[str]:
+    """A line for each level that had to hold and does not."""
+    return [
+        f"{sweep.case.name} / {sweep.way.name}: {_what_failed(sweep, outcome)}"
+        for sweep in swept
+        for outcome in sweep.failures
+    ]
+
+
+def _what_failed(sweep: Swept, outcome: Outcome) -> str:
+    bound = sweep.case.bounds[sweep.way.direction]
+    level = f"{sweep.case.hardness} {level_name(outcome.level)}"
+    if outcome.must_refuse:
+        return f"accepted at {level}, expected an error"
+    if outcome.refusal:
+        return f"refused at {level}: {outcome.refusal}"
+    return (
+        f"error {_error(outcome.error)} at {level}, expected at most"
+        f" {number(outcome.tolerance, 2)} ({bound.unit})"
+    )
+
+
+def _error(error: float) -> str:
+    return "not finite" if math.isinf(error) else "0" if error == 0 else f"{error:.1e}"
+
+
+def _verdicts(swept: Sequence[Swept]) -> Section:
+    failed = verdict_lines(swept)
+    names = {sweep.case.name for sweep in swept}
+    levels = sum(len(sweep.outcomes) for sweep in swept)
+    text = [
+        (
+            f"{len(names)} hard cases by {len(swept)} ways, {levels} evaluations. A case must hold"
+            " up to its required level; harder ones follow until it breaks. Margin: decades"
+            f" between error and tolerance, at most {DECADES:g}; the worst of a case's ways is"
+            " shown. No oracle shares code with what it judges."
+        ),
+        (
+            "Every required level holds."
+            if not failed
+            else "**Required levels that do not hold:** " + "; ".join(failed) + "."
+        ),
+    ]
+    rows = []
+    for name in dict.fromkeys(sweep.case.name for sweep in swept):
+        own = [sweep for sweep in swept if sweep.case.name == name]
+        for direction in ("forward", "backward"):
+            part = [sweep for sweep in own if sweep.way.direction == direction]
+            if part:
+                rows.append(_row(part))
+    columns = [
+        "#",
+        "case",
+        "direction",
+        "swept",
+        "must hold to",
+        "worst margin up to there",
+        "its error",
+        "tolerance",
+        "what ends it",
+    ]
+    return Section("Where hard inputs break the numerics", text, [Table(columns, rows)])
+
+
+def _row(swept: Sequence[Swept]) -> list[str]:
+    hard, direction = swept[0].case, swept[0].way.direction
+    bound = hard.bounds[direction]
+    required = [outcome for sweep in swept for outcome in sweep.outcomes if outcome.required] or [
+        outcome for sweep in swept for outcome in sweep.outcomes[:1]
+    ]
+    worst = min(required, key=lambda outcome: (outcome.margin, -outcome.error))
+    ends: dict[str, list[str]] = {}
+    for sweep in swept:
+        end = sweep.end
+        if end is not None:
+            level = f"{'refused' if end.refusal else 'breaks'} at {level_name(end.level)}"
+            error = "" if end.refusal else f" ({_error(end.error)})"
+            side = f"{sweep.way.backend} {sweep.way.precision}{error}"
+            ends.setdefault(level, []).append(side)
+    last = level_name(max(required, key=lambda outcome: hard.levels.index(outcome.level)).level)
+    return [
+        str(hard.number),
+        f"`{hard.name}`: {hard.title}",
+        direction,
+        hard.hardness,
+        last,
+        number(worst.margin, 2),
+        "refused, as it must be" if worst.must_refuse else _error(worst.error),
+        _tolerance(bound.unit, worst.tolerance),
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "no level swept",
+    ]
+
+
+def _tolerance(unit: str, tolerance: float) -> str:
+    return f"no {unit}" if tolerance == 0.5 else f"{number(tolerance, 2)} {unit}"
+
+
+def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
+    """Errors in units of their tolerance against hardness, a panel a case that ends somewhere."""
+    pictures = []
+    panels = [
+        list(of_case)
+        for _, of_case in groupby(
+            sorted(swept, key=lambda sweep: (sweep.case.number, sweep.case.name)),
+            key=lambda sweep: sweep.case.name,
+        )
+    ]
+    ending = [panel for panel in panels if any(sweep.end for sweep in panel)]
+    for group in dict.fromkeys(panel[0].case.group for panel in ending):
+        members = [panel for panel in ending if panel[0].case.group == group]
+        path = layout.figure(f"stability-{group}.svg")
+        columns = min(3, len(members))
+        rows = -(-len(members) // columns)
+        width = 3.3 * columns
+        with charts.drawing(path, columns, 2.3 * rows, rows=rows, width=width) as axes:
+            for index, axis in enumerate(axes):
+                if index < len(members):
+                    _panel(axis, members[index])
+                else:
+                    axis.set_visible(False)
+        caption = f"Hard cases of {group} that break, or are refused, at some level."
+        pictures.append(Picture(f"figures/{path.name}", caption))
+    text = [
+        (
+            "Decades of error over tolerance, from -3 to 3, against hardness: the first wrong digit"
+            " is where a line crosses 0. What must hold is left of the dotted line (of the dashed"
+            " one for gradients). Solid lines are values, dashed ones gradients; a cross at the top"
+            f" is a refusal. {len(panels) - len(ending)} other cases hold at every level."
+        ),
+    ]
+    return Section("Error against hardness", text, figures=pictures)
+
+
+def _panel(axes: Any, swept: Sequence[Swept]) -> None:
+    hard = swept[0].case
+    levels = [outcome.level for outcome in swept[0].outcomes]
+    sides = list(dict.fromkeys((s.way.backend, s.way.precision) for s in swept))
+    for sweep in swept:
+        side = (sweep.way.backend, sweep.way.precision)
+        index = sides.index(side)
+        forward = sweep.way.direction == "forward"
+        # Lines that lie on each other stand side by side.
+        x = [0.06 * (index - (len(sides) - 1) / 2) + k for k in range(len(levels))]
+        axes.plot(
+            x,
+            [math.nan if o.refusal else -o.margin for o in sweep.outcomes],
+            color=charts.PALETTE[index],
+            linestyle="-" if forward else "--",
+            marker=charts.MARKERS[index],
+            markersize=3 if forward else 2,
+            linewidth=1,
+            label=" ".join(side) if forward else None,
+        )
+        refused = [place for place, o in zip(x, sweep.outcomes, strict=True) if o.refusal]
+        axes.plot(refused, [DECADES] * len(refused), "x", color=charts.PALETTE[index], markersize=5)
+    axes.axhline(0, color="black", linewidth=0.7)
+    for way in {s.way.direction: s.way for s in swept}.values():
+        last = sum(hard.is_required(level, way.direction) for level in levels)
+        style = ":" if way.direction == "forward" else "--"
+        axes.axvline(last - 0.5, color="black", linewidth=0.7, linestyle=style)
+    axes.set_ylim(-DECADES - 0.3, DECADES + 0.3)
+    axes.set_yticks([-DECADES, 0, DECADES])
+    axes.set_xticks(range(len(levels)), [level_name(v) for v in levels], rotation=40, ha="right")
+    axes.tick_params(labelsize=6)
+    axes.set_title(f"{hard.number} {hard.name}: {hard.hardness}", loc="left", fontsize=7)
+    axes.legend(fontsize=5, loc="lower right")
+
+
+def _every_error(swept: Sequence[Swept]) -> Section:
+    """What each case is, and every error."""
+    tables = []
+    for name in dict.fromkeys(sweep.case.name for sweep in swept):
+        own = [sweep for sweep in swept if sweep.case.name == name]
+        tables.append(case_table(own))
+    refusals = [
+        [f"`{sweep.case.name}`", level_name(outcome.level), outcome.refusal]
+        for sweep in {s.case.name: s for s in swept if any(o.refusal for o in s.outcomes)}.values()
+        for outcome in [next(o for o in sweep.outcomes if o.refusal)]
+    ]
+    if refusals:
+        columns = ["case", "level", "message"]
+        tables.append(Table(columns, refusals, "The first refusal of each case."))
+    text = [
+        "One row a level; `!` marks a required level that does not hold, `~` a harder one.",
+    ]
+    return Section("Every hard case", text, tables)
+
+
+def case_table(swept: Sequence[Swept]) -> Table:
+    """The errors of one case, a row a level and a column a way."""
+    hard = swept[0].case
+    levels = [outcome.level for outcome in swept[0].outcomes]
+    rows = []
+    for k, level in enumerate(levels):
+        rows.append([level_name(level), *(_cell(sweep.outcomes[k]) for sweep in swept)])
+    bounds = "; ".join(
+        f"{direction} {_tolerance(bound.unit, bound.at(hard.levels[0]))}: {bound.reason}"
+        for direction, bound in hard.bounds.items()
+    )
+    caption = (
+        f"{hard.number} `{hard.name}`. Input: {hard.input}. Oracle: {hard.oracle}. Tolerance at"
+        f" the first level: {bounds}."
+    )
+    return Table([hard.hardness, *(sweep.way.name for sweep in swept)], rows, caption, folded=True)
+
+
+def _cell(outcome: Outcome) -> str:
+    if outcome.refusal:
+        text = "refused"
+    else:
+        text = "accepted" if outcome.must_refuse else _error(outcome.error)
+    if outcome.verdict == "breaks":
+        return f"{text} {'!' if _must_hold(outcome) else '~'}"
+    return text
