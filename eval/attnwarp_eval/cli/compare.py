@@ -34,7 +34,10 @@ def compare(
         bool, typer.Option("--update", help="Rewrite the baseline's file from the run.")
     ] = False,
 ) -> None:
-    """Did my change make anything worse? Exit code 1 if so, 3 if too little can be compared."""
+    """Did my change make anything worse?
+
+    Exit code 1 if so, 3 if too little can be compared.
+    """
     from attnwarp_eval.canonical_json import write_json
     from attnwarp_eval.compare import compare
     from attnwarp_eval.compare.pictures import pictures_of_run

@@ -19,8 +19,10 @@ WIDTH = 79
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
 ) -> None:
-    """What this machine has, and what each lack costs. Exit code 2 if something needed is
-    broken."""
+    """What this machine has, and what each lack costs.
+
+    Exit code 2 if something needed is broken.
+    """
     from dataclasses import asdict
 
     from attnwarp_eval.canonical_json import canonical_json

@@ -107,7 +107,7 @@ def _drawer(root: Path) -> Callable[[str], Markup]:
     def draw(path: str) -> Markup:
         own = f"f{next(count)}-"
         svg = (root / path).read_text(encoding="utf-8")
-        svg = svg[svg.index("<svg") :]
+        svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.S)
         svg = re.sub(r'\bid="', f'id="{own}', svg)
         return Markup(re.sub(r'((?:xlink:)?href="|url\()#', rf"\1#{own}", svg))
 
@@ -164,7 +164,8 @@ def terminal(table: Table) -> rich.table.Table:
 
 
 def markdown(report: Report) -> str:
-    """The report as Markdown; pictures are links relative to the run's folder.
+    """The report as Markdown; pictures are links relative to the run's folder, and come last, since
+    a CI's summary shows none.
 
     Example:
         >>> from attnwarp_eval.document.model import Section

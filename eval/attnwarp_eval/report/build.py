@@ -47,11 +47,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             of_probes[place].append(section)
     sections = [
         claims(results),
+        *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *ablations(results),
         *of_probes[Place.RESULT],
         *(fronts(results, layout) if timings else []),
-        *(galleries(results) if pictures else []),
         *failures(results),
         *of_probes[Place.APPENDIX],
         measured(results, timings),

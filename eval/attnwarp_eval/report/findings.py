@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
@@ -13,7 +13,8 @@ from attnwarp_eval.report.ablations import contrasts
 from attnwarp_eval.report.claims import Finding as Judged
 from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.statistics.intervals import Interval, verdict
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.parts import Ablation
+from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 
@@ -40,9 +41,12 @@ def findings(results: Results, problems: list[str], *, pictures: bool = True) ->
         problems: of the instrument, one line each.
         pictures: whether each has its picture.
     """
-    first = [_calibration(results, problems)] if results.measured else []
-    claims = [_claim(results, judged) for judged in _clearest(results)]
-    chosen = [*first, *claims, *_effects(results)][:MOST]
+    first = [_calibration(results, problems)] if results.finished("calibration") else []
+    clearest = _clearest(results)
+    claims = [_claim(results, judged) for judged in clearest]
+    effects = _effects(results, [set(judged.sides) for judged in clearest])
+    others = [finding for probe in probes() for finding in probe.findings(results)]
+    chosen = [*first, *claims, *others, *effects][:MOST]
     return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
 
 
@@ -87,34 +91,40 @@ def _claim(results: Results, judged: Judged) -> Finding:
     )
 
 
-def _effects(results: Results) -> Iterator[Finding]:
-    """For each table of variants, the clearest difference from its baseline."""
-    for ablation in results.study.ablations:
-        own = probe(ablation.probe)
-        judged = []
-        for name, metric, difference, p in contrasts(results, ablation):
-            specification = own.metric(metric)
-            if specification.direction not in ("higher", "lower") or not difference.known:
-                continue
-            direction: Literal["higher", "lower"] = (
-                "higher" if specification.direction == "higher" else "lower"
-            )
-            told = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
-            if told in ("better", "worse"):
-                hidden = not _pictures(results, ablation.probe, name)
-                judged.append((hidden, p, name, metric, difference, told))
-        if not judged:
+def _effects(results: Results, claimed: list[set[str]]) -> list[Finding]:
+    """The clearest difference of each table of variants, then the next ones; pairs of variants of
+    which a claim has told are left out.
+    """
+    tables = [_of_table(results, ablation, claimed) for ablation in results.study.ablations]
+    rounds = itertools.zip_longest(*tables)
+    return [finding for row in rounds for finding in row if finding is not None]
+
+
+def _of_table(results: Results, ablation: Ablation, claimed: list[set[str]]) -> list[Finding]:
+    """The clearest difference of each variant from the baseline, those with pictures first."""
+    own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
+    for name, metric, difference, p in contrasts(results, ablation):
+        specification = own.metric(metric)
+        if specification.direction not in ("higher", "lower") or not difference.known:
             continue
-        # A difference that can be shown comes before a clearer one.
-        _, _, name, metric, difference, told = min(judged, key=lambda item: item[:4])
-        yield Finding(
+        direction: Literal["higher", "lower"] = (
+            "higher" if specification.direction == "higher" else "lower"
+        )
+        told = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+        if told not in ("better", "worse") or {name, ablation.baseline} in claimed:
+            continue
+        if name in clearest and clearest[name][1] <= p:
+            continue
+        finding = Finding(
             f"{ablation.title}: `{name}` is {told} than `{ablation.baseline}`"
-            f" ({own.metric(metric).description}).",
+            f" ({specification.description}).",
             _value(results, ablation.probe, metric, difference),
             f"`{metric}`: {name} against {ablation.baseline}",
             "holds" if told == "better" else "fails",
             _pair(results, ablation.probe, ablation.baseline, name, metric),
         )
+        clearest[name] = (finding.picture is None, p, finding)
+    return [finding for *_, finding in sorted(clearest.values(), key=lambda item: item[:2])]
 
 
 def _value(results: Results, name: str, metric: str, difference: Interval) -> str:
