@@ -7,20 +7,37 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 
-.PHONY: demo test test-all bench docs lint checks kernels venv clean
+# Of the gate: the run, and what it says.
+GATE := build/gate
+
+.PHONY: demo test test-all gate baseline bench docs lint checks kernels measured venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
 	@scripts/venv.sh edit,eval
 	$(BIN)/attnwarp-eval run quick --jobs $(JOBS) --out $(RUN)
 
-## lint, types, layers, and the tests that fit in a coffee break (docs/testing.md)
+## lint, types, layers, the gate, and the tests that fit in a coffee break (docs/testing.md)
 test: checks
 	$(PYTEST) -m "not slow"
 
 ## everything, the thorough checks too
 test-all: checks
 	$(PYTEST)
+
+## did a change make the figures of warp, masks and depth worse? (docs/gate.md)
+gate: measured
+	$(BIN)/attnwarp-eval compare reports/baseline/gate.jsonl $(GATE) --markdown $(GATE)/compare.md \
+		--html $(GATE)/compare.html --json $(GATE)/compare.json
+
+## accept the figures as they are: writes reports/baseline/ anew and prints what changed
+baseline: measured
+	$(BIN)/attnwarp-eval compare reports/baseline/gate.jsonl $(GATE) --update
+
+# In an empty folder with an empty cache, so that no figure of former code comes back.
+measured: kernels
+	@rm -rf $(GATE)
+	ATTNWARP_CACHE=$(GATE)/derived $(BIN)/attnwarp-eval run gate --out $(GATE)
 
 ## every benchmark, one after the other
 bench: venv
@@ -38,9 +55,10 @@ lint: venv
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself.
+# Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself, and the gate
+# uses them. Output comes a target at a time, so that the two do not mix.
 checks: venv
-	@$(MAKE) --no-print-directory -j2 lint kernels
+	@$(MAKE) --no-print-directory -j2 --output-sync=target lint gate
 
 kernels: venv
 	@$(BIN)/python -m scripts.compile_kernels

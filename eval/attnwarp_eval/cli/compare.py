@@ -12,6 +12,7 @@ from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, clear_errors, fail
 if TYPE_CHECKING:
     from attnwarp_eval.compare import Snapshot
     from attnwarp_eval.compare.judge import Comparison
+    from attnwarp_eval.compare.pictures import Pictures
 
 
 def compare(
@@ -25,26 +26,41 @@ def compare(
     json: Annotated[
         Path | None, typer.Option(help="Write every verdict here, for a program.")
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(help="Write a page here, with pictures before and after of what changed."),
+    ] = None,
     update: Annotated[
         bool, typer.Option("--update", help="Rewrite the baseline's file from the run.")
     ] = False,
 ) -> None:
-    """Did my change make anything worse? Exit code 1 if so, 3 if too little can be compared."""
+    """Did my change make anything worse?
+
+    Exit code 1 if so, 3 if too little can be compared.
+    """
     from attnwarp_eval.canonical_json import write_json
-    from attnwarp_eval.compare import compare, read_snapshot
+    from attnwarp_eval.compare import compare
+    from attnwarp_eval.compare.pictures import pictures_of_run
+    from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.compare.write import as_json, document
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        measured = read_snapshot(Store(run))
+        results = read_results(Store(run))
+        measured, pictures = snapshot(results), pictures_of_run(results, run)
         if update:
-            _update(baseline, measured)
+            _update(baseline, measured, pictures)
             return
-        result = compare(_baseline(baseline, measured), measured)
+        trusted, former_pictures = _baseline(baseline, measured)
+        result = compare(trusted, measured)
         if markdown is not None:
             write_atomic(markdown, write.markdown(document(result)).encode())
+        if html is not None:
+            text = _page(result, trusted, measured, former_pictures, pictures)
+            write_atomic(html, text.encode())
         if json is not None:
             write_json(json, as_json(result))
         _print(result)
@@ -59,16 +75,36 @@ def compare(
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
 
 
-def _baseline(path: Path, run: Snapshot) -> Snapshot:
+def _page(
+    result: Comparison, trusted: Snapshot, run: Snapshot, before: Pictures, after: Pictures
+) -> str:
+    from attnwarp_eval.compare.pictures import largest_changes
+    from attnwarp_eval.compare.write import page
+
+    changes = largest_changes(trusted, run, before, after)
+    lacking = [name for name, files in (("baseline", before), ("run", after)) if not files]
+    if lacking:
+        why_none = f"The {' and the '.join(lacking)} has no pictures; its study names none."
+    else:
+        why_none = "No pictured view changed by more than the tolerance of a figure."
+    return page(result, changes, why_none)
+
+
+def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
+    """The baseline and its pictures."""
     from attnwarp.errors import InputError
-    from attnwarp_eval.compare import read_baseline, read_snapshot
+    from attnwarp_eval.compare import read_baseline
+    from attnwarp_eval.compare.pictures import pictures_of_baseline, pictures_of_run
+    from attnwarp_eval.compare.snapshot import snapshot
+    from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
     if path.is_dir():
-        snapshot = read_snapshot(Store(path))
-        if snapshot.missing:
+        results = read_results(Store(path))
+        trusted, pictures = snapshot(results), pictures_of_run(results, path)
+        if trusted.missing:
             raise InputError(
-                f"{path}: {len(snapshot.missing)} cells are missing, so it is no baseline; run its"
+                f"{path}: {len(trusted.missing)} cells are missing, so it is no baseline; run its"
                 " study again to measure them"
             )
     elif not path.exists():
@@ -76,19 +112,21 @@ def _baseline(path: Path, run: Snapshot) -> Snapshot:
             f"{path}: no such baseline; write it from a run that you trust with --update"
         )
     else:
-        snapshot = read_baseline(path)
-    if snapshot.study != run.study:
+        trusted = read_baseline(path)
+        pictures = pictures_of_baseline(path, trusted)
+    if trusted.study != run.study:
         raise InputError(
-            f"{path}: a baseline of study {snapshot.study!r}, expected {run.study!r} as the run's;"
+            f"{path}: a baseline of study {trusted.study!r}, expected {run.study!r} as the run's;"
             " name another baseline or run"
         )
-    return snapshot
+    return trusted, pictures
 
 
-def _update(path: Path, run: Snapshot) -> None:
+def _update(path: Path, run: Snapshot, pictures: Pictures) -> None:
     """Write the baseline, and say what changed."""
     from attnwarp.errors import InputError
     from attnwarp_eval.compare import compare, read_baseline, write_baseline
+    from attnwarp_eval.compare.pictures import write_pictures
 
     if path.is_dir():
         raise InputError(f"{path}: a folder, expected a baseline's file to write")
@@ -106,6 +144,7 @@ def _update(path: Path, run: Snapshot) -> None:
         )
     before = path.read_bytes().splitlines()[1:] if former else []
     write_baseline(path, run)
+    write_pictures(path, pictures)
     now = path.read_bytes().splitlines()[1:]
     if former is not None:
         _print(compare(former, run))

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from attnwarp_eval.cli import cache, compare, inspect, metrics, run, scenes, stability
+from attnwarp_eval.cli import cache, compare, doctor, inspect, metrics, run, scenes, stability
 from attnwarp_eval.cli.shell import (
     CLOSED_PIPE,
     CRASH,
@@ -29,7 +29,6 @@ app = typer.Typer(
         " measured; 130 interrupted by Ctrl-C or kill, 141 output pipe closed."
     ),
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for command in (
@@ -42,6 +41,7 @@ for command in (
     metrics.metrics,
     metrics.encoders,
     inspect.inspect,
+    doctor.doctor,
 ):
     app.command()(command)
 app.add_typer(scenes.app, name="scenes")

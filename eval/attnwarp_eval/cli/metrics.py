@@ -65,8 +65,9 @@ def metrics(
         bool, typer.Option("--json", help="Print metrics.json instead of a table.")
     ] = False,
 ) -> None:
-    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures; a figure that cannot be
-    computed is named with the reason.
+    """Edit PSNR, CLIP, DINO and perceptual figures of your own pictures.
+
+    A figure that cannot be computed is named with the reason.
     """
     from rich.console import Console
 
@@ -125,8 +126,9 @@ def encoders(
     name: Annotated[str | None, typer.Argument(help="Load this one and say what it is.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON.")] = False,
 ) -> None:
-    """The encoders that metrics can use: what ships with the package, and what is read from a
-    folder of yours.
+    """The encoders that metrics can use.
+
+    Some ship with the package, others are read from a folder of yours.
     """
     import json
 

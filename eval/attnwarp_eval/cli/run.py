@@ -39,8 +39,10 @@ def run(
         bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")
     ] = True,
 ) -> None:
-    """Run a study and write its report. Killed half-way and started again, it goes on where it
-    was."""
+    """Run a study and write its report.
+
+    Killed half-way and started again, it goes on where it was.
+    """
     from attnwarp_eval.study.study import load_study
 
     run_study(lambda: load_study(study, scenes=names(scenes), size=size), out, jobs, keep_going)
@@ -150,8 +152,9 @@ def report(
 
 
 def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:
-    """Recompute the hashes of a run's cells and pictures and compare with the list of expected
-    cells.
+    """Check that a run is whole and undamaged.
+
+    The hashes of its cells and pictures are computed again, and the expected cells listed again.
     """
     from attnwarp_eval.study.run import verify
     from attnwarp_eval.study.store import Store

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from attnwarp_eval.compare.snapshot import Measured, Snapshot
-from attnwarp_eval.metrics.gates import Margin, margin
+from attnwarp_eval.metrics.gates import Margin, margin, same_count
 from attnwarp_eval.metrics.registry import METRICS, Metric
 from attnwarp_eval.statistics.intervals import (
     ByView,
@@ -177,11 +177,14 @@ def _missing_cells(
 
 
 def _counters(name: str, first: Mapping[str, int], second: Mapping[str, int]) -> list[Fault]:
-    return [
-        Fault("counter", f"{name} / {counter}", f"{before} in the baseline, {now} in the run")
-        for counter in sorted(first.keys() | second.keys())
-        if (before := first.get(counter, "none")) != (now := second.get(counter, "none"))
-    ]
+    faults = []
+    for counter in sorted(first.keys() | second.keys()):
+        before, now = first.get(counter), second.get(counter)
+        if before is None or now is None or not same_count(counter, before, now):
+            counts = ["none" if count is None else str(count) for count in (before, now)]
+            detail = f"{counts[0]} in the baseline, {counts[1]} in the run"
+            faults.append(Fault("counter", f"{name} / {counter}", detail))
+    return faults
 
 
 def _missing_figures(

@@ -137,10 +137,19 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
         cell.probe,
         cell.variants,
         cell.seed,
-        digest(without_seed(record.spec))[:16],
+        definition(record.spec),
         dict(record.cost.counters),
         figures,
     )
+
+
+def definition(spec: Mapping[str, Any]) -> str:
+    """Hash of all that decides a cell's figures but its seed.
+
+    Args:
+        spec: of the cell.
+    """
+    return digest(without_seed(dict(spec)))[:16]
 
 
 def shortened(value: float) -> float:

@@ -1,19 +1,34 @@
-"""A comparison as a document and as JSON."""
+"""A comparison as a document, as a page with pictures, and as JSON."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.compare.judge import Comparison, Row
-from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.compare.pictures import Change
+from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Slider, Table
 from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.write import page as write_page
 from attnwarp_eval.metrics.registry import METRICS
 
 ORDER = ("worse", "can't tell", "better", "equal")
+
+COLUMNS = [
+    "verdict",
+    "probe",
+    "variant",
+    "metric",
+    "baseline",
+    "run",
+    "difference",
+    "worst view",
+]
 
 LONGEST = 50
 """Rows of a table for a terminal or a summary; the JSON has them all."""
@@ -54,13 +69,68 @@ def document(comparison: Comparison) -> Report:
         key=lambda row: ORDER.index(row.verdict),
     )
     if changed:
-        columns = ["verdict", "probe", "variant", "metric", "baseline", "run", "difference"]
         rows = [_cells(row) for row in changed]
-        sections.append(_section("Figures that changed", [*columns, "worst view"], rows))
+        sections.append(_section("Figures that changed", COLUMNS, rows))
     if comparison.added:
         rows = [[name] for name in comparison.added]
         sections.append(_section("Only in the run (take in with --update)", ["name"], rows))
     return Report(f"Comparison of study {comparison.study}", lead, sections)
+
+
+def page(comparison: Comparison, changes: Sequence[Change], why_none: str = "") -> str:
+    """The comparison as one HTML file, with every figure, and the pictures of what changed most.
+
+    Args:
+        comparison: the verdicts.
+        changes: the pictured views that changed, the largest change first.
+        why_none: why there are no pictures, where ``changes`` is empty.
+
+    Example:
+        >>> text = page(Comparison("quick", True, 3, (), ()), [], "No figure changed.")
+        >>> "No figure changed." in text
+        True
+    """
+    report = document(comparison)
+    pictures = Section("Pictures of what changed most", [why_none] if not changes else [HOW])
+    if changes:
+        pictures.gallery = Gallery([(_sentence(change), _sliders(change)) for change in changes])
+    rows = [_cells(row) for row in comparison.rows]
+    every = Table(COLUMNS, rows, f"All {len(rows)} figures", folded=True)
+    return write_page(
+        Report(
+            report.title,
+            report.lead,
+            [pictures, *report.sections, Section("Every figure", [], [every])],
+        ),
+        Path(),
+    )
+
+
+HOW = (
+    "The views whose figures moved by the most margins, the largest first. Left of the handle is"
+    " the baseline, right of it the run."
+)
+
+
+def _sentence(change: Change) -> str:
+    if math.isfinite(change.margins):
+        size = f"{number(change.margins)} margins"
+    else:
+        size = "defined on one side only"
+    return (
+        f"**{change.scene}, {change.view}** {change.probe} of {change.variant}: `{change.metric}`"
+        f" {number(change.before, 4)} -> {number(change.now, 4)} ({size})"
+    )
+
+
+def _sliders(change: Change) -> list[Slider]:
+    return [
+        Slider(
+            Picture(str(before), f"{content.replace('-', ' ')}, baseline"),
+            Picture(str(after), "run"),
+        )
+        for content, (before, after) in change.pictures.items()
+    ]
 
 
 def as_json(comparison: Comparison) -> dict[str, Any]:
@@ -86,7 +156,8 @@ def _method(comparison: Comparison) -> str:
     if comparison.exact:
         return (
             "Same seeds on both sides: a view that got worse by more than its metric's margin is a"
-            " regression, smaller changes are tested over the scenes. Counters must be the same;"
+            " regression, smaller changes are tested over the scenes. Counters must be the same,"
+            " those behind rounded numbers within 0.1 %;"
             ' seconds are not compared. "can\'t tell" is not "equal".'
         )
     return (

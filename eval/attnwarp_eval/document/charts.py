@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Interval, front
 
@@ -74,7 +76,36 @@ def drawing(
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
         plt.close(figure)
-        write_atomic(path, buffer.getvalue())
+        write_atomic(path, _titled(buffer.getvalue().decode()).encode())
+
+
+HOVER = "hover: "
+"""Begins the id of an element that has a text of its own, which follows."""
+
+
+def hover(axes: Axes, x: float, y: float, text: str) -> None:
+    """Give a point of a figure a text that a browser shows where the pointer rests on it.
+
+    Args:
+        axes: of the figure.
+        x, y: of the point, in the axes' units.
+        text: on one line or several.
+
+    Example:
+        >>> from pathlib import Path
+        >>> with drawing(Path("figure.svg")) as (axes,):
+        ...     hover(axes, 0.5, 0.5, "half & half")
+        >>> "<title>half &amp; half</title>" in Path("figure.svg").read_text()
+        True
+    """
+    # Not fully transparent: matplotlib draws nothing then, and there is nothing to rest on.
+    spot = axes.scatter([x], [y], s=110, color="#888888", alpha=0.004, linewidths=0, zorder=9)
+    spot.set_gid(HOVER + text)
+
+
+def _titled(svg: str) -> str:
+    """The SVG with the texts of :func:`hover` as titles."""
+    return re.sub(rf'<g id="{HOVER}([^"]*)">', r'<g class="hover"><title>\1</title>', svg)
 
 
 @dataclass
@@ -138,6 +169,9 @@ def lines(
             capsize=2,
             label=line.name,
         )
+        for place, value in zip(line.x, line.y, strict=True):
+            if np.isfinite(value.mean):
+                hover(axes, place + shift, value.mean, f"{line.name}, {place:g}: {spread(value)}")
     axes.set(xlabel=x, ylabel=y)
     axes.set_title(title, loc="left", fontsize=9.5)
     if log:
@@ -271,6 +305,8 @@ def cost_front(
                 color=colour,
             )
         )
+        text = f"{name}: {spread(quality)} in {number(1000 * seconds.mean)} ms"
+        hover(axes, seconds.mean, quality.mean, text)
     if on_front:
         axes.step(
             [cost[i] for i in on_front],

@@ -3,7 +3,9 @@ pictures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 
 @dataclass
@@ -11,7 +13,8 @@ class Table:
     """A table of ready-made text cells.
 
     Columns named in ``timed`` hold seconds or memory. A ``folded`` table is closed on a page until
-    a reader opens it.
+    a reader opens it. In a ``glossary`` the first column names what the others explain, and the
+    same names elsewhere on the page link to it.
 
     Example:
         >>> table = Table(["variant", "seconds"], [["paper", "0.1"]], timed=("seconds",))
@@ -24,12 +27,14 @@ class Table:
     caption: str = ""
     timed: tuple[str, ...] = ()
     folded: bool = False
+    glossary: bool = False
 
     def without_timings(self) -> Table:
         """The same table without its columns of seconds and memory."""
         keep = [i for i, name in enumerate(self.columns) if name not in self.timed]
         rows = [[row[i] for i in keep] for row in self.rows]
-        return Table([self.columns[i] for i in keep], rows, self.caption, folded=self.folded)
+        columns = [self.columns[i] for i in keep]
+        return replace(self, columns=columns, rows=rows, timed=())
 
 
 @dataclass
@@ -46,8 +51,30 @@ class Picture:
 
 
 @dataclass
+class Slider:
+    """Two pictures of one size laid over each other, with a handle that uncovers the second.
+
+    Example:
+        >>> slider = Slider(Picture("a.png", "mask, baseline"), Picture("b.png", "mask, run"))
+        >>> slider.caption
+        'mask, baseline | mask, run'
+    """
+
+    before: Picture
+    after: Picture
+
+    @property
+    def caption(self) -> str:
+        """What lies on the left and on the right of the handle."""
+        return f"{self.before.caption} | {self.after.caption}"
+
+
+@dataclass
 class Gallery:
-    """Pictures in rows: a line of text, then pictures side by side.
+    """Pictures in rows: a line of text, then pictures or sliders side by side.
+
+    With ``picker``, a row in bold heads the rows of one view, and on a page a reader picks two
+    pictures of a view and lays them over each other.
 
     Example:
         >>> gallery = Gallery([("yaw 30", [Picture("a.png", "truth"), Picture("b.png", "warp")])])
@@ -55,7 +82,8 @@ class Gallery:
         [2]
     """
 
-    rows: list[tuple[str, list[Picture]]]
+    rows: Sequence[tuple[str, Sequence[Picture | Slider]]]
+    picker: bool = False
 
 
 @dataclass
@@ -76,8 +104,31 @@ class Section:
 
 
 @dataclass
+class Finding:
+    """What a reader of a page sees first: a sentence, a number with its interval, and a picture.
+
+    Attributes:
+        text: one sentence.
+        value: the number.
+        about: what the number is of.
+        outcome: "holds" or "fails", which colour it.
+        picture: that shows it best.
+
+    Example:
+        >>> Finding("The mask helps.", "+0.10 ± 0.02 share", "precision", "holds").picture is None
+        True
+    """
+
+    text: str
+    value: str
+    about: str
+    outcome: Literal["holds", "fails"]
+    picture: Picture | Slider | None = None
+
+
+@dataclass
 class Report:
-    """The whole report.
+    """The whole report; its findings stand on a page alone.
 
     Example:
         >>> from attnwarp_eval.document.write import markdown
@@ -88,3 +139,4 @@ class Report:
     title: str
     lead: list[str]
     sections: list[Section]
+    findings: list[Finding] = field(default_factory=list)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import base64
+import functools
 import html
+import io
+import itertools
+import math
 import mimetypes
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from attnwarp_eval.document.model import Report, Table
+from attnwarp_eval.document.model import Gallery, Report, Slider, Table
 
 if TYPE_CHECKING:
     import rich.table
@@ -50,12 +55,82 @@ def _css(cell: str) -> Markup:
     return Markup(' class="wide"') if len(cell) > 40 else Markup("")
 
 
-def _embedder(root: Path):  # type: ignore[no-untyped-def]
+LARGEST = 5_400_000
+"""Bytes of a page's pictures; with a third more as base64 and the rest, a page has at most 8 MB."""
+
+
+def _pictures(report: Report) -> set[str]:
+    """The files of all pictures of a report."""
+    entries = [finding.picture for finding in report.findings if finding.picture is not None]
+    for section in report.sections:
+        entries += [entry for _, row in (section.gallery or Gallery([])).rows for entry in row]
+    return {
+        picture.path
+        for entry in entries
+        for picture in ([entry.before, entry.after] if isinstance(entry, Slider) else [entry])
+    }
+
+
+def _embedder(report: Report, root: Path) -> Callable[[str], str]:
+    """What writes a file into the page; pictures are made smaller where all are too large."""
+    pictures = _pictures(report)
+    total = sum((root / path).stat().st_size for path in pictures)
+    scale = min(1.0, 0.9 * math.sqrt(LARGEST / total)) if total > LARGEST else 1.0
+
+    @functools.cache
     def embed(path: str) -> str:
         kind = mimetypes.guess_type(path)[0] or "application/octet-stream"
-        return f"data:{kind};base64,{base64.b64encode((root / path).read_bytes()).decode()}"
+        data = (root / path).read_bytes()
+        if path in pictures and scale < 1:
+            kind, data = "image/jpeg", _reduced(data, scale)
+        return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
     return embed
+
+
+def _reduced(data: bytes, scale: float) -> bytes:
+    """A picture's file with its sides scaled, as JPEG."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as picture:
+        size = (max(1, round(scale * picture.width)), max(1, round(scale * picture.height)))
+        smaller = picture.convert("RGB").resize(size, Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    smaller.save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()
+
+
+def _drawer(root: Path) -> Callable[[str], Markup]:
+    """What puts a figure into the page as SVG, with ids that no other figure has."""
+    count = itertools.count(1)
+
+    def draw(path: str) -> Markup:
+        own = f"f{next(count)}-"
+        svg = (root / path).read_text(encoding="utf-8")
+        svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.S)
+        svg = re.sub(r'\bid="', f'id="{own}', svg)
+        return Markup(re.sub(r'((?:xlink:)?href="|url\()#', rf"\1#{own}", svg))
+
+    return draw
+
+
+def _linker(report: Report) -> Callable[[str], Markup]:
+    """What writes a cell of a table; names of metrics link to their meaning."""
+    names = {
+        row[0]
+        for section in report.sections
+        for t in section.tables
+        if t.glossary
+        for row in t.rows
+    }
+
+    def cell(text: str) -> Markup:
+        name = text if text in names else ".".join(text.split(".")[:2])
+        if name in names and " " not in text:
+            return Markup('<a href="#m-{}">{}</a>').format(name, inline(text))
+        return inline(text)
+
+    return cell
 
 
 def plain(text: str) -> str:
@@ -89,7 +164,8 @@ def terminal(table: Table) -> rich.table.Table:
 
 
 def markdown(report: Report) -> str:
-    """The report as Markdown; pictures are links relative to the run's folder.
+    """The report as Markdown; pictures are links relative to the run's folder, and come last, since
+    a CI's summary shows none.
 
     Example:
         >>> from attnwarp_eval.document.model import Section
@@ -127,5 +203,11 @@ def page(report: Report, root: Path) -> str:
         undefined=StrictUndefined,
         autoescape=True,
     )
-    environment.filters.update(inline=inline, css=_css, embed=_embedder(root))
+    environment.filters.update(
+        inline=inline,
+        css=_css,
+        cell=_linker(report),
+        embed=_embedder(report, root),
+        draw=_drawer(root),
+    )
     return environment.get_template("report.html.j2").render(report=report) + "\n"

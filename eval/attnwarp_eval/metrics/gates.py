@@ -65,6 +65,25 @@ mean squared error, which is always defined.
 """
 
 
+COUNTERS: Mapping[str, Margin] = dict.fromkeys(
+    ("visible", "tile_pairs", "pairs", "source_pairs", "composited", "contributing"),
+    Margin(0.0, 1e-3),
+)
+"""Margins of the counters that stand behind a comparison of rounded numbers, such as whether a
+splat reaches a tile: another processor counts a few more or less. All others must be the same.
+"""
+
+
+def same_count(counter: str, before: int, now: int) -> bool:
+    """Whether two counts of a cell are the same work.
+
+    Example:
+        >>> same_count("pairs", 966_432, 966_416), same_count("taps", 300_672, 300_671)
+        (True, False)
+    """
+    return abs(now - before) <= COUNTERS.get(counter, Margin(0.0)).around(before)
+
+
 def gated(key: str) -> bool:
     """Whether a result's key is gated: a metric of :data:`GATES`, over the whole picture or on a
     feature grid. Regions of a picture follow from the whole; keys of known flaws rate a metric, not

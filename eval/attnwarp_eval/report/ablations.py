@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import benjamini_hochberg, paired, verdict
+from attnwarp_eval.statistics.intervals import Interval, benjamini_hochberg, paired, verdict
 from attnwarp_eval.study.parts import Ablation
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Probe, mean_values
@@ -49,11 +49,13 @@ def _section(results: Results, ablation: Ablation) -> Section:
     )
     section.tables += own.details(results, names)
     if len(names) > 1:
-        section.tables.append(_contrasts(results, own, baseline, names[1:]))
+        section.tables.append(_contrasts(results, own, ablation))
     return section
 
 
-def _contrasts(results: Results, own: Probe[Any], baseline: str, names: list[str]) -> Table:
+def contrasts(results: Results, ablation: Ablation) -> list[tuple[str, str, Interval, float]]:
+    """(variant, metric, difference from the baseline, p-value adjusted over the table)."""
+    own, baseline = probe(ablation.probe), ablation.baseline
     metrics = [metric.format(layer=results.layer) for metric in own.contrasts]
     differences = [
         (
@@ -63,12 +65,17 @@ def _contrasts(results: Results, own: Probe[Any], baseline: str, names: list[str
                 results.views(own.name, baseline, metric), results.views(own.name, name, metric)
             ),
         )
-        for name in names
+        for name in ablation.variants
+        if name != baseline
         for metric in metrics
     ]
     adjusted = benjamini_hochberg([difference.p for _, _, difference in differences])
+    return [(*difference, p) for difference, p in zip(differences, adjusted, strict=True)]
+
+
+def _contrasts(results: Results, own: Probe[Any], ablation: Ablation) -> Table:
     rows = []
-    for (name, metric, difference), p in zip(differences, adjusted, strict=True):
+    for name, metric, difference, p in contrasts(results, ablation):
         specification = own.metric(metric)
         judged: str = "–"
         if specification.direction in ("higher", "lower"):
@@ -101,5 +108,5 @@ def _contrasts(results: Results, own: Probe[Any], baseline: str, names: list[str
         "scenes, views",
     ]
     return Table(
-        columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True
+        columns, rows, caption=f"Differences from {ablation.baseline!r}, with verdicts", folded=True
     )

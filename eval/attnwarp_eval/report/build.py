@@ -7,6 +7,7 @@ from pathlib import Path
 from attnwarp_eval.document.model import Report, Section
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.claims import claims
+from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.measured import failures, measured
@@ -52,11 +53,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             of_probes[place].append(section)
     sections = [
         *([claims(results)] if study.scenes else []),
+        *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *ablations(results),
         *of_probes[Place.RESULT],
         *(fronts(results, layout) if timings else []),
-        *(galleries(results) if pictures else []),
         *failures(results),
         *of_probes[Place.APPENDIX],
         measured(results, timings),
@@ -64,7 +65,8 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
     if not timings:
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
-    return Report(study.title or study.name, lead, sections)
+    first = findings(results, problems(results), pictures=pictures)
+    return Report(study.title or study.name, lead, sections, first)
 
 
 def problems(results: Results) -> list[str]:

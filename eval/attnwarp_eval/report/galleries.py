@@ -38,4 +38,4 @@ def galleries(results: Results) -> list[Section]:
             f" blue too near, red too far, full colour at {100 * DEPTH_RANGE:g} %."
         ),
     ]
-    return [Section("Pictures", text, gallery=Gallery(rows))]
+    return [Section("Pictures", text, gallery=Gallery(rows, picker=True))]

@@ -60,7 +60,7 @@ def measured(results: Results, timings: bool) -> Section:
     return Section(
         "How it was measured",
         text,
-        [Table(["metric", "unit", "better", "version", "meaning"], rows)],
+        [Table(["metric", "unit", "better", "version", "meaning"], rows, glossary=True)],
     )
 
 

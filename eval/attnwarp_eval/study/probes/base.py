@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 from attnwarp_eval.cost import Meter
-from attnwarp_eval.document.model import Section, Table
+from attnwarp_eval.document.model import Finding, Section, Table
 from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
@@ -247,6 +247,10 @@ class Probe(ABC, Generic[E]):
     def problems(self, results: Results) -> list[str]:
         """What is wrong with the instrument by this probe's records, one line each."""
         return []
+
+    def findings(self, results: Results) -> Iterator[Finding]:
+        """What a reader should know first, where no table of variants tells it."""
+        return iter(())
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Sections of the report; none where the run has no record of this probe."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.model import Finding, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics import registry
 from attnwarp_eval.metrics.arrays import Array
@@ -245,6 +245,31 @@ class Sensitivity(Probe[Seconds]):
         """From the record's cost."""
         rounds = data["cost"].get("rounds", {})
         return Seconds({key: [float(v) for v in values] for key, values in rounds.items()})
+
+    def findings(self, results: Results) -> Iterator[Finding]:
+        """Of the metrics that need no truth, what one sees best, and what one misses most, of the
+        flaws that each is meant to see.
+        """
+        records = [(cell.scene, record) for cell, record in results.finished(self.name)]
+        seen = [
+            (value, row, flaw)
+            for row in ROWS
+            for flaw in FLAWS
+            if row.meant != _ALL and flaw.name in row.meant
+            if math.isfinite((value := share(records, row.key, flaw.name)).mean)
+        ]
+        if not seen:
+            return
+        about = "right results ranked above those with the flaw; 0.5 is blind"
+        best, worst = (pick(seen, key=lambda item: item[0].mean) for pick in (max, min))
+        for (value, row, flaw), text in ((best, "the most"), (worst, "the least")):
+            yield Finding(
+                f"Of what metrics without a truth are meant to see, {row.title} sees"
+                f" {flaw.title!r} {text} often.",
+                f"{spread(replace(value, undefined=0))} share",
+                about,
+                "holds" if value.mean > 0.5 else "fails",
+            )
 
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """What each metric sees, how it follows the strength of an edit, and what it costs."""

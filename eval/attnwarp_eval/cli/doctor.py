@@ -1,0 +1,68 @@
+"""The command that says what this machine has, and what each lack costs."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from attnwarp_eval.cli.shell import USAGE, clear_errors, fail
+
+if TYPE_CHECKING:
+    from attnwarp_eval.cli.machine import Check
+
+WIDTH = 79
+"""Of a line, for a terminal of 80 columns."""
+
+
+def doctor(
+    json: Annotated[bool, typer.Option("--json", help="Every check as JSON.")] = False,
+) -> None:
+    """What this machine has, and what each lack costs.
+
+    Exit code 2 if something needed is broken.
+    """
+    from dataclasses import asdict
+
+    from attnwarp_eval.canonical_json import canonical_json
+    from attnwarp_eval.cli.machine import checks
+
+    results: list[Check] = []
+    with clear_errors():
+        for check in checks():
+            results.append(check)
+            if not json:
+                typer.echo(lines(check))
+        if json:
+            typer.echo(canonical_json([asdict(check) for check in results]))
+    broken = [check.name for check in results if check.state == "broken"]
+    if broken:
+        raise fail(f"broken: {', '.join(broken)}", USAGE)
+    if not json:
+        lacking = sum(check.state == "lack" for check in results)
+        costs = f"; {lacking} lack{'s' if lacking > 1 else ''}, each at the cost that it names"
+        typer.echo(f"\nEverything needed works{costs if lacking else ''}.")
+
+
+def lines(check: Check) -> str:
+    """A check on lines of a terminal: its state and name, then what there is, the cost, and the
+    remedy.
+    """
+    text = textwrap.wrap(
+        f"{check.name}: {check.text}",
+        WIDTH,
+        initial_indent=f"{check.state:7}",
+        subsequent_indent=" " * 7,
+        break_on_hyphens=False,
+    )
+    for title, part in (("cost", check.cost), ("remedy", check.remedy)):
+        if part:
+            text += textwrap.wrap(
+                f"{title}: {part}",
+                WIDTH,
+                initial_indent=" " * 9,
+                subsequent_indent=" " * 11,
+                break_on_hyphens=False,
+            )
+    return "\n".join(text)

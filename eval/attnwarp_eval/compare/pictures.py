@@ -1,0 +1,169 @@
+"""Pictures of what changed most: those of the baseline beside those of the run."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from attnwarp_eval.compare.snapshot import Figure, Measured, Snapshot, definition
+from attnwarp_eval.files import write_atomic
+from attnwarp_eval.metrics.gates import Margin, margin
+from attnwarp_eval.metrics.registry import METRICS
+from attnwarp_eval.study.results import Results
+
+Pictures = Mapping[tuple[str, int, str], Mapping[str, Path]]
+"""(definition of the cell, seed, view) -> what is shown -> the file."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A view whose figures changed, and its pictures on both sides.
+
+    Attributes:
+        scene, probe, variant, view: of the figures.
+        metric: whose value moved by the most margins.
+        before, now: its values.
+        margins: by how many; infinite where only one side is defined.
+        pictures: what is shown -> the files of the baseline and of the run.
+    """
+
+    scene: str
+    probe: str
+    variant: str
+    view: str
+    metric: str
+    before: float
+    now: float
+    margins: float
+    pictures: Mapping[str, tuple[Path, Path]]
+
+
+def pictures_of_run(results: Results, root: Path) -> Pictures:
+    """The pictures of a run's cells.
+
+    Args:
+        results: of the run.
+        root: its folder.
+    """
+    table: dict[tuple[str, int, str], dict[str, Path]] = {}
+    for cell in results.cells:
+        if (record := cell.record) is None:
+            continue
+        for picture in record.pictures:
+            key = (definition(record.spec), cell.seed, picture.view)
+            table.setdefault(key, {})[picture.content] = root / picture.path
+    return table
+
+
+def folder_of(baseline: Path) -> Path:
+    """Where the pictures of a baseline's file lie: beside it."""
+    return baseline.with_suffix(".pictures")
+
+
+def pictures_of_baseline(baseline: Path, snapshot: Snapshot) -> Pictures:
+    """The pictures beside a baseline's file; none where it was written without them.
+
+    Args:
+        baseline: the file.
+        snapshot: its content.
+    """
+    table = {}
+    for cell in snapshot.cells:
+        for folder in sorted(_folder(baseline, cell.definition, cell.seed).glob("*/")):
+            files = {file.stem: file for file in sorted(folder.glob("*.jpg"))}
+            table[cell.definition, cell.seed, folder.name.replace(SLASH, "/")] = files
+    return table
+
+
+SLASH = "__"
+"""Stands for the slash of a view's name, such as ``edit/yaw030``, in the name of its folder."""
+
+
+def write_pictures(baseline: Path, pictures: Pictures) -> None:
+    """Put a run's pictures beside a baseline's file, instead of former ones.
+
+    Args:
+        baseline: the file.
+        pictures: of the run that it was written from.
+    """
+    if folder_of(baseline).is_dir():
+        shutil.rmtree(folder_of(baseline))
+    for (cell, seed, view), files in pictures.items():
+        for content, file in files.items():
+            name = f"{view.replace('/', SLASH)}/{content}.jpg"
+            write_atomic(_folder(baseline, cell, seed) / name, file.read_bytes())
+
+
+def _folder(baseline: Path, cell: str, seed: int) -> Path:
+    return folder_of(baseline) / f"{cell}-{seed}"
+
+
+def largest_changes(
+    baseline: Snapshot, run: Snapshot, before: Pictures, after: Pictures, most: int = 6
+) -> list[Change]:
+    """The pictured views whose figures changed by the most margins.
+
+    Args:
+        baseline, run: the two sides.
+        before, after: their pictures.
+        most: how many to return.
+
+    Example:
+        >>> from attnwarp_eval.compare import Snapshot
+        >>> largest_changes(Snapshot("my", "", ()), Snapshot("my", "", ()), {}, {})
+        []
+    """
+    changes = [
+        change
+        for first, second, variant in _shared(baseline, run)
+        for change in _of_cell(first, second, variant, before, after)
+    ]
+    return sorted(changes, key=lambda change: -change.margins)[:most]
+
+
+def _shared(baseline: Snapshot, run: Snapshot) -> Iterator[tuple[Measured, Measured, str]]:
+    """The cells of each variant that both sides have, with the first of their seeds."""
+    sides: list[dict[tuple[str, str, str], Measured]] = [{}, {}]
+    for side, snapshot in zip(sides, (baseline, run), strict=True):
+        for cell in snapshot.cells:
+            for variant in cell.variants:
+                side.setdefault((cell.scene, cell.probe, variant), cell)
+    for key in sorted(sides[0].keys() & sides[1].keys()):
+        yield sides[0][key], sides[1][key], key[2]
+
+
+def _of_cell(
+    first: Measured, second: Measured, variant: str, before: Pictures, after: Pictures
+) -> Iterator[Change]:
+    views = {view for figure in first.figures.values() for view in figure.values}
+    for view in sorted(views):
+        files = before.get((first.definition, first.seed, view), {})
+        others = after.get((second.definition, second.seed, view), {})
+        both = {
+            content: (files[content], others[content]) for content in files if content in others
+        }
+        moved = [
+            (margins, key, figure.values[view], second.figures[key].values[view])
+            for key, figure in sorted(first.figures.items())
+            if (margins := _margins(key, figure, second.figures.get(key), view)) > 0
+        ]
+        if both and moved:
+            margins, key, old, new = max(moved, key=lambda item: item[0])
+            yield Change(first.scene, first.probe, variant, view, key, old, new, margins, both)
+
+
+def _margins(key: str, first: Figure, second: Figure | None, view: str) -> float:
+    """By how many margins a view's figure changed; 0 within the registry's tolerance."""
+    if second is None or view not in first.values or view not in second.values:
+        return 0.0
+    old, new = first.values[view], second.values[view]
+    if math.isnan(old) or math.isnan(new):
+        return 0.0 if math.isnan(old) and math.isnan(new) else math.inf
+    if METRICS[key].direction == "zero":
+        old, new = abs(old), abs(new)
+    tolerance = Margin(METRICS[key].atol, METRICS[key].rtol).around(old)
+    change = abs(new - old)
+    return change / margin(key).around(old) if change > tolerance else 0.0

@@ -1,0 +1,116 @@
+"use strict";
+(() => {
+  const all = (selector, root = document) => [...root.querySelectorAll(selector)];
+  document.documentElement.classList.add("js");
+
+  // Sliders: the handle below, or the pointer on the picture itself.
+  for (const slider of all(".slider")) {
+    const [area, range] = [slider.querySelector("div"), slider.querySelector("input")];
+    const cut = (percent) => {
+      range.value = percent;
+      slider.style.setProperty("--cut", `${percent}%`);
+    };
+    range.addEventListener("input", () => cut(range.value));
+    const follow = (event) => {
+      const box = area.getBoundingClientRect();
+      cut(Math.max(0, Math.min(100, (100 * (event.clientX - box.left)) / box.width)));
+    };
+    area.addEventListener("pointerdown", follow);
+    area.addEventListener("pointermove", (event) => {
+      if (event.pointerType === "mouse" || event.buttons) follow(event);
+    });
+    area.addEventListener("dragstart", (event) => event.preventDefault());
+  }
+
+  // Tables: a click on a column's head sorts by it, numbers by value, undefined ones last.
+  const value = (row, column) => {
+    const text = row.cells[column].textContent.trim();
+    const number = parseFloat(text.replace("\u2212", "-"));
+    return [text, text === "\u2013" ? NaN : number];
+  };
+  for (const head of all("thead th")) {
+    head.tabIndex = 0;
+    const sort = () => {
+      const [table, column] = [head.closest("table"), head.cellIndex];
+      const up = head.getAttribute("aria-sort") !== "ascending";
+      const rows = all("tbody tr", table).map((row) => [row, ...value(row, column)]);
+      const numeric = rows.some(([, , number]) => !Number.isNaN(number));
+      rows.sort(([, a, x], [, b, y]) => {
+        if (!numeric) return up ? a.localeCompare(b) : b.localeCompare(a);
+        if (Number.isNaN(x) || Number.isNaN(y)) return Number.isNaN(x) - Number.isNaN(y);
+        return up ? x - y : y - x;
+      });
+      all("th", table).forEach((other) => other.removeAttribute("aria-sort"));
+      head.setAttribute("aria-sort", up ? "ascending" : "descending");
+      table.tBodies[0].append(...rows.map(([row]) => row));
+    };
+    head.addEventListener("click", sort);
+    head.addEventListener("keydown", (event) => event.key === "Enter" && sort());
+  }
+
+  // Pictures: any two of a view over each other.
+  for (const picker of all(".picker")) {
+    const views = new Map();
+    let view = null;
+    for (const title of all(".all > h3", picker.parentNode)) {
+      const bold = title.querySelector("strong");
+      if (bold) views.set(bold.textContent, (view = new Map()));
+      for (const picture of all("img", title.nextElementSibling)) {
+        const label = bold ? picture.alt : `${title.textContent}: ${picture.alt}`;
+        view.set(label, picture);
+      }
+    }
+    const [place, left, right] = all("select", picker);
+    const [before, after] = all("img", picker);
+    const caption = picker.querySelector("figcaption");
+    const fill = (select, names, wanted) => {
+      const former = select.value;
+      select.replaceChildren(...names.map((name) => new Option(name)));
+      select.value = names.includes(former) ? former : (names.find(wanted) ?? names[0]);
+    };
+    const show = () => {
+      const pictures = views.get(place.value);
+      for (const [image, select] of [[before, left], [after, right]]) {
+        image.src = pictures.get(select.value).src;
+        image.alt = select.value;
+      }
+      caption.textContent = `${left.value} | ${right.value}`;
+    };
+    const change = () => {
+      const names = [...views.get(place.value).keys()];
+      fill(left, names, (name) => name.endsWith(": warped"));
+      fill(right, names, (name) => name === "target");
+      show();
+    };
+    fill(place, [...views.keys()], () => true);
+    place.addEventListener("change", change);
+    for (const select of [left, right]) select.addEventListener("change", show);
+    change();
+  }
+
+  // Contents: the section in view.
+  const links = new Map(all("nav a").map((link) => [link.hash.slice(1), link]));
+  const mark = () => {
+    let current = null;
+    for (const id of links.keys()) {
+      if (document.getElementById(id).getBoundingClientRect().top < 120) current = id;
+    }
+    for (const [id, link] of links) link.classList.toggle("here", id === current);
+  };
+  document.addEventListener("scroll", mark, { passive: true });
+  mark();
+
+  // A link into a folded table opens it; paper shows everything.
+  const open = () => document.getElementById(location.hash.slice(1))?.closest("details")?.setAttribute("open", "");
+  window.addEventListener("hashchange", () => {
+    open();
+    document.getElementById(location.hash.slice(1))?.scrollIntoView();
+  });
+  open();
+  let closed = [];
+  window.addEventListener("beforeprint", () => {
+    closed = all("details:not([open])");
+    closed.forEach((part) => (part.open = true));
+  });
+  window.addEventListener("afterprint", () => closed.forEach((part) => (part.open = false)));
+})();

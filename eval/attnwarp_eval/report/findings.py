@@ -1,0 +1,176 @@
+"""What a reader should know first: three to six sentences, each with a number and a picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import Literal
+
+from attnwarp_eval.document.model import Finding, Picture, Slider
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.report.ablations import contrasts
+from attnwarp_eval.report.claims import Finding as Judged
+from attnwarp_eval.report.claims import judge, load_claims
+from attnwarp_eval.statistics.intervals import Interval, verdict
+from attnwarp_eval.study.parts import Ablation
+from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.record import PictureFile
+from attnwarp_eval.study.results import Results
+
+MOST = 6
+
+CLAIMS = 3
+"""Findings that claims give at most; the others come from the tables of variants."""
+
+CONTENTS = {
+    "occlusion.": ("mask",),
+    "warp.feature": ("warped",),
+    "warp.": ("endpoint-error", "warped"),
+    "depth.": ("depth-error", "render"),
+    "fit.": ("render", "depth-error"),
+}
+"""Pictures that show a metric, by the beginning of its name."""
+
+
+def findings(results: Results, problems: list[str], *, pictures: bool = True) -> list[Finding]:
+    """Whether the instrument is calibrated, then claims, then the largest effects of the tables.
+
+    Args:
+        results: of the run.
+        problems: of the instrument, one line each.
+        pictures: whether each has its picture.
+    """
+    first = [_calibration(results, problems)] if results.finished("calibration") else []
+    clearest = _clearest(results)
+    claims = [_claim(results, judged) for judged in clearest]
+    effects = _effects(results, [set(judged.sides) for judged in clearest])
+    others = [finding for probe in probes() for finding in probe.findings(results)]
+    chosen = [*first, *claims, *others, *effects][:MOST]
+    return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
+
+
+def _calibration(results: Results, problems: list[str]) -> Finding:
+    worst = max(
+        (
+            value
+            for cell, record in results.finished("calibration")
+            for view in record.views
+            if math.isfinite(value := view.metrics.get("warp.epe_median", math.nan))
+        ),
+        default=math.nan,
+    )
+    return Finding(
+        "The instrument is not calibrated: " + "; ".join(problems)
+        if problems
+        else "The instrument is calibrated: the truth's own depth, warped, lands where it should.",
+        f"{number(worst, 2)} px",
+        "largest median error of a view, no interval",
+        "fails" if problems else "holds",
+        _warped_and_true(results),
+    )
+
+
+def _clearest(results: Results) -> list[Judged]:
+    """The claims with a clear outcome, those that hold in general or do not before the others."""
+    clear = [j for j in judge(results, load_claims()) if len(j.sides) > 1 and j.here != "mixed"]
+    return sorted(clear, key=lambda j: (j.verdict == "can't tell", j.contrast.p))[:CLAIMS]
+
+
+def _claim(results: Results, judged: Judged) -> Finding:
+    first, second = list(judged.sides)
+    outcome = {"seen": "seen here", "not seen": "not seen here"}[judged.here]
+    if judged.verdict != "can't tell":
+        outcome += f", {judged.verdict} in general"
+    return Finding(
+        f"{judged.claim.text}: {outcome}.",
+        _value(results, judged.claim.probe, judged.metric, judged.contrast),
+        f"`{judged.metric}`: {second} against {first}",
+        "holds" if judged.here == "seen" else "fails",
+        _pair(results, judged.claim.probe, first, second, judged.metric),
+    )
+
+
+def _effects(results: Results, claimed: list[set[str]]) -> list[Finding]:
+    """The clearest difference of each table of variants, then the next ones; pairs of variants of
+    which a claim has told are left out.
+    """
+    tables = [_of_table(results, ablation, claimed) for ablation in results.study.ablations]
+    rounds = itertools.zip_longest(*tables)
+    return [finding for row in rounds for finding in row if finding is not None]
+
+
+def _of_table(results: Results, ablation: Ablation, claimed: list[set[str]]) -> list[Finding]:
+    """The clearest difference of each variant from the baseline, those with pictures first."""
+    own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
+    for name, metric, difference, p in contrasts(results, ablation):
+        specification = own.metric(metric)
+        if specification.direction not in ("higher", "lower") or not difference.known:
+            continue
+        direction: Literal["higher", "lower"] = (
+            "higher" if specification.direction == "higher" else "lower"
+        )
+        told = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+        if told not in ("better", "worse") or {name, ablation.baseline} in claimed:
+            continue
+        if name in clearest and clearest[name][1] <= p:
+            continue
+        finding = Finding(
+            f"{ablation.title}: `{name}` is {told} than `{ablation.baseline}`"
+            f" ({specification.description}).",
+            _value(results, ablation.probe, metric, difference),
+            f"`{metric}`: {name} against {ablation.baseline}",
+            "holds" if told == "better" else "fails",
+            _pair(results, ablation.probe, ablation.baseline, name, metric),
+        )
+        clearest[name] = (finding.picture is None, p, finding)
+    return [finding for *_, finding in sorted(clearest.values(), key=lambda item: item[:2])]
+
+
+def _value(results: Results, name: str, metric: str, difference: Interval) -> str:
+    plain = replace(difference, undefined=0)
+    sign = "+" if difference.mean > 0 else ""
+    unit = probe(name).metric(metric).unit
+    return f"{sign}{spread(plain)} {unit}"
+
+
+def _warped_and_true(results: Results) -> Slider | None:
+    """The source warped by the truth's own depth over the true target."""
+    pictures = _pictures(results, "calibration", "calibration")
+    for (scene, view, seed, content), file in pictures.items():
+        target = pictures.get((scene, view, seed, "target"))
+        if content == "warped" and target is not None:
+            title = f"source warped by true depth, {scene}, {view}"
+            return Slider(Picture(file.path, title), Picture(target.path, "target"))
+    return None
+
+
+def _pair(results: Results, name: str, first: str, second: str, metric: str) -> Slider | None:
+    """The pictures of the view in which two variants differ most."""
+    contents = next((c for start, c in CONTENTS.items() if metric.startswith(start)), ())
+    before, after = (_pictures(results, name, variant) for variant in (first, second))
+    left, right = (results.views(name, variant, metric) for variant in (first, second))
+    for content in contents:
+        differences = {}
+        for scene, view, seed, shown in sorted(before.keys() & after.keys()):
+            values = [side.get(scene, {}).get(f"{view}/{seed}", math.nan) for side in (left, right)]
+            if shown == content and math.isfinite(difference := abs(values[1] - values[0])):
+                differences[scene, view, seed, shown] = difference
+        if differences:
+            key = max(differences, key=lambda k: differences[k])
+            title = f"{content.replace('-', ' ')}, {key[0]}, {key[1]}"
+            return Slider(
+                Picture(before[key].path, f"{title}: {first}"), Picture(after[key].path, second)
+            )
+    return None
+
+
+def _pictures(
+    results: Results, name: str, variant: str
+) -> dict[tuple[str, str, int, str], PictureFile]:
+    """(scene, view, seed, content) -> the picture of a variant."""
+    return {
+        (scene, picture.view, seed, picture.content): picture
+        for scene, seed, record in results.records(name, variant)
+        for picture in record.pictures
+    }
