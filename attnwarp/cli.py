@@ -742,6 +742,26 @@ def undistort(
         typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")
 
 
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def inspect(
+    context: typer.Context,
+    splats: Annotated[
+        Path, typer.Argument(help="Splats (.ply, .splat), or a folder that attnwarp edit made.")
+    ],
+    data: Annotated[
+        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+    ],
+) -> None:
+    """See a scene, its cameras and its warps in 3D; takes the options of attnwarp-eval inspect."""
+    from importlib.util import find_spec
+
+    if find_spec("attnwarp_eval") is None:
+        raise fail("inspect: needs the package attnwarp_eval: pip install 'attnwarp[inspect]'")
+    # The library does not import the instrument: this process becomes its command.
+    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", str(splats)]
+    os.execv(sys.executable, [*command, "--data", str(data), *context.args])
+
+
 def _read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaussians:
     from dataclasses import replace
 

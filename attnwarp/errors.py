@@ -24,6 +24,7 @@ EXTRAS = {
         "yaml",
     ),
     "inspect": ("pyvista",),
+    "web": ("trame", "trame_vtk"),
     "gpu": ("gsplat",),
 }
 """The extras of pyproject.toml -> the modules that each brings and the plain package lacks."""

@@ -3,23 +3,54 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from attnwarp_eval.cli.shell import clear_errors
 
+if TYPE_CHECKING:
+    from attnwarp_eval.inspect.pair import Pair
+    from attnwarp_eval.inspect.subject import Subject
+
 
 def inspect(
-    what: Annotated[str, typer.Argument(help="A run's folder, or a scene's name or file.")],
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="A run's folder, a scene's name or file, or with --data: splats or an edit's"
+            " folder."
+        ),
+    ],
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Cameras of your own scene: transforms.json, its folder, or COLMAP's."),
+    ] = None,
+    ply: Annotated[
+        Path | None, typer.Option(help="Splats before the edit, as given to attnwarp edit.")
+    ] = None,
+    images: Annotated[Path | None, typer.Option(help="Pictures of a COLMAP model.")] = None,
+    source: Annotated[
+        str | None, typer.Option(help="Source view of your own scene; the first if left out.")
+    ] = None,
     scene: Annotated[str | None, typer.Option(help="Of a run; its first if left out.")] = None,
     variant: Annotated[
         str | None, typer.Option(help="Of the run, or a preset; corrected if left out.")
     ] = None,
     view: Annotated[str | None, typer.Option(help="Target view; the first if left out.")] = None,
     pixel: Annotated[str | None, typer.Option(help="Target pixel COLUMN,ROW to explain.")] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Feature grid, such as 64x64; --pixel then picks its cell.")
+    ] = None,
+    step: Annotated[
+        str | None, typer.Option(help="Of an edit: before, 'stage 1', ..., edited.")
+    ] = None,
     color: Annotated[
-        str, typer.Option(help="picture, mask, endpoint error, depth error or incidence.")
+        str,
+        typer.Option(
+            help="picture, mask, rules, incidence; with truth: endpoint error, depth error,"
+            " covered by; of an edit: edit disagreement."
+        ),
     ] = "mask",
     splats: Annotated[bool, typer.Option(help="Draw the splats as discs.")] = False,
     size: Annotated[int | None, typer.Option(min=16, max=4096, help="Image size in px.")] = None,
@@ -27,63 +58,138 @@ def inspect(
         Path | None, typer.Option(help="Write a PNG instead of opening a window.")
     ] = None,
     export: Annotated[
-        Path | None, typer.Option(help="Write .html, .gltf or .vtp instead of a window.")
+        Path | None, typer.Option(help="Write .html, .glb or .vtp instead of opening a window.")
     ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the window to a browser.")] = False,
+    host: Annotated[
+        str, typer.Option(help="Address for --web; 0.0.0.0 lets other machines in.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port for --web; 0: a free one.")] = 0,
 ) -> None:
     """Open a warp in 3D: surface, cameras, mask against truth, and a pixel's numbers."""
-    from attnwarp.errors import InputError
-    from attnwarp_eval.inspect import subject
-    from attnwarp_eval.inspect.pair import COLORINGS
-    from attnwarp_eval.inspect.pixel import report
-    from attnwarp_eval.inspect.window import Window
-
     with clear_errors():
-        subject.one_of(color, list(COLORINGS), "--color")
-        place = _pixel(pixel)
-        if (Path(what) / "study.json").is_file():
-            chosen = subject.of_run(Path(what), scene, size)
-        elif scene is not None:
-            raise InputError(f"{what}: not a run's folder, so --scene has no meaning; leave it out")
-        else:
-            chosen = subject.of_scene(what, size or subject.SIZE)
-        variants, targets = list(chosen.variants), list(chosen.targets)
-        preferred = "corrected" if "corrected" in variants else variants[0]
-        variant, view = variant or preferred, view or targets[0]
-        pair = chosen.pair(variant, view)
-        if place is not None:
-            try:
-                typer.echo("\n".join(report(pair, *place).lines()))
-            except ValueError as error:
-                raise InputError(f"--pixel: {error}") from None
-        window = Window(
-            chosen.pair,
-            variants,
-            targets,
-            variant=variant,
-            target=view,
-            coloring=color,
-            splats=splats,
-            off_screen=screenshot is not None or export is not None,
+        place = _numbers(pixel, ",", "--pixel", "COLUMN,ROW such as 120,84")
+        if export is not None:
+            from attnwarp_eval.inspect.export import check_ending
+
+            check_ending(export)
+        if web:
+            from attnwarp_eval.inspect.web import check_web
+
+            check_web()
+        from attnwarp_eval.inspect.capture import one_of
+        from attnwarp_eval.inspect.pair import COLORINGS
+        from attnwarp_eval.inspect.scene import State
+
+        one_of(color, COLORINGS, "--color")
+        chosen = _subject(what, data, ply, images, source, scene, size)
+        variant = variant or chosen.preferred
+        pair = chosen.pair(variant, view or chosen.targets[0])
+        one_of(color, pair.colorings, "--color")
+        steps = [""] if chosen.edit is None else list(chosen.edit.steps)
+        if step is not None:
+            one_of(step, steps, "--step")
+        state = State(
+            variant,
+            pair.target,
+            color,
+            _layer(layer, pair),
+            steps[0] if step is None else step,
+            splats,
         )
+        picked = None if place is None else _report(pair, state.layer, place)
+        if picked is not None:
+            typer.echo("\n".join(picked.lines()))
+        if export is not None:
+            from attnwarp_eval.inspect.export import export as write
+
+            write(export, chosen, state, picked)
+            typer.echo(export)
+        if screenshot is None and export is not None and not web:
+            return
+        from attnwarp_eval.inspect.window import Window
+
+        window = Window(chosen, state, off_screen=web or screenshot is not None)
         if place is not None:
             window.pick(*place)
         if screenshot is not None:
             window.screenshot(screenshot)
             typer.echo(screenshot)
-        if export is not None:
-            window.export(export)
-            typer.echo(export)
-        if screenshot is None and export is None:
+        if web:
+            from attnwarp_eval.inspect.web import serve
+
+            typer.echo("Ctrl-C, or closing the page, ends this.", err=True)
+            serve(window, host=host, port=port, announce=typer.echo)
+        elif screenshot is None:
             window.open()
+        window.close()
 
 
-def _pixel(text: str | None) -> tuple[int, int] | None:
+def _subject(
+    what: str,
+    data: Path | None,
+    ply: Path | None,
+    images: Path | None,
+    source: str | None,
+    scene: str | None,
+    size: int | None,
+) -> Subject:
+    from attnwarp.errors import InputError
+    from attnwarp_eval.inspect import subject
+    from attnwarp_eval.inspect.capture import is_edit
+
+    path = Path(what)
+    if scene is not None and not (path / "study.json").is_file():
+        raise InputError(f"{what}: not a run's folder, so --scene has no meaning; leave it out")
+    if data is not None:
+        return subject.of_capture(
+            path, data, ply=ply, images=images, source=source, size=size or subject.SIZE
+        )
+    given = {"--ply": ply, "--images": images, "--source": source}
+    for name, value in given.items():
+        if value is not None:
+            raise InputError(f"{name}: only goes with --data; name the cameras of your scene")
+    if (path / "study.json").is_file():
+        return subject.of_run(path, scene, size)
+    if path.suffix.lower() in (".ply", ".splat") or is_edit(path):
+        raise InputError(f"{what}: needs cameras; name them with --data FOLDER")
+    return subject.of_scene(what, size or subject.SIZE)
+
+
+def _report(pair: Pair, layer: tuple[int, int] | None, place: tuple[int, int]) -> Any:
+    from attnwarp.errors import InputError
+    from attnwarp_eval.inspect.cell import cell_of, cell_report
+    from attnwarp_eval.inspect.pixel import report
+
+    try:
+        if layer is None:
+            return report(pair, *place)
+        return cell_report(pair, layer, *cell_of(pair, layer, *place))
+    except ValueError as error:
+        raise InputError(f"--pixel: {error}") from None
+
+
+def _layer(text: str | None, pair: Pair) -> tuple[int, int] | None:
+    from attnwarp_eval.inspect.capture import one_of
+
+    size = _numbers(text, "x", "--layer", "WIDTHxHEIGHT such as 64x64")
+    if size is None:
+        return None
+    width, height = size
+    names = [f"{w}x{h}" for h, w in pair.layers]
+    one_of(f"{width}x{height}", names, "--layer")
+    return height, width
+
+
+def _numbers(
+    text: str | None, separator: str, option: str, expected: str
+) -> tuple[int, int] | None:
     from attnwarp.errors import InputError
 
     if text is None:
         return None
     try:
-        column, row = (int(part) for part in text.split(","))
+        first, second = (int(part) for part in text.split(separator))
     except ValueError:
-        raise InputError(f"--pixel: got {text!r}, expected COLUMN,ROW such as 120,84") from None
-    return column, row
+        raise InputError(f"{option}: got {text!r}, expected {expected}") from None
+    return first, second

@@ -1,34 +1,87 @@
-"""A pair of views under one variant: its truth, its warp, and the pictures that colour it."""
+"""A pair of views under one variant: its warp, its truth where there is one, and its colours."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from attnwarp import Gaussians
+from attnwarp import Camera, Gaussians
+from attnwarp.render import render
 from attnwarp.warp import (
+    FeatureWarp,
     Surface,
     WarpedView,
     WarpSettings,
+    angle_between,
+    depth_slope,
     render_surface,
+    sample,
+    sample_depth,
     warp_surfaces,
     warp_view,
 )
+from attnwarp_eval.inspect.capture import Capture, Edit, rendered
 from attnwarp_eval.study import pictures
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 from attnwarp_eval.world import World
 
+Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
-
-COLORINGS = ("picture", "mask", "endpoint error", "depth error", "incidence")
-"""What the surface that the target sees can be coloured by."""
+Legend = list[tuple[str, str]]
+Size = tuple[int, int]
 
 LABELS = {NONE: "none", VISIBLE: "visible", HIDDEN: "hidden", AMBIGUOUS: "ambiguous"}
+
+COLORINGS = (
+    "picture",
+    "mask",
+    "rules",
+    "endpoint error",
+    "depth error",
+    "incidence",
+    "covered by",
+    "edit disagreement",
+)
+"""What the surface that the target sees can be coloured by; :attr:`Pair.colorings` has those that
+a pair can show."""
+
+NEEDS_TRUTH = ("endpoint error", "depth error", "covered by")
+
+ACCEPTED, REJECTED = "#2ca25f", "#4a4a4a"
+
+CATEGORIES = (
+    "#1f78b4", "#e31a1c", "#33a02c", "#ff7f00", "#6a3d9a", "#b15928", "#a6cee3", "#fb9a99",
+    "#b2df8a", "#fdbf6f", "#cab2d6", "#ffd92f",
+)  # fmt: skip
+"""Colours of rules and of views, in order (ColorBrewer, Paired)."""
+
+DISAGREEMENT = 0.3
+"""Mean absolute difference of sRGB at the bright end of the colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The surface that the target's pixels see.
+
+    Attributes:
+        point: (H, W, 3) world coordinates, NaN where there is none.
+        depth: (H, W) along the target's axis.
+        normal: (H, W, 3) world, of either sign.
+        owner: (H, W) number of the object, all 0 without truth.
+        valid: (H, W) bool.
+    """
+
+    point: Array
+    depth: Array
+    normal: Array
+    owner: npt.NDArray[Any]
+    valid: npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,41 +89,69 @@ class Pair:
     """One target view against the source, under one variant.
 
     Args:
-        world: the scene's truth.
+        views: a scene with truth, or a user's own.
         target: name of the target view.
         settings: the rules of the warp.
         model: the splats that give depth; None takes the truth's own depth.
         spp: samples a pixel of the true pictures.
+        edit: of the scene.
     """
 
-    world: World
+    views: World | Capture
     target: str
     settings: WarpSettings
     model: Gaussians | None
     spp: int = 8
+    edit: Edit | None = None
+
+    @property
+    def world(self) -> World | None:
+        """The scene's truth; None for a user's own scene."""
+        return self.views if isinstance(self.views, World) else None
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Source and target."""
+        return self.views.source, self.views.targets[self.target]
+
+    @property
+    def size(self) -> Size:
+        """(H, W) of the target."""
+        return self.cameras[1].height, self.cameras[1].width
 
     @cached_property
-    def truth(self) -> TwoView:
+    def truth(self) -> TwoView | None:
         """Exact correspondences and visibility."""
+        if self.world is None:
+            return None
         return self.world.pair(self.target, self.world.source.height)
+
+    def truth_at(self, size: Size) -> TwoView | None:
+        """The truth on a feature grid (h, w); None where it is not known."""
+        if self.world is None or size[0] != size[1]:
+            return None
+        return self.world.pair(self.target, size[0])
 
     @cached_property
     def images(self) -> tuple[Image, Image]:
-        """(H, W, 3) sRGB truth of the source and of the target."""
-        world = self.world
-        return world.image(world.source.name, self.spp), world.image(self.target, self.spp)
+        """(H, W, 3) sRGB of the source and of the target before any edit."""
+        if isinstance(self.views, World):
+            views = self.views
+            return views.image(views.source.name, self.spp), views.image(self.target, self.spp)
+        return self.views.image(self.views.source.name), self.views.image(self.target)
 
     @cached_property
     def surfaces(self) -> tuple[Surface, Surface]:
         """What source and target know of the surface, as the warp takes it."""
-        source, target = self.world.source, self.world.targets[self.target]
+        source, target = self.cameras
         if self.model is not None:
             return (
                 render_surface(self.model, source, self.settings),
                 render_surface(self.model, target, self.settings),
             )
-        source_hits = self.world.geometry.trace(source)
-        target_hits = self.world.geometry.trace(target)
+        assert isinstance(self.views, World)
+        source_hits = self.views.geometry.trace(source)
+        target_hits = self.views.geometry.trace(target)
         return (
             Surface(source_hits.depth, source_hits.normal, image=self.images[0]),
             Surface(target_hits.depth, target_hits.normal, image=self.images[1]),
@@ -79,7 +160,7 @@ class Pair:
     @cached_property
     def view(self) -> WarpedView:
         """The warp and its mask."""
-        source, target = self.world.source, self.world.targets[self.target]
+        source, target = self.cameras
         if self.model is None:
             return warp_surfaces(source, target, self.surfaces[1], self.surfaces[0], self.settings)
         source_image, target_image = self.images
@@ -94,53 +175,378 @@ class Pair:
         )
 
     @cached_property
-    def depths(self) -> Mapping[str, npt.NDArray[np.float64]]:
+    def seen(self) -> Seen:
+        """The surface that the target sees: the true one, or that of the splats."""
+        if self.truth is not None:
+            hits = self.truth.hits
+            return Seen(hits.point, hits.depth, hits.normal, hits.object_id, hits.valid)
+        surface, target = self.surfaces[1], self.cameras[1]
+        depth = np.asarray(surface.depth, dtype=np.float64)
+        if surface.alpha is not None and self.settings.opaque is not None:
+            opaque = np.asarray(surface.alpha) >= self.settings.opaque
+            depth = np.where(opaque, depth, np.nan)
+        valid = np.isfinite(depth)
+        point = target.unproject(target.pixel_centers(), depth)
+        normal = np.asarray(surface.normal, dtype=np.float64)
+        return Seen(point, depth, normal, np.zeros(depth.shape, int), valid)
+
+    @cached_property
+    def depths(self) -> Mapping[str, Array]:
         """(H, W) depth of the target by each definition, NaN where undefined."""
-        maps = {"truth": self.truth.hits.depth}
+        maps = {"of the warp": self.view.correspondence.target_depth.numpy()}
+        if self.truth is not None:
+            maps["truth"] = self.truth.hits.depth
         if self.model is not None:
             for depth in ("intersection", "center"):
-                for statistic in ("expected", "median"):
-                    settings = WarpSettings(depth=depth, depth_statistic=statistic)
-                    surface = render_surface(self.model, self.world.targets[self.target], settings)
-                    maps[f"{depth}, {statistic}"] = np.asarray(surface.depth, dtype=np.float64)
+                how = "peak" if depth == "intersection" and self.model.kind == "3d" else depth
+                with torch.no_grad():
+                    result = render(self.model, self.cameras[1], depth=how)
+                maps[f"{depth}, expected"] = result.depth.double().numpy()
+                maps[f"{depth}, median"] = result.median_depth.double().numpy()
         return maps
 
     @cached_property
-    def incidence(self) -> npt.NDArray[np.float64]:
-        """(H, W) degrees between the true normal and the direction to the source camera."""
-        hits = self.truth.hits
-        ray = self.world.source.position - hits.point
-        cosine = np.einsum("hwi,hwi->hw", hits.normal, ray) / np.linalg.norm(ray, axis=-1)
+    def source_depth(self) -> Array:
+        """(H, W) depth that the source itself has at the warp's positions; NaN where none."""
+        depth = torch.as_tensor(np.asarray(self.surfaces[0].depth, dtype=np.float64))
+        spread = self.settings.depth_spread
+        return sample_depth(depth, self.view.correspondence, spread=spread).numpy()
+
+    @cached_property
+    def tolerance(self) -> Array:
+        """(H, W) largest difference of depths that counts as agreement."""
+        depth = torch.as_tensor(np.asarray(self.surfaces[0].depth, dtype=np.float64))
+        correspondence = self.view.correspondence
+        slope = sample(depth_slope(depth)[None], correspondence, mode="nearest")[0][0]
+        tolerance = self.settings.depth_relative * correspondence.z
+        tolerance = tolerance + self.settings.depth_slope * torch.nan_to_num(slope, nan=0.0)
+        return tolerance.numpy()
+
+    @cached_property
+    def margins(self) -> Mapping[str, tuple[Array, str]]:
+        """(H, W) distance of each rule's pixels from the other verdict, and its unit.
+
+        Positive where the rule passes, NaN where the quantity is undefined.
+        """
+        return {rule: self._margin(rule) for rule in self.view.rules}
+
+    def _margin(self, rule: str) -> tuple[Array, str]:
+        settings, correspondence = self.settings, self.view.correspondence
+        if rule == "defined":
+            return correspondence.target_depth.numpy(), "of depth"
+        if rule == "in_bounds":
+            camera = correspondence.source if settings.bounds == "source" else self.cameras[1]
+            # With integer centres the method holds the index against the border.
+            slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
+            x, y = np.moveaxis(correspondence.xy.numpy() - slip, -1, 0)
+            border = np.minimum(np.minimum(x, y), np.minimum(camera.width - x, camera.height - y))
+            return border, "px to the border"
+        if rule == "in_front":
+            return correspondence.z.numpy(), "of depth"
+        if rule == "opaque" and settings.opaque is not None:
+            return self._opacity() - settings.opaque, "of alpha"
+        if rule == "depth_agrees":
+            return self.tolerance - abs(correspondence.z.numpy() - self.source_depth), "of depth"
+        if rule == "photometric" and settings.photometric is not None:
+            source = torch.as_tensor(np.asarray(self.images[0], dtype=np.float64))
+            warped = sample(source.permute(2, 0, 1), correspondence)[0].permute(1, 2, 0).numpy()
+            difference = np.abs(warped - np.asarray(self.images[1])).mean(axis=2)
+            difference[~correspondence.defined.numpy()] = np.nan
+            return settings.photometric - difference, "of colour"
+        if rule == "facing":
+            return 90.0 - self._warp_incidence(), "degrees of incidence"
+        if rule == "source_incidence":
+            return min(90.0, settings.normal_angle) - self._warp_incidence(), "degrees of incidence"
+        if rule == "camera_frame":
+            return settings.normal_angle - self._frame_angle(), "degrees between normals"
+        return np.full(self.size, np.nan), "(yes or no)"
+
+    def _opacity(self) -> Array:
+        """(H, W) smaller alpha of target and source; NaN outside the source image."""
+        alpha = np.full(self.size, np.inf)
+        if self.view.target.alpha is not None:
+            alpha = np.asarray(self.view.target.alpha, dtype=np.float64)
+        if self.surfaces[0].alpha is not None:
+            own = torch.as_tensor(np.asarray(self.surfaces[0].alpha, dtype=np.float64))
+            sampled, inside = sample(own[None], self.view.correspondence)
+            alpha = np.where(inside.numpy(), np.minimum(alpha, sampled[0].numpy()), np.nan)
+        return np.where(np.isinf(alpha), np.nan, alpha)
+
+    def _target_normals(self) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(self.view.target.normal, dtype=np.float64))
+
+    def _warp_incidence(self) -> Array:
+        """(H, W) degrees between the warp's normal, flipped to the target, and the source."""
+        correspondence = self.view.correspondence
+        normal = self._target_normals()
+        rotation = torch.from_numpy(correspondence.source.rotation.copy())
+        to_source = -correspondence.points @ rotation
+        offset = correspondence.source.position - correspondence.target.position
+        to_target = to_source - torch.from_numpy(offset)
+        away = (normal * to_target).sum(dim=-1, keepdim=True) < 0
+        return angle_between(torch.where(away, -normal, normal), to_source).numpy()
+
+    def _frame_angle(self) -> Array:
+        """(H, W) degrees between camera-space normals, each turned to its camera."""
+        correspondence, normal = self.view.correspondence, self._target_normals()
+        turned = []
+        for camera, points in (
+            (correspondence.source, correspondence.points),
+            (correspondence.target, correspondence.target_points),
+        ):
+            own = normal @ torch.from_numpy(camera.rotation.T.copy())
+            away = (own * points).sum(dim=-1, keepdim=True) > 0
+            turned.append(torch.where(away, -own, own))
+        return angle_between(*turned).numpy()
+
+    @cached_property
+    def incidence(self) -> Array:
+        """(H, W) degrees between the surface's normal and the direction to the source camera.
+
+        The normal is the true one, or the splats' turned to the target.
+        """
+        source, target = self.cameras
+        seen = self.seen
+        to_target = target.position - seen.point
+        away = np.einsum("hwi,hwi->hw", seen.normal, to_target) < 0
+        normal = np.where(away[..., None], -seen.normal, seen.normal)
+        to_source = source.position - seen.point
+        lengths = np.linalg.norm(to_source, axis=-1) * np.linalg.norm(normal, axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cosine = np.einsum("hwi,hwi->hw", normal, to_source) / lengths
         return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
-    def colors(self, coloring: str) -> Image:
+    @cached_property
+    def first_rejection(self) -> npt.NDArray[np.int64]:
+        """(H, W) number of the first rule that rejects the pixel; -1 where none does."""
+        passed = np.stack([mask.numpy() for mask in self.view.rules.values()])
+        return np.where(passed.all(axis=0), -1, passed.argmin(axis=0))
+
+    @cached_property
+    def covering(self) -> npt.NDArray[np.int64]:
+        """(H, W) number of the view that sees the surface at the smallest incidence, -1 for none.
+
+        Number 0 is the source; the others are the targets in order, this one left out.
+        """
+        assert isinstance(self.views, World) and self.truth is not None
+        hits, geometry = self.truth.hits, self.views.geometry
+        points, normals = hits.point[hits.valid], hits.normal[hits.valid]
+        best = np.full(len(points), -1)
+        largest = np.zeros(len(points))
+        for number, name in enumerate(self._covering_views()):
+            camera = self.views.camera(name)
+            xy, z = camera.project(points)
+            with np.errstate(invalid="ignore"):
+                inside = (z > 0) & ((xy >= 0) & (xy <= (camera.width, camera.height))).all(axis=1)
+            ray = camera.position - points
+            cosine = np.einsum("ni,ni->n", normals, ray) / np.linalg.norm(ray, axis=1)
+            better = np.flatnonzero(inside & (cosine > largest))
+            ids = hits.primitive_id[hits.valid][better]
+            visible = geometry.visible_from(points[better], normals[better], ids, camera)
+            best[better[visible]] = number
+            largest[better[visible]] = cosine[better[visible]]
+        covering = np.full(self.size, -1)
+        covering[hits.valid] = best
+        return covering
+
+    def _covering_views(self) -> list[str]:
+        others = [name for name in self.views.targets if name != self.target]
+        return [self.views.source.name, *others][: len(CATEGORIES)]
+
+    @cached_property
+    def disagreement(self) -> Array:
+        """(H, W) mean absolute difference of the target's edit and the source's, warped.
+
+        NaN where the mask rejects, and where a view has not been edited.
+        """
+        edited = self._edited(self.views.source.name), self._edited(self.target)
+        if edited[0] is None or edited[1] is None:
+            return np.full(self.size, np.nan)
+        source = torch.as_tensor(np.asarray(edited[0], dtype=np.float64)).permute(2, 0, 1)
+        warped = sample(source, self.view.correspondence)[0].permute(1, 2, 0).numpy()
+        difference = np.abs(warped - edited[1]).mean(axis=2)
+        return np.where(self.view.mask.numpy(), difference, np.nan)
+
+    def _edited(self, name: str) -> Image | None:
+        """(H, W, 3) the edit of a view, at its camera's size."""
+        picture = None if self.edit is None else self.edit.edited(name)
+        return None if picture is None else fitted(picture, self.views.camera(name))
+
+    # --- feature grids
+
+    @cached_property
+    def layers(self) -> tuple[Size, ...]:
+        """(h, w) of feature grids that the images divide into: an eighth, a sixteenth, ..."""
+        source, target = self.cameras
+        sizes = []
+        for factor in (4, 8, 16, 32, 64):
+            sides = (target.height, target.width, source.height, source.width)
+            if all(side % factor == 0 for side in sides) and min(sides) >= 2 * factor:
+                sizes.append((target.height // factor, target.width // factor))
+        return tuple(sizes)
+
+    def layer(self, size: Size) -> FeatureWarp:
+        """The warp of an (h, w) feature grid."""
+        return self.view.at(size)
+
+    def mask(self, layer: Size | None = None) -> npt.NDArray[np.bool_]:
+        """(H, W) the mask, or that of a feature grid with its cells as blocks of pixels."""
+        if layer is None:
+            return self.view.mask.numpy()
+        return blocks(self.layer(layer).mask.numpy(), self.size)
+
+    # --- colours
+
+    @property
+    def colorings(self) -> tuple[str, ...]:
+        """Those of :data:`COLORINGS` that this pair can show."""
+        return tuple(
+            name
+            for name in COLORINGS
+            if (self.truth is not None or name not in NEEDS_TRUTH)
+            and (self.edit is not None or name != "edit disagreement")
+        )
+
+    def colors(self, coloring: str, layer: Size | None = None, step: str | None = None) -> Image:
         """(H, W, 3) sRGB colours of the target's pixels.
 
         Args:
-            coloring: one of :data:`COLORINGS`.
+            coloring: one of :attr:`colorings`.
+            layer: (h, w) of a feature grid, whose mask "mask" then shows.
+            step: of the edit, whose scene "picture" then shows.
         """
+        if coloring not in self.colorings:
+            raise ValueError(
+                f"coloring: got {coloring!r}, expected one of {', '.join(self.colorings)}"
+            )
+        truth, target = self.truth, self.images[1]
         if coloring == "picture":
-            return self.images[1]
+            return self.picture(step)
         if coloring == "mask":
-            return pictures.mask_against_truth(self.view.mask.numpy(), self.truth, self.images[1])
-        if coloring == "endpoint error":
-            return pictures.endpoint_map(self.view.correspondence.xy.numpy(), self.truth)
-        if coloring == "depth error":
-            depth = np.asarray(self.surfaces[1].depth, dtype=np.float64)
-            return pictures.depth_map(depth, self.truth.hits)
+            if truth is not None:
+                return pictures.mask_against_truth(self.mask(layer), truth, target)
+            mask = self.mask(layer)
+            return tinted([ACCEPTED, REJECTED], np.where(mask, 0, 1), target)
+        if coloring == "rules":
+            return tinted([*CATEGORIES, ACCEPTED], self.first_rejection, target)
         if coloring == "incidence":
             return incidence_map(self.incidence)
-        raise ValueError(f"coloring: got {coloring!r}, expected one of {', '.join(COLORINGS)}")
+        if coloring == "edit disagreement":
+            return disagreement_map(self.disagreement)
+        assert truth is not None
+        if coloring == "endpoint error":
+            return pictures.endpoint_map(self.view.correspondence.xy.numpy(), truth)
+        if coloring == "depth error":
+            depth = np.asarray(self.surfaces[1].depth, dtype=np.float64)
+            return pictures.depth_map(depth, truth.hits)
+        return tinted([*CATEGORIES, REJECTED], self.covering, target)
 
-    def insets(self) -> dict[str, Image]:
-        """The four pictures beside the 3D view, by title."""
+    def legend(self, coloring: str) -> Legend:
+        """(text, "#rrggbb") of what the colours mean."""
+        if coloring == "mask":
+            if self.truth is None:
+                return [("accepted", ACCEPTED), ("rejected", REJECTED)]
+            return [(name, color) for name, (color, _) in pictures.CLASSES.items()]
+        if coloring == "rules":
+            rules = [
+                (f"rejected by {rule}", CATEGORIES[number])
+                for number, rule in enumerate(self.view.rules)
+            ]
+            return [("accepted", ACCEPTED), *rules]
+        if coloring == "covered by":
+            views = zip(self._covering_views(), CATEGORIES, strict=False)
+            return [*views, ("no view", REJECTED)]
+        if coloring == "endpoint error":
+            low, high = pictures.EPE_RANGE
+            values = np.geomspace(low, high, 4)
+            scale = _scale("viridis", [f"{value:g} px" for value in values])
+            return [*scale, ("no position", "#b2182b")]
+        if coloring == "depth error":
+            limit = pictures.DEPTH_RANGE
+            return _scale("RdBu_r", [f"{v:+.0%} of depth" for v in np.linspace(-limit, limit, 5)])
+        if coloring == "incidence":
+            return _scale("viridis_r", [f"{v:.0f} degrees" for v in np.linspace(0, 90, 4)])
+        if coloring == "edit disagreement":
+            values = np.linspace(0, DISAGREEMENT, 4)
+            return [*_scale("magma", [f"{v:.1f} of sRGB" for v in values]), ("no warp", "#999999")]
+        return []
+
+    def picture(self, step: str | None = None) -> Image:
+        """(H, W, 3) the target's picture, or the render of the scene after a step of its edit."""
+        if self.edit is None or step in (None, self.edit.steps[0]):
+            return self.images[1]
+        part = f"renders/after/{self.target}.png" if step == "edited" else ""
+        made = self.edit.picture(part) if part else None
+        target = self.cameras[1]
+        assert step is not None
+        return rendered(self.edit.splats(step), target) if made is None else fitted(made, target)
+
+    def insets(self, layer: Size | None = None, step: str | None = None) -> dict[str, Image]:
+        """The pictures beside the 3D view, by title.
+
+        Args:
+            layer: (h, w) of a feature grid: what is warped then has its cells.
+            step: of the edit.
+        """
         source, target = self.images
-        return {
-            "source": source,
-            "target": target,
-            "source, warped": pictures.warped(source, self.view),
-            "mask against truth": self.colors("mask"),
-        }
+        parts = {"source": source, "target": target}
+        if self.edit is not None:
+            edited = self._edited(self.views.source.name), self._edited(self.target)
+            parts = {
+                "source, edited": source if edited[0] is None else edited[0],
+                "target, not edited yet" if edited[1] is None else "target, edited": target
+                if edited[1] is None
+                else edited[1],
+                f"scene, {step or self.edit.steps[0]}": self.picture(step),
+            }
+        shown = parts["source, edited"] if self.edit is not None else source
+        parts["source, warped"] = self._warped(shown, layer)
+        parts["mask against truth" if self.truth is not None else "mask"] = self.colors(
+            "mask", layer
+        )
+        if self.edit is not None:
+            features = self.edit.picture(f"features/{self.target}.png")
+            if features is not None:
+                parts["features, warped"] = features
+        return parts
+
+    def _warped(self, source: Image, layer: Size | None) -> Image:
+        if layer is None:
+            return pictures.warped(source, self.view)
+        warp = self.layer(layer)
+        camera = warp.correspondence.source
+        small = fitted(source, camera)
+        image = warp.warp(torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1))))
+        large = blocks(image.permute(1, 2, 0).numpy(), self.size)
+        mask = self.mask(layer)[..., None]
+        return np.where(mask, large, pictures.checkered(self.size)).astype(np.float32)
+
+
+def fitted(picture: Image, camera: Camera) -> Image:
+    """A picture at a camera's size: averaged where it shrinks, cubic where it grows."""
+    from attnwarp.propagate.pictures import resized
+
+    return resized(picture, (camera.height, camera.width))
+
+
+def blocks(cells: npt.NDArray[Any], size: Size) -> npt.NDArray[Any]:
+    """(H, W, ...) of (h, w, ...) cells, each a block of pixels."""
+    rows = np.arange(size[0]) * cells.shape[0] // size[0]
+    columns = np.arange(size[1]) * cells.shape[1] // size[1]
+    return np.asarray(cells[rows[:, None], columns])
+
+
+def tinted(colors: Sequence[str], number: npt.NDArray[Any], image: Image) -> Image:
+    """(H, W, 3) colours by number, over the darkened grey picture.
+
+    Args:
+        colors: "#rrggbb"; number -1 takes the last.
+        number: (H, W) int.
+        image: (H, W, 3) sRGB.
+    """
+    palette = np.stack([pictures.rgb(color) for color in colors])
+    grey = image.mean(axis=2, keepdims=True)
+    return (0.35 * grey + 0.65 * palette[number]).astype(np.float32)
 
 
 def incidence_map(degrees: npt.NDArray[Any]) -> Image:
@@ -150,3 +556,21 @@ def incidence_map(degrees: npt.NDArray[Any]) -> Image:
     image = matplotlib.colormaps["viridis"](1 - np.nan_to_num(degrees, nan=90) / 90)[..., :3]
     faces = np.isfinite(degrees) & (degrees < 90)
     return np.where(faces[..., None], image, 0.6).astype(np.float32)
+
+
+def disagreement_map(difference: npt.NDArray[Any]) -> Image:
+    """Difference of edits, 0 dark to :data:`DISAGREEMENT` bright; grey where it is undefined."""
+    import matplotlib
+
+    scaled = np.clip(np.nan_to_num(difference) / DISAGREEMENT, 0, 1)
+    image = matplotlib.colormaps["magma"](scaled)[..., :3]
+    return np.where(np.isfinite(difference)[..., None], image, 0.6).astype(np.float32)
+
+
+def _scale(colormap: str, texts: Sequence[str]) -> Legend:
+    """Evenly spaced colours of a map."""
+    import matplotlib
+    from matplotlib.colors import to_hex
+
+    colors = matplotlib.colormaps[colormap](np.linspace(0, 1, len(texts)))
+    return [(text, to_hex(color)) for text, color in zip(texts, colors, strict=True)]

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from attnwarp.warp import angle_between, depth_slope, sample, sample_depth
 from attnwarp_eval.inspect.pair import LABELS, Pair
 
 Vector = npt.NDArray[np.float64]
+
+NEARER = 1e-6
+"""What stands in the way is nearer than the point by at least this share of the distance."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +38,45 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Exact:
+    """The truth of a target pixel.
+
+    Attributes:
+        label: none, visible, hidden or ambiguous.
+        object: name of the object that the pixel shows, or "".
+        xy: (2,) source pixel coordinates of its surface point.
+        z: depth of the point in the source camera.
+        blocked_by: name of the object that the source sees instead, or "" where the way is free.
+
+    Example:
+        >>> Exact("hidden", "marble", np.array([3.5, 4.5]), 2.0, blocked_by="chrome").blocked_by
+        'chrome'
+    """
+
+    label: str
+    object: str
+    xy: Vector
+    z: float
+    blocked_by: str
+
+
+@dataclass(frozen=True)
 class PixelReport:
     """What is known of a target pixel.
 
     Attributes:
         column, row: of the pixel.
-        label: of the truth: none, visible, hidden or ambiguous.
-        object: name of the object that the pixel shows, or "".
-        point: (3,) true surface point in the world; NaN without a surface.
+        point: (3,) surface point in the world; NaN without a surface.
         depths: z along the target's axis, by definition.
-        true_xy, xy: source pixel coordinates, exact and of the warp.
-        true_z, z: depth in the source camera, exact and of the warp.
+        xy: (2,) source pixel coordinates of the warp.
+        z: depth of the warp's point in the source camera.
         source_depth: depth that the source itself has at ``xy``; NaN where it has none.
         tolerance: of the depth agreement there.
         verdicts: every rule that was applied, in order.
         accepted: all rules together.
-        blocker: (3,) what the source really sees toward the point; equal to ``point`` where the
-            way is free.
-        blocked_by: name of the object there, or "" where the way is free.
+        seen_instead: (3,) what the source really sees toward the point, where something else
+            stands in the way; None where the way is free or unknown.
+        exact: the truth, where there is one.
 
     Example:
         >>> from attnwarp.warp import PRESETS
@@ -69,40 +91,46 @@ class PixelReport:
 
     column: int
     row: int
-    label: str
-    object: str
     point: Vector
     depths: dict[str, float]
-    true_xy: Vector
     xy: Vector
-    true_z: float
     z: float
     source_depth: float
     tolerance: float
     verdicts: tuple[Verdict, ...]
     accepted: bool
-    blocker: Vector
-    blocked_by: str
+    seen_instead: Vector | None
+    exact: Exact | None
 
     @property
     def endpoint_error(self) -> float:
         """Distance between the warp's position and the exact one, in source pixels."""
-        return float(np.linalg.norm(self.xy - self.true_xy))
+        if self.exact is None:
+            return float("nan")
+        return float(np.linalg.norm(self.xy - self.exact.xy))
 
     def lines(self) -> list[str]:
         """The report in words, a line each."""
-        text = [f"pixel ({self.column}, {self.row}) {self.object or 'nothing'}: {self.label}"]
+        text = [f"pixel ({self.column}, {self.row})"]
+        if self.exact is not None:
+            text[0] += f" {self.exact.object or 'nothing'}: {self.exact.label}"
         text += [f"depth, {name}: {value:.5g}" for name, value in self.depths.items()]
-        text.append(f"in the source: ({self.xy[0]:.2f}, {self.xy[1]:.2f}) px")
-        text.append(f"  exact ({self.true_xy[0]:.2f}, {self.true_xy[1]:.2f}), z {self.true_z:.5g}")
-        text.append(f"  endpoint error {self.endpoint_error:.3g} px, z {self.z:.5g}")
+        text.append(f"in the source: ({self.xy[0]:.2f}, {self.xy[1]:.2f}) px, z {self.z:.5g}")
+        if self.exact is not None:
+            x, y = self.exact.xy
+            text.append(f"  exact ({x:.2f}, {y:.2f}), z {self.exact.z:.5g}")
+            text.append(f"  endpoint error {self.endpoint_error:.3g} px")
         text.append(f"  source depth {self.source_depth:.5g}, tolerance {self.tolerance:.3g}")
         for verdict in self.verdicts:
             word = "pass" if verdict.passed else "FAIL"
-            text.append(f"{word} {verdict.rule}: margin {verdict.margin:.3g} {verdict.unit}")
+            margin = "" if np.isnan(verdict.margin) else f": margin {verdict.margin:.3g}"
+            text.append(f"{word} {verdict.rule}{margin} {verdict.unit}")
         text.append("accepted" if self.accepted else "rejected")
-        if self.blocked_by:
-            text.append(f"hidden behind: {self.blocked_by}")
+        if self.seen_instead is not None:
+            name = self.exact.blocked_by if self.exact is not None else "something nearer"
+            text.append(f"hidden behind: {name}")
+        elif self.exact is not None and self.exact.label == "hidden":
+            text.append("turned away from the source")
         return text
 
 
@@ -126,110 +154,59 @@ def report(pair: Pair, column: int, row: int) -> PixelReport:
         >>> report(pair, 8, 12).endpoint_error < 1
         True
     """
-    truth, view = pair.truth, pair.view
-    height, width = truth.label.shape
+    height, width = pair.size
     if not (0 <= column < width and 0 <= row < height):
         raise ValueError(
             f"pixel: got ({column}, {row}), expected a column below {width} and a row below"
             f" {height}"
         )
-    pixel = row, column
-    names = pair.world.scene.object_names
-    hits = truth.hits
-    blocker, blocked_by = _blocker(pair, hits.point[pixel], int(hits.primitive_id[pixel]))
-    source_depth, tolerance = _source_depth(pair, pixel)
+    pixel, view = (row, column), pair.view
+    exact, seen_instead = _truth(pair, pixel)
+    if exact is None:
+        seen_instead = _nearer(pair, pixel)
     return PixelReport(
         column=column,
         row=row,
-        label=LABELS[int(truth.label[pixel])],
-        object=names[hits.object_id[pixel]] if hits.valid[pixel] else "",
-        point=hits.point[pixel],
+        point=pair.seen.point[pixel],
         depths={name: float(depth[pixel]) for name, depth in pair.depths.items()},
-        true_xy=truth.xy[pixel],
         xy=view.correspondence.xy[pixel].numpy(),
-        true_z=float(truth.z_source[pixel]),
         z=float(view.correspondence.z[pixel]),
-        source_depth=source_depth,
-        tolerance=tolerance,
+        source_depth=float(pair.source_depth[pixel]),
+        tolerance=float(pair.tolerance[pixel]),
         verdicts=tuple(
-            Verdict(name, bool(mask[pixel]), *_margin(pair, name, pixel))
+            Verdict(name, bool(mask[pixel]), float(pair.margins[name][0][pixel]), unit)
             for name, mask in view.rules.items()
+            for unit in [pair.margins[name][1]]
         ),
         accepted=bool(view.mask[pixel]),
-        blocker=blocker,
-        blocked_by=blocked_by,
+        seen_instead=seen_instead,
+        exact=exact,
     )
 
 
-def _blocker(pair: Pair, point: Vector, primitive: int) -> tuple[Vector, str]:
-    if not np.isfinite(point).all():
-        return point, ""
-    geometry, eye = pair.world.geometry, pair.world.source.position
-    if geometry.reached(eye, point[None], [primitive])[0]:
-        return point, ""
-    hits = geometry.trace_rays(eye, (point - eye)[None])
-    return hits.point[0], pair.world.scene.object_names[hits.object_id[0]]
+def _truth(pair: Pair, pixel: tuple[int, int]) -> tuple[Exact | None, Vector | None]:
+    world, truth = pair.world, pair.truth
+    if world is None or truth is None:
+        return None, None
+    hits, names = truth.hits, world.scene.object_names
+    blocker, name = None, ""
+    if hits.valid[pixel]:
+        point, eye = hits.point[pixel], world.source.position
+        faces = hits.normal[pixel] @ (eye - point) > 0
+        free = world.geometry.reached(eye, point[None], [hits.primitive_id[pixel]])[0]
+        first = world.geometry.trace_rays(eye, (point - eye)[None])
+        # The far side of a thing is hidden by its near side; that of a sheet by nothing before it.
+        if not (free and faces) and first.valid[0] and first.t[0] < 1 - NEARER:
+            blocker, name = first.point[0], names[first.object_id[0]]
+    owner = names[hits.object_id[pixel]] if hits.valid[pixel] else ""
+    z = float(truth.z_source[pixel])
+    return Exact(LABELS[int(truth.label[pixel])], owner, truth.xy[pixel], z, name), blocker
 
 
-def _source_depth(pair: Pair, pixel: tuple[int, int]) -> tuple[float, float]:
-    """Depth that the source has at the warp's position, and the tolerance of the agreement."""
-    settings, correspondence = pair.settings, pair.view.correspondence
-    depth = torch.as_tensor(np.asarray(pair.surfaces[0].depth, dtype=np.float64))
-    seen = sample_depth(depth, correspondence, spread=settings.depth_spread)[pixel]
-    slope = sample(depth_slope(depth)[None], correspondence, mode="nearest")[0][0][pixel]
-    tolerance = settings.depth_relative * correspondence.z[pixel]
-    tolerance = tolerance + settings.depth_slope * torch.nan_to_num(slope, nan=0.0)
-    return float(seen), float(tolerance)
-
-
-def _margin(pair: Pair, rule: str, pixel: tuple[int, int]) -> tuple[float, str]:
-    """How far a pixel is from the other verdict of a rule, and the unit."""
-    settings, correspondence = pair.settings, pair.view.correspondence
-    source, _ = pair.surfaces
-    if rule == "defined":
-        return float(pair.view.target.depth[pixel]), "of depth"
-    if rule == "in_bounds":
-        camera = correspondence.source if settings.bounds == "source" else correspondence.target
-        # With integer centres the rule holds the index against the border, as the method does.
-        slip = 0.5 if correspondence.pixel_centers == "integer" else 0.0
-        x, y = (correspondence.xy[pixel] - slip).tolist()
-        return min(x, y, camera.width - x, camera.height - y), "px to the border"
-    if rule == "in_front":
-        return float(correspondence.z[pixel]), "of depth"
-    if rule == "opaque" and settings.opaque is not None:
-        margins = []
-        if pair.view.target.alpha is not None:
-            margins.append(float(pair.view.target.alpha[pixel]) - settings.opaque)
-        if source.alpha is not None:
-            alpha = torch.as_tensor(np.asarray(source.alpha, dtype=np.float64))
-            sampled, inside = sample(alpha[None], correspondence)
-            if not inside[pixel]:
-                return float("nan"), "of alpha: outside the source image"
-            margins.append(float(sampled[0][pixel]) - settings.opaque)
-        return min(margins, default=float("nan")), "of alpha"
-    if rule == "depth_agrees":
-        depth, tolerance = _source_depth(pair, pixel)
-        return tolerance - abs(float(correspondence.z[pixel]) - depth), "of depth"
-    if rule == "photometric" and settings.photometric is not None:
-        image = torch.as_tensor(np.asarray(pair.images[0], dtype=np.float64))
-        warped = sample(image.permute(2, 0, 1), correspondence)[0][(slice(None), *pixel)].numpy()
-        away = np.abs(warped - np.asarray(pair.images[1])[pixel]).mean()
-        return settings.photometric - float(away), "of colour"
-    if rule in ("facing", "source_incidence"):
-        limit = 90.0 if rule == "facing" else settings.normal_angle
-        return limit - _incidence(pair, pixel), "degrees of incidence"
-    return float("nan"), "(no single quantity)"
-
-
-def _incidence(pair: Pair, pixel: tuple[int, int]) -> float:
-    """Degrees between the warp's normal, flipped to the target, and the ray to the source."""
+def _nearer(pair: Pair, pixel: tuple[int, int]) -> Vector | None:
+    """What the source's own depth says stands before the point."""
     correspondence = pair.view.correspondence
-    normal = torch.as_tensor(np.asarray(pair.view.target.normal, dtype=np.float64)[pixel])
-    source = torch.from_numpy(correspondence.source.rotation.copy())
-    point = source.T @ correspondence.points[pixel]
-    to_source = -point
-    offset = correspondence.source.position - correspondence.target.position
-    to_target = to_source - torch.from_numpy(offset)
-    if normal @ to_target < 0:
-        normal = -normal
-    return float(angle_between(normal, to_source))
+    depth, z = float(pair.source_depth[pixel]), float(correspondence.z[pixel])
+    if not depth < z - float(pair.tolerance[pixel]):  # NaN too
+        return None
+    return correspondence.source.unproject(correspondence.xy[pixel].numpy(), depth)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from attnwarp import Camera, Gaussians
-from attnwarp_eval.inspect.pair import Image, Pair
+from attnwarp.gaussians import SH_C0
+from attnwarp_eval.inspect.cell import CellReport
+from attnwarp_eval.inspect.pair import Image, Pair, Seen
 from attnwarp_eval.inspect.pixel import PixelReport
+from attnwarp_eval.inspect.subject import Subject
 from attnwarp_eval.truth import Geometry
-from attnwarp_eval.twoview import Hits
 
 if TYPE_CHECKING:
     import pyvista
@@ -21,15 +25,16 @@ Array = npt.NDArray[np.float64]
 SEAM = 0.05
 """Neighbouring pixels whose depths differ by more than this fraction are not joined by a face."""
 
-DISC_SIDES = 10
-"""Corners of the polygon that stands for a splat, drawn at one sigma."""
+DISC_SIDES = ((20_000, 10), (60_000, 6))
+"""(splats, corners): up to so many splats, a disc is a polygon of so many corners; beyond, it is a
+square. Software draws 200,000 ten-sided discs in a second, squares in a third of it."""
 
 
-def seen_surface(hits: Hits, colors: Image) -> pyvista.PolyData:
+def seen_surface(seen: Seen, colors: Image) -> pyvista.PolyData:
     """The surface that a view sees: a vertex a pixel, faces between neighbours of one surface.
 
     Args:
-        hits: of the view, H x W.
+        seen: of the view, H x W.
         colors: (H, W, 3) sRGB in [0, 1].
 
     Returns:
@@ -37,24 +42,25 @@ def seen_surface(hits: Hits, colors: Image) -> pyvista.PolyData:
     """
     import pyvista
 
-    height, width = hits.valid.shape
+    height, width = seen.valid.shape
     index = np.full(height * width, -1)
-    valid = hits.valid.ravel()
+    valid = seen.valid.ravel()
     index[valid] = np.arange(valid.sum())
-    grid = index.reshape(height, width)
-    corners = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1)
-    depth = hits.depth
-    around = np.stack([depth[:-1, :-1], depth[:-1, 1:], depth[1:, 1:], depth[1:, :-1]], axis=-1)
-    owner = hits.object_id
-    owners = np.stack([owner[:-1, :-1], owner[:-1, 1:], owner[1:, 1:], owner[1:, :-1]], axis=-1)
+    corners = _squares(index.reshape(height, width))
+    around, owners = _squares(seen.depth), _squares(seen.owner)
     with np.errstate(invalid="ignore"):
         joined = (corners >= 0).all(-1) & (around.max(-1) <= (1 + SEAM) * around.min(-1))
     joined &= (owners == owners[..., :1]).all(-1)
-    faces = np.insert(corners[joined], 0, 4, axis=1)
-    mesh = pyvista.PolyData(hits.point.reshape(-1, 3)[valid], faces=faces.ravel())
+    points = seen.point.reshape(-1, 3)[valid]
+    mesh = pyvista.PolyData.from_regular_faces(points, corners[joined])
     mesh.point_data["colors"] = as_bytes(colors).reshape(-1, 3)[valid]
     mesh.point_data["pixel"] = np.flatnonzero(valid)
     return mesh
+
+
+def _squares(grid: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(H - 1, W - 1, 4) values at the corners of each square of neighbours, going around."""
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1)
 
 
 def true_surface(geometry: Geometry) -> pyvista.PolyData:
@@ -63,39 +69,42 @@ def true_surface(geometry: Geometry) -> pyvista.PolyData:
 
     corners, _ = geometry.flat_patches()
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    mesh = pyvista.PolyData(corners.reshape(-1, 3), faces=np.insert(faces, 0, 3, axis=1).ravel())
-    for center, radius, _ in zip(*geometry.spheres(), strict=True):
-        mesh = mesh.append_polydata(
-            pyvista.Sphere(radius=radius, center=center, theta_resolution=48, phi_resolution=48)
-        )
-    return mesh
+    flat = pyvista.PolyData.from_regular_faces(corners.reshape(-1, 3), faces)
+    spheres = [
+        pyvista.Sphere(radius=radius, center=center, theta_resolution=48, phi_resolution=48)
+        for center, radius, _ in zip(*geometry.spheres(), strict=True)
+    ]
+    return flat.append_polydata(*spheres) if spheres else flat
 
 
 def discs(gaussians: Gaussians) -> pyvista.PolyData:
     """Splats as filled ellipses of one sigma in their two widest axes, oriented as they are."""
     import pyvista
 
-    from attnwarp.render.reference import rotation_matrices
-
     scales = gaussians.scales.detach().double()
-    axes = rotation_matrices(gaussians.quats.detach().double())
+    axes = gaussians.rotations().detach().double()
     if scales.shape[1] == 3:
         widest = scales.argsort(dim=1, descending=True)[:, :2]
         scales = scales.gather(1, widest)
         axes = axes.gather(2, widest[:, None, :].expand(-1, 3, 2))
     spans = (axes[:, :, :2] * scales[:, None, :2]).numpy()
-    angle = 2 * np.pi * np.arange(DISC_SIDES) / DISC_SIDES
+    count = len(spans)
+    sides = disc_sides(count)
+    angle = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    points = gaussians.world_means()[:, None] + np.swapaxes(spans @ circle, 1, 2)
-    count = len(points)
-    faces = np.arange(count * DISC_SIDES).reshape(count, DISC_SIDES)
-    mesh = pyvista.PolyData(
-        points.reshape(-1, 3), faces=np.insert(faces, 0, DISC_SIDES, axis=1).ravel()
-    )
+    offsets = np.swapaxes(spans @ circle, 1, 2)
+    points = gaussians.world_means()[:, None] + offsets
+    faces = np.arange(count * sides).reshape(count, sides)
+    mesh = pyvista.PolyData.from_regular_faces(points.reshape(-1, 3), faces)
     # Degree 0 of the harmonics is the colour without its dependence on the viewer.
-    flat = 0.5 + 0.28209479177387814 * gaussians.sh.detach()[:, 0].double().numpy()
+    flat = 0.5 + SH_C0 * gaussians.sh.detach()[:, 0].double().numpy()
     mesh.cell_data["colors"] = as_bytes(flat.astype(np.float32))
     return mesh
+
+
+def disc_sides(count: int) -> int:
+    """Corners of each disc among so many."""
+    return next((sides for most, sides in DISC_SIDES if count <= most), 4)
 
 
 def frustum(camera: Camera, reach: float) -> tuple[pyvista.PolyData, Array]:
@@ -122,21 +131,220 @@ def picture_plane(corners: Array) -> pyvista.PolyData:
     return plane
 
 
-def rays(pair: Pair, report: PixelReport) -> dict[str, pyvista.PolyData]:
-    """A picked pixel's ray, its way to the source, and what the source really sees."""
+def rays(pair: Pair, report: PixelReport | CellReport) -> dict[str, pyvista.PolyData]:
+    """A picked pixel's or cell's ray, its way to the source, and what the source really sees.
+
+    A cell also has its taps: what the source sees at the cells that are read.
+    """
     import pyvista
 
     if not np.isfinite(report.point).all():
         return {}
-    source, target = pair.world.source.position, pair.world.targets[pair.target].position
+    source, target = (camera.position for camera in pair.cameras)
     parts = {
         "target ray": pyvista.Line(target, report.point),
         "to the source": pyvista.Line(report.point, source),
         "point": pyvista.PolyData(report.point[None]),
     }
-    if report.blocked_by:
-        parts["blocker"] = pyvista.PolyData(report.blocker[None])
+    if isinstance(report, PixelReport):
+        if report.seen_instead is not None:
+            parts["blocker"] = pyvista.PolyData(report.seen_instead[None])
+        return parts
+    read = [tap.point for tap in report.taps if tap.weight > 0 and np.isfinite(tap.point).all()]
+    if read:
+        parts["taps"] = pyvista.PolyData(np.array(read))
+        ends = np.insert(np.array(read), 0, source, axis=0)
+        lines = np.array([[2, 0, number + 1] for number in range(len(read))])
+        parts["tap rays"] = pyvista.PolyData(ends, lines=lines.ravel())
     return parts
+
+
+def cell_outlines(
+    camera: Camera, size: tuple[int, int], cells: Sequence[tuple[int, int]], reach: float
+) -> pyvista.PolyData:
+    """The edges of feature cells (column, row) on a camera's picture plane.
+
+    Args:
+        camera: at image size.
+        size: (h, w) of the grid.
+        cells: at least one.
+        reach: depth of the picture plane.
+    """
+    import pyvista
+
+    resized = camera.resize(size[1], size[0])
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    corners = (np.array(cells, dtype=np.float64)[:, None] + square).reshape(-1, 2)
+    points = resized.unproject(corners, np.full(len(corners), reach))
+    lines = [
+        [2, 4 * cell + k, 4 * cell + (k + 1) % 4] for cell in range(len(cells)) for k in range(4)
+    ]
+    return pyvista.PolyData(points, lines=np.array(lines).ravel())
+
+
+def fly(cameras: tuple[Camera, Camera], center: Array, steps: int) -> list[tuple[Array, Array]]:
+    """(position, rotation) of cameras on an arc from one camera to another.
+
+    The distance to the centre and the direction are interpolated, and the axes turn evenly.
+
+    Args:
+        cameras: first and last.
+        center: (3,) what the arc goes around.
+        steps: number of poses, both ends among them.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    share = np.linspace(0, 1, steps)
+    offsets = np.array([camera.position - center for camera in cameras])
+    lengths = np.linalg.norm(offsets, axis=1)
+    units = offsets / np.maximum(lengths, 1e-12)[:, None]
+    angle = np.arccos(np.clip(units[0] @ units[1], -1, 1))
+    if np.sin(angle) > 1e-6:
+        near, far = np.sin((1 - share) * angle), np.sin(share * angle)
+        weights = np.stack([near, far], axis=1) / np.sin(angle)
+    else:
+        weights = np.stack([1 - share, share], axis=1)
+    radii = (1 - share) * lengths[0] + share * lengths[1]
+    positions = center + radii[:, None] * (weights @ units)
+    turns = Slerp([0, 1], Rotation.from_matrix([camera.rotation for camera in cameras]))(share)
+    return list(zip(positions, turns.as_matrix(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Something in the 3D view.
+
+    Attributes:
+        name: of the part; a part of the same name is replaced.
+        key: what it depends on; a part with the key of the one on show is not drawn again.
+        mesh: makes it.
+        color: "#rrggbb", or None for the mesh's own ``colors``.
+        picture: makes the (H, W, 3) sRGB texture, where it has one.
+        opacity: in [0, 1].
+    """
+
+    name: str
+    key: tuple[Any, ...]
+    mesh: Callable[[], pyvista.PolyData]
+    color: str | None = None
+    picture: Callable[[], Image] | None = None
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True)
+class State:
+    """What the window shows.
+
+    Attributes:
+        variant, target: names.
+        coloring: one of the pair's colorings.
+        layer: (h, w) of a feature grid; None for the image's pixels.
+        step: of the edit, "" without one.
+        splats: as discs.
+        surface: the whole true surface, translucent.
+    """
+
+    variant: str
+    target: str
+    coloring: str = "mask"
+    layer: tuple[int, int] | None = None
+    step: str = ""
+    splats: bool = False
+    surface: bool = False
+
+
+SOURCE_COLOR, TARGET_COLOR, BLOCKER_COLOR = "#1f4e9c", "#b35a00", "#e31a1c"
+PICKED_COLORS = {
+    "target ray": TARGET_COLOR,
+    "to the source": SOURCE_COLOR,
+    "point": "#000000",
+    "blocker": BLOCKER_COLOR,
+    "taps": "#1f4e9c",
+    "tap rays": "#7a9fd4",
+}
+
+
+def parts(
+    subject: Subject, pair: Pair, state: State, picked: PixelReport | CellReport | None
+) -> list[Part]:
+    """Everything in the 3D view, in the order of drawing."""
+    source, target = pair.cameras
+    reach = 0.25 * float(np.linalg.norm(source.position - subject.center))
+    result = [
+        *_camera("source", source, reach, SOURCE_COLOR, lambda: pair.images[0]),
+        *_camera(
+            "target", target, reach, TARGET_COLOR, lambda: pair.picture(state.step), state.step
+        ),
+        Part(
+            "seen",
+            (state.variant, state.target, state.coloring, state.layer, state.step),
+            lambda: seen_surface(
+                pair.seen, pair.colors(state.coloring, state.layer, state.step or None)
+            ),
+        ),
+    ]
+    if state.splats and pair.model is not None:
+        result.append(
+            Part("discs", (id(pair.model), state.step), lambda: discs(_splats(pair, state.step)))
+        )
+    if state.surface and pair.world is not None:
+        geometry = pair.world.geometry
+        result.append(
+            Part("whole surface", (), lambda: true_surface(geometry), "#c8c8c8", opacity=0.35)
+        )
+    if picked is None:
+        return result
+    key = (state.variant, state.target, picked.column, picked.row, state.layer)
+    for name, mesh in rays(pair, picked).items():
+        result.append(Part(name, key, _ready(mesh), PICKED_COLORS[name]))
+    if isinstance(picked, CellReport):
+        layer = pair.layer(picked.size).correspondence
+        grids = {
+            "cell": (target, picked.size, [(picked.column, picked.row)], TARGET_COLOR),
+            "tap cells": (
+                source,
+                (layer.source.height, layer.source.width),
+                [(tap.column, tap.row) for tap in picked.taps if tap.weight > 0],
+                SOURCE_COLOR,
+            ),
+        }
+        for name, (camera, size, cells, color) in grids.items():
+            if cells:
+                outline = cell_outlines(camera, size, cells, 0.99 * reach)
+                result.append(Part(name, key, _ready(outline), color))
+    return result
+
+
+def _ready(mesh: pyvista.PolyData) -> Callable[[], pyvista.PolyData]:
+    return lambda: mesh
+
+
+def _camera(
+    name: str,
+    camera: Camera,
+    reach: float,
+    color: str,
+    picture: Callable[[], Image],
+    step: str = "",
+) -> list[Part]:
+    edges, corners = frustum(camera, reach)
+    return [
+        Part(f"{name} frustum", (camera.name,), lambda: edges, color),
+        Part(
+            f"{name} picture",
+            (camera.name, step),
+            lambda: picture_plane(corners),
+            picture=picture,
+            opacity=0.9,
+        ),
+    ]
+
+
+def _splats(pair: Pair, step: str) -> Gaussians:
+    assert pair.model is not None
+    if pair.edit is None or step in ("", pair.edit.steps[0]):
+        return pair.model
+    return pair.edit.splats(step)
 
 
 def as_bytes(colors: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:

@@ -1,20 +1,32 @@
-"""What there is to inspect: the variants and views of a run, or of a scene under the presets."""
+"""What there is to inspect: a run, a scene, or a user's own splats and cameras."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
-from attnwarp.errors import InputError, suggest
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp import Gaussians
+from attnwarp.errors import InputError
+from attnwarp.io import read_dataset, read_ply, read_splat
+from attnwarp.io.names import file_stems
+from attnwarp.propagate.command import FIT_FOLDER
 from attnwarp.warp import PRESETS
+from attnwarp_eval.inspect.capture import Capture, Edit, is_edit, one_of, read_edit
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.study.parts import Splats, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
-from attnwarp_eval.world import splats, world
+from attnwarp_eval.world import World, splats, world
 
 SIZE = 512
-"""Image size of a scene that is inspected by its name."""
+"""Image size of a scene that is inspected by its name, and longest side of a user's pictures."""
+
+EDIT_VARIANT = "the edit's"
+"""Name of the variant with the settings that an edit's manifest names."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +38,11 @@ class Subject:
         size: of the images, in pixels.
         spp: samples a pixel of the true pictures.
         seed: of the splats.
-        variants: by name, each with its splats; None stands for the truth's own depth.
+        variants: by name, each with its splats; None stands for the truth's own depth, or for the
+            user's own splats.
         targets: names of the views.
+        capture: the user's own scene, which has no truth.
+        edit: of the user's own scene.
 
     Example:
         >>> subject = of_scene("spheres", 16)
@@ -41,6 +56,8 @@ class Subject:
     seed: int
     variants: dict[str, tuple[Variant, Splats | None]]
     targets: tuple[str, ...]
+    capture: Capture | None = field(default=None, repr=False)
+    edit: Edit | None = field(default=None, repr=False)
 
     def pair(self, variant: str, target: str) -> Pair:
         """One target view under one variant.
@@ -51,10 +68,37 @@ class Subject:
         one_of(variant, list(self.variants), "variant")
         one_of(target, list(self.targets), "view")
         chosen, model = self.variants[variant]
+        settings = chosen.settings()
+        if self.capture is not None:
+            if variant == EDIT_VARIANT and self.edit is not None:
+                settings = self.edit.settings
+            return Pair(self.capture, target, settings, self.capture.model, edit=self.edit)
         gaussians = None
         if model is not None:
             gaussians = splats(self.scene, self.size, self.seed, **model.model_dump())
-        return Pair(world(self.scene, self.size), target, chosen.settings(), gaussians, self.spp)
+        return Pair(world(self.scene, self.size), target, settings, gaussians, self.spp)
+
+    @property
+    def preferred(self) -> str:
+        """The variant to begin with: the edit's own, else "corrected", else the first."""
+        names = list(self.variants)
+        return next((name for name in (EDIT_VARIANT, "corrected") if name in names), names[0])
+
+    @cached_property
+    def views(self) -> World | Capture:
+        """The cameras and pictures."""
+        return world(self.scene, self.size) if self.capture is None else self.capture
+
+    @cached_property
+    def center(self) -> npt.NDArray[np.float64]:
+        """(3,) what the cameras look at."""
+        center = self.views.scene.center if isinstance(self.views, World) else self.views.center
+        return np.asarray(center, dtype=np.float64)
+
+    @cached_property
+    def up(self) -> npt.NDArray[np.float64]:
+        """(3,) unit vector."""
+        return self.views.up if isinstance(self.views, Capture) else np.array([0.0, 0, 1])
 
 
 def of_scene(scene: str, size: int = SIZE) -> Subject:
@@ -68,11 +112,12 @@ def of_scene(scene: str, size: int = SIZE) -> Subject:
         ['corrected', 'paper', 'released']
     """
     model = Splats(position_noise=0.1, normal_noise=3.0)
-    variants: dict[str, tuple[Variant, Splats | None]] = {
-        name: (Variant(preset=name), model) for name in sorted(PRESETS)
-    }
     targets = tuple(world(scene, size).targets)
-    return Subject(scene, size, 8, 0, variants, targets)
+    return Subject(scene, size, 8, 0, _presets(model), targets)
+
+
+def _presets(model: Splats | None) -> dict[str, tuple[Variant, Splats | None]]:
+    return {name: (Variant(preset=name), model) for name in sorted(PRESETS)}
 
 
 def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> Subject:
@@ -112,18 +157,57 @@ def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> S
     return Subject(scene, size, study.spp, study.seeds[0], variants, targets)
 
 
-def one_of(value: str, choices: list[str], name: str) -> None:
-    """Refuse what is no choice, with the nearest one that is.
+def of_capture(
+    path: Path,
+    data: Path,
+    *,
+    ply: Path | None = None,
+    images: Path | None = None,
+    source: str | None = None,
+    size: int = SIZE,
+) -> Subject:
+    """A user's own scene: splats, or the folder of an edit, and the cameras with their pictures.
+
+    Args:
+        path: a PLY or .splat file, or a folder that ``attnwarp edit`` made.
+        data: transforms.json, its folder, or a COLMAP folder.
+        ply: the splats before the edit, where the folder does not have them.
+        images: folder of the pictures of a COLMAP model.
+        source: name of the source view; that of the edit, else the first.
+        size: longest side of the pictures.
 
     Raises:
-        InputError: ``value`` is none of ``choices``.
+        InputError: the folder holds no edit, the splats are missing, or there is no such view.
 
     Example:
-        >>> one_of("papper", ["corrected", "paper"], "variant")
-        Traceback (most recent call last):
-        attnwarp.errors.InputError: variant: got 'papper'; did you mean 'paper'?; expected ...
+        >>> subject = of_capture(Path("scene.ply"), Path("my_capture"), size=32)
+        >>> subject.targets[:2], sorted(subject.variants)
+        (('1', '2'), ['corrected', 'paper', 'released'])
     """
-    if value not in choices:
-        raise InputError(
-            f"{name}: got {value!r}{suggest(value, choices)}; expected one of {', '.join(choices)}"
-        )
+    # A camera without a picture is shown with a render.
+    dataset = read_dataset(data, images=images, missing_images="none", points=False)
+    variants = _presets(None)
+    edit = None
+    if path.is_dir():
+        if not is_edit(path):
+            raise InputError(f"{path}: expected splats (.ply, .splat) or a folder of attnwarp edit")
+        edit = read_edit(path, file_stems(dataset.cameras))
+        source = source or edit.source
+        variants = {EDIT_VARIANT: (Variant(preset="corrected"), None), **variants}
+        if ply is None and not (path / FIT_FOLDER / "splats.ply").is_file():
+            raise InputError(
+                f"{path}: was made from splats of your own; name them with --ply FILE.ply"
+            )
+        ply = ply or path / FIT_FOLDER / "splats.ply"
+    elif ply is not None:
+        raise InputError(f"--ply: {path} is no folder of an edit; leave --ply out")
+    capture = Capture(_splats(path if ply is None else ply), dataset, source=source, size=size)
+    targets = tuple(capture.targets)
+    if edit is not None:
+        # Views that were edited come first.
+        targets = tuple(sorted(targets, key=lambda name: name not in edit.views))
+    return Subject(str(path), size, 0, 0, variants, targets, capture, edit)
+
+
+def _splats(path: Path) -> Gaussians:
+    return read_splat(path) if path.suffix.lower() == ".splat" else read_ply(path)

@@ -1,53 +1,64 @@
-"""The window: a 3D view with picture insets, keys, a slider, and picking of pixels."""
+"""The window: a 3D view with picture insets, keys, sliders, and picking of pixels and cells."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from attnwarp.errors import InputError
-from attnwarp_eval.inspect import scene
-from attnwarp_eval.inspect.pair import COLORINGS, Pair
+from attnwarp_eval.inspect import draw, scene
+from attnwarp_eval.inspect.cell import CellReport, cell_of, cell_report
+from attnwarp_eval.inspect.gl import require_gl
+from attnwarp_eval.inspect.pair import Image, Legend, Pair, Size
 from attnwarp_eval.inspect.pixel import PixelReport, report
-
-if TYPE_CHECKING:
-    import pyvista
+from attnwarp_eval.inspect.scene import State
+from attnwarp_eval.inspect.subject import Subject
 
 KEYS = {
     "n / p": "next, previous target view",
     "v": "next variant",
-    "c": "next colouring of the surface",
+    "c": "next colouring",
+    "l": "next feature grid, then pixels",
+    "e": "next step of the edit",
     "d": "splats as discs, on and off",
     "g": "the whole true surface, on and off",
     "1 / 2": "look through the source, the target",
     "0": "look from outside",
-    "click": "a pixel: its rays and its numbers",
+    "f": "fly from the source to the target",
+    "click": "a pixel or cell: rays and numbers",
     "?": "these keys, on and off",
     "q": "close",
 }
 
-INSETS = ("source", "target", "source, warped", "mask against truth")
-MAIN = 4
-"""Index of the 3D view; the insets come before it."""
-
 SIZE = (1500, 900)
+
+FLIGHT = 40
+"""Pictures of a flight from the source to the target."""
+
+MOVING = 20_000
+"""More splats than this are points while the view moves, so that it follows the mouse."""
+
+PIXELS = "pixels"
+"""Name of the layer that is no feature grid."""
 
 
 class Window:
     """A warp in 3D.
 
     Args:
-        make_pair: the pair of a (variant, target); called on first use of each.
-        variants, targets: their names, in order.
-        variant, target: those to begin with; the first ones if left out.
-        coloring: one of :data:`COLORINGS`.
-        splats: whether splats are drawn at first.
+        subject: what can be shown.
+        state: what is shown at first.
         off_screen: draw without a display.
         size: of the window, in pixels.
+
+    Attributes:
+        state: what is shown.
+        picked: the report of the picked pixel or cell, or None.
+        changed: called after each change of what is shown.
 
     Raises:
         InputError: no OpenGL can be had.
@@ -55,165 +66,239 @@ class Window:
 
     def __init__(
         self,
-        make_pair: Callable[[str, str], Pair],
-        variants: Sequence[str],
-        targets: Sequence[str],
+        subject: Subject,
+        state: State,
         *,
-        variant: str | None = None,
-        target: str | None = None,
-        coloring: str = "mask",
-        splats: bool = False,
         off_screen: bool = False,
         size: tuple[int, int] = SIZE,
     ) -> None:
-        self._make_pair = make_pair
+        require_gl(display=not off_screen)
+        self.subject = subject
+        self.variants, self.targets = list(subject.variants), list(subject.targets)
+        self.steps = [""] if subject.edit is None else list(subject.edit.steps)
+        self.state = state
+        self.picked: PixelReport | CellReport | None = None
+        self.help_shown = False
+        self.changed: Callable[[], object] = lambda: None
         self._pairs: dict[tuple[str, str], Pair] = {}
-        self.variants, self.targets = list(variants), list(targets)
-        self.variant, self.target = variant or self.variants[0], target or self.targets[0]
-        self.coloring = coloring
-        self.picked: PixelReport | None = None
-        self.splats_shown, self.surface_shown, self.help_shown = splats, False, False
+        self._drawn: dict[str, tuple[Any, ...]] = {}
+        self._insets: tuple[Any, ...] = ()
+        self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
-        self.plotter: Any = _plotter(off_screen, size)
+        self.plotter: Any = self._plotter(off_screen, size)
         self._draw()
         self.look_from_outside()
 
     @property
     def pair(self) -> Pair:
         """The pair of views on show."""
-        key = self.variant, self.target
+        key = self.state.variant, self.state.target
         if key not in self._pairs:
-            self._pairs[key] = self._make_pair(*key)
+            self._pairs[key] = self.subject.pair(*key)
         return self._pairs[key]
 
-    def show_target(self, name: str) -> None:
-        """Go to a target view."""
-        self.target, self.picked = name, None
+    @property
+    def layers(self) -> list[Size | None]:
+        """The pixels (None) and the feature grids of the pair on show."""
+        return [None, *self.pair.layers]
+
+    def show(self, **changes: Any) -> None:
+        """Change some of the :class:`~attnwarp_eval.inspect.scene.State`.
+
+        A pixel that was picked is picked again under another variant, and dropped in another view.
+        """
+        before = self.state
+        self.state = replace(self.state, **changes)
+        if self.state.layer not in self.layers:
+            self.state = replace(self.state, layer=None)
+        if self.picked is not None:
+            if (self.state.target, self.state.layer) != (before.target, before.layer):
+                self.picked = None
+            elif self.state.variant != before.variant:
+                self.picked = self._report(self.picked.column, self.picked.row)
         self._draw()
 
-    def show_variant(self, name: str) -> None:
-        """Go to a variant."""
-        self.variant = name
+    def pick(self, column: int, row: int) -> PixelReport | CellReport:
+        """Show a target pixel's rays and numbers; those of its cell while a grid is shown."""
+        if self.state.layer is not None:
+            column, row = cell_of(self.pair, self.state.layer, column, row)
+        self.picked = self._report(column, row)
         self._draw()
-
-    def show_coloring(self, name: str) -> None:
-        """Colour the surface by one of :data:`COLORINGS`."""
-        self.coloring = name
-        with self._one_render():
-            self._draw_surface()
-
-    def pick(self, column: int, row: int) -> PixelReport:
-        """Show a target pixel's rays and numbers."""
-        self.picked = report(self.pair, column, row)
-        with self._one_render():
-            self._draw_picked()
         return self.picked
+
+    def _report(self, column: int, row: int) -> PixelReport | CellReport:
+        if self.state.layer is None:
+            return report(self.pair, column, row)
+        return cell_report(self.pair, self.state.layer, column, row)
+
+    # --- the camera
 
     def look_from_outside(self) -> None:
         """A view of the scene and of both cameras."""
-        world, target = self.pair.world, self.pair.world.targets[self.target]
-        center = np.asarray(world.scene.center, dtype=np.float64)
-        eyes = np.stack([world.source.position, target.position]) - center
-        away = (
-            eyes.mean(0)
-            if np.linalg.norm(eyes.mean(0)) > 0.3 * np.linalg.norm(eyes[0])
-            else (np.cross(eyes[0], [0, 0, 1.0]))
-        )
-        reach = np.linalg.norm(eyes, axis=1).max()
-        direction = away / np.linalg.norm(away) + [0, 0, 0.5]
-        self.plotter.subplot(MAIN)
-        self.plotter.camera_position = [
-            center + 2.1 * reach * direction / np.linalg.norm(direction), center, (0, 0, 1),
-        ]  # fmt: skip
+        self._main()
+        self.plotter.camera.view_angle = 30
+        self.plotter.camera_position = draw.outside(self.subject, self.pair.cameras)
+        self.plotter.reset_camera_clipping_range()
+        self.plotter.render()
 
     def look_through(self, name: str) -> None:
-        """Take the place of the source ("source") or of a target."""
-        camera = self.pair.world.camera(name)
-        self.plotter.subplot(MAIN)
-        forward, down = camera.rotation[2], camera.rotation[1]
-        self.plotter.camera_position = [camera.position, camera.position + forward, -down]
+        """Take the place of the source or of a target."""
+        camera = self.subject.views.camera(name)
+        self._main()
         view = 2 * np.degrees(np.arctan(camera.height / 2 / camera.K[1, 1]))
         self.plotter.camera.view_angle = view
+        self.look(camera.position, camera.rotation)
+
+    def fly(self, show: Callable[[], object] = lambda: None, steps: int = FLIGHT) -> None:
+        """Move the view from the source camera to the target.
+
+        Args:
+            show: called after each picture.
+            steps: number of pictures.
+        """
+        self.look_through(self.pair.cameras[0].name)
+        for position, rotation in scene.fly(self.pair.cameras, self.subject.center, steps):
+            self.look(position, rotation)
+            show()
+
+    def look(self, position: Any, rotation: Any) -> None:
+        """Take the place of a camera.
+
+        Args:
+            position: (3,) world.
+            rotation: (3, 3) its axes in rows: right, down, forward.
+        """
+        forward, down = rotation[2], rotation[1]
+        distance = max(float(np.linalg.norm(self.subject.center - position)), 1e-6)
+        self.plotter.camera_position = [position, position + distance * forward, -down]
+        self.plotter.reset_camera_clipping_range()
+        self.plotter.render()
+
+    # --- out
 
     def screenshot(self, path: Path) -> None:
-        """Write the window as a picture."""
-        self.plotter.screenshot(str(path))
+        """Write the window as a PNG."""
+        from attnwarp.io.file import write_atomically
+        from attnwarp.io.images import encode_png
 
-    def export(self, path: Path) -> None:
-        """Write what is on show as .html (to look at), .gltf or .vtp (the coloured surface).
-
-        Raises:
-            InputError: another ending.
-        """
-        if path.suffix == ".vtp":
-            scene.seen_surface(self.pair.truth.hits, self.pair.colors(self.coloring)).save(path)
-        elif path.suffix == ".gltf":
-            self._alone().export_gltf(str(path))
-        elif path.suffix == ".html":
-            try:
-                self._alone().export_html(str(path))
-            except ImportError:
-                raise InputError(
-                    f"{path}: a page needs trame; install it with: pip install 'attnwarp[inspect]'"
-                ) from None
-        else:
-            raise InputError(
-                f"{path}: got {path.suffix or 'no ending'}, expected .html, .gltf or .vtp"
-            )
+        data = encode_png(np.ascontiguousarray(self.plotter.screenshot(return_img=True)[..., :3]))
+        write_atomically(path, lambda stream: stream.write(data))
 
     def open(self) -> None:
         """Show the window until it is closed."""
-        plotter = self.plotter
-        plotter.subplot(MAIN)
-        for key, action in self._actions().items():
-            plotter.add_key_event(key, action)
-        if len(self.targets) > 1:
-            plotter.add_slider_widget(
-                self._slide,
-                (0, len(self.targets) - 1),
-                value=self.targets.index(self.target),
-                title="target view",
-                fmt="%.0f",
-                pointa=(0.62, 0.08),
-                pointb=(0.95, 0.08),
-            )
-        plotter.enable_point_picking(
-            callback=self._picked_point, left_clicking=True, show_message=False, use_picker=True
-        )
-        plotter.show()
+        self._main()
+        for key, action in self.actions().items():
+            self.plotter.add_key_event(key, action)
+        self._add_sliders()
+        self.enable_picking()
+        self.plotter.show()
 
-    def _actions(self) -> dict[str, Callable[[], None]]:
-        def step(names: Sequence[str], current: str, by: int) -> str:
-            return names[(names.index(current) + by) % len(names)]
+    def close(self) -> None:
+        """Free what the window holds of the graphics."""
+        self.plotter.close()
 
+    # --- keys, sliders, clicks
+
+    def actions(self) -> dict[str, Callable[[], None]]:
+        """What each key does, by VTK's name of the key."""
+        state = lambda: self.state  # noqa: E731
         return {
-            "n": lambda: self.show_target(step(self.targets, self.target, 1)),
-            "p": lambda: self.show_target(step(self.targets, self.target, -1)),
-            "v": lambda: self.show_variant(step(self.variants, self.variant, 1)),
-            "c": lambda: self.show_coloring(step(COLORINGS, self.coloring, 1)),
-            "d": lambda: self._toggle("splats_shown"),
-            "g": lambda: self._toggle("surface_shown"),
-            "question": lambda: self._toggle("help_shown"),
-            "1": lambda: self.look_through(self.pair.world.source.name),
-            "2": lambda: self.look_through(self.target),
+            "n": lambda: self.show(target=_next(self.targets, state().target)),
+            "p": lambda: self.show(target=_next(self.targets, state().target, -1)),
+            "v": lambda: self.show(variant=_next(self.variants, state().variant)),
+            "c": lambda: self.show(coloring=_next(self.pair.colorings, state().coloring)),
+            "l": lambda: self.show(layer=_next(self.layers, state().layer)),
+            "e": lambda: self.show(step=_next(self.steps, state().step)),
+            "d": lambda: self.show(splats=not state().splats),
+            "g": lambda: self.show(surface=not state().surface),
+            "question": self.toggle_help,
+            "1": lambda: self.look_through(self.pair.cameras[0].name),
+            "2": lambda: self.look_through(state().target),
             "0": self.look_from_outside,
+            "f": self.fly,
         }
 
-    def _toggle(self, name: str) -> None:
-        setattr(self, name, not getattr(self, name))
+    def toggle_help(self) -> None:
+        """Show or hide the keys."""
+        self.help_shown = not self.help_shown
         self._draw()
 
-    def _slide(self, value: float) -> None:
-        name = self.targets[round(value)]
-        if name != self.target:
-            self.show_target(name)
+    def enable_picking(self) -> None:
+        """Let a click pick the pixel under it."""
+        self._main()
+        self.plotter.enable_point_picking(
+            callback=self._picked_point,
+            left_clicking=True,
+            show_message=False,
+            show_point=False,
+            use_picker=True,
+            pickable_window=False,
+        )
 
     def _picked_point(self, point: Any, picker: Any) -> None:
         mesh, index = picker.GetDataSet(), picker.GetPointId()
         if mesh is None or index < 0 or not mesh.GetPointData().HasArray("pixel"):
             return
         pixel = int(mesh.GetPointData().GetArray("pixel").GetValue(index))
-        self.pick(pixel % self.pair.truth.label.shape[1], pixel // self.pair.truth.label.shape[1])
+        row, column = divmod(pixel, self.pair.size[1])
+        self.pick(column, row)
+
+    def _add_sliders(self) -> None:
+        choices = {
+            "view": (self.targets, lambda: self.state.target, lambda v: self.show(target=v)),
+            "variant": (self.variants, lambda: self.state.variant, lambda v: self.show(variant=v)),
+            "layer": (self.layers, lambda: self.state.layer, lambda v: self.show(layer=v)),
+            "step": (self.steps, lambda: self.state.step, lambda v: self.show(step=v)),
+        }
+        choices = {name: choice for name, choice in choices.items() if len(choice[0]) > 1}
+        width = 0.66 / len(choices) if choices else 0.0
+        for number, (name, (values, current, change)) in enumerate(choices.items()):
+            left = 0.3 + number * width
+            slider = self.plotter.add_slider_widget(
+                _changing(values, current, change),
+                (0, len(values) - 1),
+                value=list(values).index(current()),
+                title=name,
+                fmt="",
+                pointa=(left, 0.07),
+                pointb=(left + 0.85 * width, 0.07),
+                title_height=0.018,
+                slider_width=0.03,
+                tube_width=0.006,
+                interaction_event="end",
+            )
+            self._sliders[name] = (
+                slider,
+                _index(values, current),
+                _title(name, current),
+            )
+        self._move_sliders()
+
+    def _move_sliders(self) -> None:
+        for slider, index, title in self._sliders.values():
+            slider.GetRepresentation().SetValue(index())
+            slider.GetRepresentation().SetTitleText(plain(title()))
+
+    # --- drawing
+
+    def _plotter(self, off_screen: bool, size: tuple[int, int]) -> Any:
+        import pyvista
+
+        self._inset_columns = 1 if self.subject.edit is None else 2
+        columns = self._inset_columns
+        plotter = pyvista.Plotter(
+            shape=(4, columns + 1),
+            groups=[(slice(None), columns)],
+            col_weights=[*[0.2 / columns if columns == 1 else 0.13] * columns, 0.8],
+            off_screen=off_screen,
+            window_size=list(size),
+        )
+        plotter.set_background("white", all_renderers=True)
+        return plotter
+
+    def _main(self) -> None:
+        """Turn to the 3D view; the insets are the other parts of the window."""
+        self.plotter.subplot(0, self._inset_columns)
 
     @contextmanager
     def _one_render(self) -> Iterator[None]:
@@ -226,147 +311,149 @@ class Window:
         self.plotter.render()
 
     def _draw(self) -> None:
+        if self.state.coloring not in self.pair.colorings:
+            self.state = replace(self.state, coloring="mask")
         with self._one_render():
             self._draw_insets()
-            self.plotter.subplot(MAIN)
-            self._draw_cameras()
-            self._draw_surface()
-            self._optional(
-                "discs", self.splats_shown and self.pair.model is not None, self._add_discs
-            )
-            self._optional("whole surface", self.surface_shown, self._add_whole_surface)
-            self._draw_help()
-            self._draw_picked()
+            self._main()
+            self._draw_parts()
+            self._draw_texts()
+            self._move_sliders()
+            self.plotter.reset_camera_clipping_range()
+        self.changed()
 
     def _draw_insets(self) -> None:
-        plotter = self.plotter
-        for index, (title, image) in enumerate(self.pair.insets().items()):
-            plotter.subplot(index)
-            height, width = image.shape[:2]
-            plane = scene.picture_plane(
-                np.array([[0, height, 0], [width, height, 0], [width, 0, 0], [0, 0, 0.0]])
-            )
-            plotter.add_mesh(plane, texture=_texture(image), lighting=False, name="picture")
-            plotter.add_text(title, font_size=8, name="title", color="black")
-            plotter.view_xy()
-            plotter.camera.parallel_projection = True
-            plotter.camera.parallel_scale = height / 1.8
-
-    def _draw_help(self) -> None:
-        help_text = "\n".join(f"{key:>6}  {what}" for key, what in KEYS.items())
-        self.plotter.add_text(
-            help_text if self.help_shown else "? for keys",
-            position="lower_left",
-            font_size=8,
-            name="help",
-            color="black",
-            font="courier",
-        )
-
-    def _draw_cameras(self) -> None:
-        world = self.pair.world
-        reach = 0.25 * float(np.linalg.norm(world.source.position - world.scene.center))
-        cameras = {"source": world.source, "target": world.targets[self.target]}
-        colors = {"source": "#1f4e9c", "target": "#b35a00"}
-        for (name, camera), image in zip(cameras.items(), self.pair.images, strict=True):
-            edges, corners = scene.frustum(camera, reach)
-            self.plotter.add_mesh(edges, color=colors[name], line_width=3, name=f"{name} frustum")
-            self.plotter.add_mesh(
-                scene.picture_plane(corners),
-                texture=_texture(image),
-                lighting=False,
-                opacity=0.9,
-                name=f"{name} picture",
-            )
-
-    def _draw_surface(self) -> None:
-        self.plotter.subplot(MAIN)
-        mesh = scene.seen_surface(self.pair.truth.hits, self.pair.colors(self.coloring))
-        self.plotter.add_mesh(mesh, scalars="colors", rgb=True, lighting=False, name="seen")
-        self.plotter.add_text(
-            f"{self.pair.world.scene.name}, {self.variant}, source -> {self.target};"
-            f" coloured by {self.coloring}",
-            font_size=10,
-            name="title",
-            color="black",
-        )
-
-    def _add_discs(self) -> None:
-        assert self.pair.model is not None
-        mesh = scene.discs(self.pair.model)
-        self.plotter.add_mesh(mesh, scalars="colors", rgb=True, name="discs")
-
-    def _add_whole_surface(self) -> None:
-        mesh = scene.true_surface(self.pair.world.geometry)
-        self.plotter.add_mesh(mesh, color="#c8c8c8", opacity=0.35, name="whole surface")
-
-    def _optional(self, name: str, wanted: bool, add: Callable[[], None]) -> None:
-        if wanted:
-            add()
-        else:
-            self.plotter.remove_actor(name)
-
-    def _draw_picked(self) -> None:
-        self.plotter.subplot(MAIN)
-        names = ("target ray", "to the source", "point", "blocker")
-        for name in names:
-            self.plotter.remove_actor(name)
-        self.plotter.remove_actor("numbers")
-        if self.picked is None:
+        key = (self.state.variant, self.state.target, self.state.layer, self.state.step)
+        if key == self._insets:
             return
-        colors = dict(zip(names, ("#b35a00", "#1f4e9c", "#000000", "#e31a1c"), strict=True))
-        for name, mesh in scene.rays(self.pair, self.picked).items():
-            self.plotter.add_mesh(
-                mesh,
-                color=colors[name],
-                line_width=3,
-                point_size=14,
-                render_points_as_spheres=True,
-                name=name,
-            )
-        self.plotter.add_text(
-            "\n".join(self.picked.lines()),
-            position="upper_right",
-            font_size=7,
-            name="numbers",
-            color="black",
-            font="courier",
-        )
+        self._insets = key
+        insets = self.pair.insets(self.state.layer, self.state.step or None)
+        for index, (title, image) in enumerate(insets.items()):
+            self.plotter.subplot(*divmod(index, self._inset_columns))
+            self._draw_inset(title, image)
 
-    def _alone(self) -> Any:
-        """The 3D view without insets: what exporters take."""
+    def _draw_inset(self, title: str, image: Image) -> None:
+        height, width = image.shape[:2]
+        plane = scene.picture_plane(
+            np.array([[0, height, 0], [width, height, 0], [width, 0, 0], [0, 0, 0.0]])
+        )
+        self.plotter.add_mesh(
+            plane, texture=draw.texture(image), lighting=False, name="picture", pickable=False
+        )
+        self.plotter.add_text(plain(title), font_size=7, name="title", color="black")
+        self.plotter.view_xy()
+        self.plotter.camera.parallel_projection = True
+        self.plotter.camera.parallel_scale = max(height, 1.1 * width) / 1.75
+
+    def _draw_parts(self) -> None:
+        parts = scene.parts(self.subject, self.pair, self.state, self.picked)
+        for name in set(self._drawn) - {part.name for part in parts}:
+            self.plotter.remove_actor(name)
+            del self._drawn[name]
+        for part in parts:
+            if self._drawn.get(part.name) != part.key:
+                self._drawn[part.name] = part.key
+                self._add(part)
+
+    def _add(self, part: scene.Part) -> None:
+        actor = draw.add_part(self.plotter, part)
+        if part.name == "discs":
+            self._draw_lighter_while_moving(actor)
+
+    def _draw_lighter_while_moving(self, actor: Any) -> None:
+        """Let many discs be points while the view moves."""
         import pyvista
 
-        plotter: Any = pyvista.Plotter(off_screen=True)
-        pair = self.pair
-        mesh = scene.seen_surface(pair.truth.hits, pair.colors(self.coloring))
-        plotter.add_mesh(mesh, scalars="colors", rgb=True, lighting=False)
-        for camera in (pair.world.source, pair.world.targets[self.target]):
-            reach = 0.25 * float(
-                np.linalg.norm(pair.world.source.position - pair.world.scene.center)
-            )
-            plotter.add_mesh(scene.frustum(camera, reach)[0], line_width=3)
-        return plotter
+        mesh = actor.mapper.dataset
+        if mesh.n_cells <= MOVING:
+            return
+        step = mesh.n_points // mesh.n_cells
+        points = pyvista.PolyData(np.asarray(mesh.points)[::step])
+        points.point_data["colors"] = mesh.cell_data["colors"]
+        cloud = self.plotter.add_mesh(
+            points, scalars="colors", rgb=True, lighting=False, point_size=3, pickable=False,
+            reset_camera=False, name="moving discs",
+        )  # fmt: skip
+        cloud.visibility = False
 
+        def swap(moving: bool) -> None:
+            # Hidden discs are no longer among the window's parts.
+            on_show = "discs" in self._drawn
+            actor.visibility = on_show and not moving
+            cloud.visibility = on_show and moving
 
-def _plotter(off_screen: bool, size: tuple[int, int]) -> Any:
-    import os
+        style = self.plotter.iren.style
+        style.AddObserver("StartInteractionEvent", lambda *_: swap(True))
+        style.AddObserver("EndInteractionEvent", lambda *_: swap(False))
 
-    import pyvista
-
-    if not off_screen and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError(
-            "inspect: this machine has no display; draw a picture instead with --screenshot FILE,"
-            " or write a page with --export FILE.html"
+    def _draw_texts(self) -> None:
+        pair, state = self.pair, self.state
+        layer = "" if state.layer is None else f", grid {state.layer[1]} x {state.layer[0]}"
+        step = f", {state.step}" if state.step else ""
+        title = (
+            f"{Path(self.subject.scene).name}, {state.variant}, {pair.cameras[0].name} ->"
+            f" {state.target}{layer}{step}; colours: {state.coloring}"
         )
-    plotter: Any = pyvista.Plotter(
-        shape="4|1", off_screen=off_screen, window_size=list(size), splitting_position=0.2
-    )
-    plotter.set_background("white")
-    return plotter
+        numbers = [] if self.picked is None else ["", *self.picked.lines()]
+        self._text("title", "\n".join([title, *numbers]), "upper_left")
+        keys = "\n".join(f"{key:>6}  {what}" for key, what in KEYS.items())
+        self._text("help", keys if self.help_shown else "? for keys", "lower_left")
+        self._draw_legend(pair.legend(state.coloring))
+
+    def _draw_legend(self, legend: Legend) -> None:
+        # A legend that is not there cannot be removed.
+        if self.plotter.renderer.legend is not None:
+            self.plotter.remove_legend()
+        if not legend:
+            return
+        labels = [[plain(text), color] for text, color in legend]
+        actor = self.plotter.add_legend(
+            labels, bcolor="white", background_opacity=0.8, face="rectangle"
+        )
+        longest = max(len(text) for text, _ in labels)
+        width, height = 0.011 * longest + 0.05, 0.026 * len(labels)
+        actor.SetPosition(0.99 - width, 0.99 - height)
+        actor.SetPosition2(width, height)
+
+    def _text(self, name: str, text: str, position: str) -> None:
+        actor = self.plotter.add_text(
+            plain(text, 4000), position=position, font_size=8, name=name, color="black",
+            font="courier",
+        )  # fmt: skip
+        actor.prop.background_color = "white"
+        actor.prop.background_opacity = 0.7 if text else 0.0
 
 
-def _texture(image: np.ndarray) -> pyvista.Texture:
-    import pyvista
+def plain(text: str, most: int = 120) -> str:
+    """Text that VTK draws as it stands: no control characters, no formulas, and not endless."""
+    shown = "".join(c if c == "\n" or c.isprintable() else "?" for c in text)
+    shown = shown if len(shown) <= most else f"{shown[: most - 3]}..."
+    return shown.replace("$", "\\$")
 
-    return pyvista.Texture(np.ascontiguousarray(scene.as_bytes(image)))
+
+def _next(names: Sequence[Any], current: Any, by: int = 1) -> Any:
+    return names[(names.index(current) + by) % len(names)]
+
+
+def _changing(
+    values: Sequence[Any], current: Callable[[], Any], change: Callable[[Any], None]
+) -> Callable[[float], None]:
+    def slide(value: float) -> None:
+        chosen = values[round(value)]
+        if chosen != current():
+            change(chosen)
+
+    return slide
+
+
+def _index(values: Sequence[Any], current: Callable[[], Any]) -> Callable[[], int]:
+    return lambda: list(values).index(current())
+
+
+def _title(name: str, current: Callable[[], Any]) -> Callable[[], str]:
+    return lambda: f"{name}: {layer_name(current()) if name == 'layer' else current()}"
+
+
+def layer_name(layer: Size | None) -> str:
+    """ "pixels", or the size of a feature grid in words."""
+    return PIXELS if layer is None else f"{layer[1]} x {layer[0]}"

@@ -1,0 +1,222 @@
+"""A user's own scene: splats, cameras with pictures, and perhaps the folder of an edit of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from attnwarp import Camera, Gaussians
+from attnwarp.errors import InputError, suggest
+from attnwarp.fit import load_views
+from attnwarp.io import Dataset, read_image, read_ply
+from attnwarp.io.names import file_stems
+from attnwarp.propagate.folder import MANIFEST
+from attnwarp.render import render
+from attnwarp.warp import WarpSettings
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.float32]
+
+LARGEST_MANIFEST = 16 * 2**20
+"""Bytes; the manifest of an edit of 10,000 views has less than 1 MiB."""
+
+BEFORE, EDITED = "before", "edited"
+"""First and last step of an edit."""
+
+
+class Capture:
+    """Cameras with pictures, and the splats of the scene.
+
+    Args:
+        model: the splats, before any edit.
+        dataset: the cameras and the files of their pictures.
+        source: name of the source view; the first if None.
+        size: longest side of the pictures in px; larger ones are averaged down.
+
+    Attributes:
+        source: the source camera.
+        targets: all other cameras by the name of their file, without suffix.
+        center: (3,) where the optical axes pass closest to each other.
+        up: (3,) mean of the cameras' upward axes.
+
+    Raises:
+        InputError: fewer than two cameras, or no source of that name.
+    """
+
+    def __init__(
+        self, model: Gaussians, dataset: Dataset, *, source: str | None = None, size: int = 512
+    ) -> None:
+        if len(dataset.cameras) < 2:
+            raise InputError(
+                f"DATA: got {len(dataset.cameras)} camera, expected at least a source and a target"
+            )
+        self.model, self.dataset, self.size = model, dataset, size
+        names = file_stems(dataset.cameras)
+        cameras = [
+            replace(_resized(camera, size), name=name)
+            for camera, name in zip(dataset.cameras, names, strict=True)
+        ]
+        source = names[0] if source is None else source
+        one_of(source, names, "source")
+        self.names = names
+        self.source = cameras[names.index(source)]
+        self.targets = {camera.name: camera for camera in cameras if camera.name != source}
+        self.center = _convergence(cameras)
+        up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+        self.up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0, 1])
+        self.image: Callable[[str], Image] = cache(self._image)
+
+    def camera(self, name: str) -> Camera:
+        """The source or a target by its name."""
+        return self.source if name == self.source.name else self.targets[name]
+
+    def _image(self, name: str) -> Image:
+        """(H, W, 3) sRGB of a view in [0, 1]: its picture, or a render where it has none."""
+        index, data = self.names.index(name), self.dataset
+        if data.image_paths[index] is None:
+            return rendered(self.model, self.camera(name))
+        one = Dataset([data.cameras[index]], [data.image_paths[index]], lenses=[data.lenses[index]])
+        views = load_views(one, max_size=self.size)
+        return views.target(0, torch.zeros(3)).numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Edit:
+    """The files of an edit of a scene, made by ``attnwarp edit``.
+
+    Attributes:
+        path: its folder.
+        instruction: in words.
+        source: name of the source view.
+        views: names of the edited target views.
+        settings: of its warp.
+        steps: "before", the stages, and "edited" once it is done.
+    """
+
+    path: Path
+    instruction: str
+    source: str
+    views: tuple[str, ...]
+    settings: WarpSettings
+    steps: tuple[str, ...]
+
+    def splats(self, step: str) -> Gaussians:
+        """The splats after a step other than "before"."""
+        number = step.removeprefix("stage ")
+        return read_ply(self.path / ("edited.ply" if step == EDITED else f"stages/{number}.ply"))
+
+    def picture(self, name: str) -> Image | None:
+        """(h, w, 3) sRGB of a file of the folder; None where the edit has not made it."""
+        path = self.path / name
+        if not path.is_file():
+            return None
+        pixels = read_image(path)
+        return (pixels[..., :3] / np.iinfo(pixels.dtype).max).astype(np.float32)
+
+    def edited(self, view: str) -> Image | None:
+        """(h, w, 3) the edited picture of a view."""
+        return self.picture("source.png" if view == self.source else f"views/{view}.png")
+
+
+def is_edit(path: Path) -> bool:
+    """Whether a folder holds an edit."""
+    return (path / MANIFEST).is_file()
+
+
+def read_edit(path: Path, names: Sequence[str]) -> Edit:
+    """The edit in a folder.
+
+    Args:
+        path: of the folder.
+        names: of the data set's views, without suffix.
+
+    Raises:
+        InputError: the manifest is damaged, or the edit is of another data set.
+    """
+    file = path / MANIFEST
+    if file.stat().st_size > LARGEST_MANIFEST:
+        raise InputError(f"{file}: {file.stat().st_size} bytes; expected an edit's manifest")
+    try:
+        manifest: Any = json.loads(file.read_text(encoding="utf-8"))
+        source, instruction = manifest["source"], manifest["instruction"]
+        views = [name for stage in manifest["stages"] for name in stage]
+        settings = WarpSettings.from_dict(manifest["settings"]["warp"])
+        if not all(isinstance(text, str) for text in (source, instruction, *views)):
+            raise TypeError("a name that is no text")
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise InputError(
+            f"{file}: not the manifest of an edit ({reason}); make it with attnwarp edit"
+        ) from None
+    # The names become file names below the folder, so none but those of the data set are taken.
+    missing = sorted({source, *views} - set(names))
+    if missing:
+        raise InputError(
+            f"{path}: is an edit of a view {missing[0]!r}, which DATA has not; expected the data"
+            " set that was edited"
+        )
+    stages = [
+        f"stage {number + 1}"
+        for number in range(len(manifest["stages"]))
+        if (path / f"stages/{number + 1}.ply").is_file()
+    ]
+    if (path / "edited.ply").is_file():
+        # The last stage's splats are the edited ones.
+        stages = [*stages[: len(manifest["stages"]) - 1], EDITED]
+    return Edit(path, instruction, source, tuple(views), settings, (BEFORE, *stages))
+
+
+def rendered(model: Gaussians, camera: Camera) -> Image:
+    """(H, W, 3) render of splats over black, in [0, 1]."""
+    with torch.no_grad():
+        color = render(model, camera).color
+    return np.asarray(color.clamp(0, 1).float().cpu().numpy())
+
+
+def one_of(value: str, choices: Sequence[str], name: str) -> None:
+    """Refuse what is no choice, with the nearest one that is.
+
+    Raises:
+        InputError: ``value`` is none of ``choices``.
+
+    Example:
+        >>> one_of("papper", ["corrected", "paper"], "variant")
+        Traceback (most recent call last):
+        attnwarp.errors.InputError: variant: got 'papper'; did you mean 'paper'?; expected ...
+    """
+    if value not in choices:
+        listed = ", ".join(choices[:12]) + (", ..." if len(choices) > 12 else "")
+        raise InputError(
+            f"{name}: got {value!r}{suggest(value, choices)}; expected one of {listed}"
+        )
+
+
+def _resized(camera: Camera, longest: int) -> Camera:
+    """The camera of a picture that :func:`attnwarp.fit.load_views` averages down."""
+    factor = longest / max(camera.width, camera.height)
+    if factor >= 1:
+        return camera
+    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+    return camera.resize(width, height)
+
+
+def _convergence(cameras: Sequence[Camera]) -> Array:
+    """The point with the least squared distance to all optical axes.
+
+    Axes that are nearly parallel have no such point; the mean of the cameras then serves.
+    """
+    across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
+    matrix = np.sum(across, axis=0)
+    positions = np.array([camera.position for camera in cameras])
+    if np.linalg.cond(matrix) > 1e6:
+        return np.asarray(positions.mean(axis=0))
+    right = np.sum([a @ p for a, p in zip(across, positions, strict=True)], axis=0)
+    return np.asarray(np.linalg.solve(matrix, right))

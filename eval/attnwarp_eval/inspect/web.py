@@ -1,0 +1,257 @@
+"""The window in a browser, served on this machine through trame."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from attnwarp.errors import InputError, optional_imports
+from attnwarp_eval.inspect.window import Window, layer_name, plain
+
+LOCAL = "127.0.0.1"
+
+LEFT = 10.0
+"""Seconds after which the server ends, once the last browser has gone; a reload takes less."""
+
+
+def check_web() -> None:
+    """Refuse to go on without trame, before anything is computed.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    with optional_imports():
+        import trame.app
+        import trame.widgets.vtk
+        import trame.widgets.vuetify3  # noqa: F401
+
+
+def serve(
+    window: Window,
+    *,
+    host: str = LOCAL,
+    port: int = 0,
+    announce: Callable[[str], object] = print,
+    left: float = LEFT,
+) -> None:
+    """Serve a window until the last browser has left, or until it is interrupted.
+
+    The address holds a secret: other users of the machine and other pages of the browser cannot
+    connect without it.
+
+    Args:
+        window: drawn off screen.
+        host: address to listen at.
+        port: to listen at; 0 takes a free one.
+        announce: told the address to open.
+        left: seconds from the last browser's end to the server's.
+
+    Raises:
+        InputError: the address cannot be used.
+    """
+    secret = secrets.token_urlsafe(16)
+    try:
+        asyncio.run(_serve(_Page(window, announce, left), host, port, secret))
+    except OSError as error:
+        raise InputError(
+            f"--host {host} --port {port}: {error.strerror or error}; choose another, or leave"
+            " --port out"
+        ) from None
+
+
+async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
+    page.url = lambda bound: f"http://{host}:{bound}/index.html?secret={secret}"
+    # trame reads the command line by itself, in a way that clashes with this command's options.
+    arguments, sys.argv = sys.argv, ["attnwarp-eval", "--authKey", secret]
+    try:
+        task = page.server.start(
+            host=host,
+            port=port,
+            timeout=0,
+            open_browser=False,
+            show_connection_info=False,
+            disable_logging=True,
+            exec_mode="coroutine",
+        )
+    finally:
+        sys.argv = arguments
+    await task
+
+
+class _Page:
+    """The page's controls, each of which changes the window's state."""
+
+    def __init__(self, window: Window, announce: Callable[[str], object], left: float) -> None:
+        from trame.app import get_server
+
+        self.window, self.announce, self.left = window, announce, left
+        self.clients = 0
+        self.url: Callable[[int], str] = str
+        self.server: Any = get_server("attnwarp-inspect", client_type="vue3")
+        state, controller = self.server.state, self.server.controller
+        self._describe()
+        self._build()
+        state.change("target", "variant", "coloring", "layer", "step", "splats", "surface")(
+            self._changed
+        )
+        controller.on_server_ready.add(self._ready)
+        self.server.add_protocol_to_configure(self._watch_clients)
+        window.enable_picking()
+        window.changed = self._drawn
+
+    def _describe(self) -> None:
+        """Write the window's state into the controls."""
+        window, state = self.window, self.server.state
+        shown = window.state
+        state.targets = [plain(name) for name in window.targets]
+        state.variants = [
+            {"title": plain(name), "value": k} for k, name in enumerate(window.variants)
+        ]
+        state.colorings = list(window.pair.colorings)
+        state.layers = [layer_name(layer) for layer in window.layers]
+        state.steps = list(window.steps)
+        state.target = window.targets.index(shown.target)
+        state.variant = window.variants.index(shown.variant)
+        state.coloring = shown.coloring
+        state.layer = window.layers.index(shown.layer)
+        state.step = window.steps.index(shown.step)
+        state.splats, state.surface = shown.splats, shown.surface
+        state.numbers = "" if window.picked is None else "\n".join(window.picked.lines())
+
+    def _changed(self, **_: Any) -> None:
+        """Show what the controls say."""
+        window, state = self.window, self.server.state
+        wanted = {
+            "target": window.targets[int(state.target)],
+            "variant": window.variants[int(state.variant)],
+            "coloring": state.coloring,
+            "layer": window.layers[min(int(state.layer), len(window.layers) - 1)],
+            "step": window.steps[int(state.step)],
+            "splats": bool(state.splats),
+            "surface": bool(state.surface),
+        }
+        changes = {
+            name: value for name, value in wanted.items() if value != getattr(window.state, name)
+        }
+        if changes and state.coloring in window.pair.colorings:
+            window.show(**changes)
+
+    def _drawn(self) -> None:
+        self._describe()
+        self.server.state.flush()
+        self.server.controller.view_update()
+
+    def _look(self, action: Callable[[], object]) -> Callable[[], None]:
+        def look() -> None:
+            action()
+            self.server.controller.view_update()
+
+        return look
+
+    async def _fly(self) -> None:
+        from attnwarp_eval.inspect import scene
+
+        window = self.window
+        for position, rotation in scene.fly(window.pair.cameras, window.subject.center, 24):
+            window.look(position, rotation)
+            self.server.controller.view_update()
+            # The picture goes out while this waits.
+            await asyncio.sleep(0.05)
+
+    def _ready(self, **_: Any) -> None:
+        self.announce(self.url(self.server.port))
+
+    def _watch_clients(self, root: Any) -> None:
+        """Count the browsers, and end when the last has left."""
+        from wslink.websocket import LinkProtocol
+
+        page = self
+
+        class Clients(LinkProtocol):  # type: ignore[misc]
+            def onConnect(self, request: Any, client_id: Any) -> None:  # noqa: N802
+                page.clients += 1
+
+            def onClose(self, client_id: Any) -> None:  # noqa: N802
+                page.clients -= 1
+                if page.clients == 0:
+                    asyncio.get_running_loop().call_later(page.left, page._end)
+
+        root.registerLinkProtocol(Clients())
+
+    def _end(self) -> None:
+        if self.clients == 0:
+            self._ending = asyncio.ensure_future(self.server.stop())
+
+    def _build(self) -> None:
+        from trame.ui.vuetify3 import VAppLayout
+        from trame.widgets import html, vtk
+        from trame.widgets import vuetify3 as vuetify
+
+        window = self.window
+        self.server.state.trame__title = "attnwarp-eval inspect"
+        compact = {"density": "compact", "hide_details": True}
+        with VAppLayout(self.server):
+            with (
+                vuetify.VNavigationDrawer(permanent=True, width=330),
+                vuetify.VContainer(classes="pa-3"),
+            ):
+                html.Div("view: {{ targets[target] }}", classes="text-caption")
+                _slider(vuetify, "target", "targets")
+                vuetify.VSelect(
+                    label="variant", v_model=("variant",), items=("variants",), **compact
+                )
+                vuetify.VSelect(
+                    label="colours",
+                    v_model=("coloring",),
+                    items=("colorings",),
+                    classes="mt-3",
+                    **compact,
+                )
+                html.Div("grid: {{ layers[layer] }}", classes="text-caption mt-3")
+                _slider(vuetify, "layer", "layers")
+                if len(window.steps) > 1:
+                    html.Div("step: {{ steps[step] }}", classes="text-caption mt-3")
+                    _slider(vuetify, "step", "steps")
+                vuetify.VCheckbox(label="splats as discs", v_model=("splats",), **compact)
+                if window.pair.world is not None:
+                    vuetify.VCheckbox(
+                        label="the whole true surface", v_model=("surface",), **compact
+                    )
+                looks = {
+                    "source": lambda: window.look_through(window.pair.cameras[0].name),
+                    "target": lambda: window.look_through(window.state.target),
+                    "outside": window.look_from_outside,
+                }
+                for name, look in looks.items():
+                    vuetify.VBtn(name, click=self._look(look), size="small", classes="ma-1")
+                vuetify.VBtn("fly", click=self._fly, size="small", classes="ma-1")
+                html.Div(
+                    "click on the surface: a pixel or cell, its rays and its numbers",
+                    classes="text-caption mt-2",
+                )
+                html.Pre("{{ numbers }}", style="font-size: 11px; overflow-x: auto;")
+            with (
+                vuetify.VMain(),
+                vuetify.VContainer(fluid=True, classes="pa-0", style="height: 100vh;"),
+            ):
+                view = vtk.VtkRemoteView(
+                    window.plotter.render_window, ref="view", interactive_ratio=1
+                )
+                self.server.controller.view_update = view.update
+
+
+def _slider(vuetify: Any, name: str, values: str) -> None:
+    vuetify.VSlider(
+        v_model=(name,),
+        min=0,
+        max=(f"{values}.length - 1",),
+        step=1,
+        show_ticks="always",
+        density="compact",
+        hide_details=True,
+        __properties=[("show_ticks", "show-ticks")],
+        classes=f"slider-{name}",
+    )

@@ -1,0 +1,60 @@
+import pytest
+import torch
+
+from attnwarp_eval.inspect import subject
+
+
+@pytest.fixture(scope="session")
+def chosen():
+    return subject.of_scene("spheres", 64)
+
+
+@pytest.fixture(scope="session")
+def pair(chosen):
+    return chosen.pair("corrected", "yaw060")
+
+
+@pytest.fixture(autouse=True, scope="package")
+def one_thread():
+    """Pictures this small gain nothing from threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def folders(tmp_path_factory):
+    """A user's scene: splats, a data set with pictures, and the folder of an edit of them."""
+    from dataclasses import replace
+
+    import numpy as np
+    from tiny_editors import pix2pix
+    from tiny_scenes import cameras, pictures, splats
+
+    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.io import Dataset, write_ply, write_transforms
+    from attnwarp.io.images import encode_png
+    from attnwarp.propagate import preset
+    from attnwarp.propagate.run import propagate
+
+    folder = tmp_path_factory.mktemp("own")
+    model = splats()
+    views = [replace(camera, name=f"images/{k}.png") for k, camera in enumerate(cameras())]
+    images = pictures(model, views)
+    (folder / "images").mkdir()
+    for camera, image in zip(views, images, strict=True):
+        (folder / camera.name).write_bytes(
+            encode_png(np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8))
+        )
+    write_ply(folder / "scene.ply", model)
+    write_transforms(
+        folder / "transforms.json", Dataset(views, [folder / camera.name for camera in views])
+    )
+    settings = preset("corrected", stages=2, views_per_stage=1, steps=1, iterations=1)
+    pipe = pix2pix()
+    editor = InstructPix2Pix(
+        pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler, text_guidance=3.0
+    )
+    propagate(model, views, images, editor, "red", settings, folder=folder / "edit")
+    return folder

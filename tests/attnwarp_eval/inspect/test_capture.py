@@ -1,0 +1,164 @@
+"""A user's own scene and an edit of it, against the library; hostile folders."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp.errors import InputError
+from attnwarp.io import read_image, read_ply
+from attnwarp.render import render
+from attnwarp.warp import PRESETS, sample, warp_view
+from attnwarp_eval.inspect import subject
+from attnwarp_eval.inspect.capture import Capture, read_edit
+from attnwarp_eval.inspect.pixel import report
+from attnwarp_eval.inspect.window import plain
+
+
+@pytest.fixture(scope="module")
+def own(folders):
+    return subject.of_capture(folders / "scene.ply", folders)
+
+
+@pytest.fixture(scope="module")
+def edited(folders):
+    return subject.of_capture(folders / "edit", folders, ply=folders / "scene.ply")
+
+
+def test_a_users_scene_is_warped_as_the_library_warps_it(own, folders):
+    pair = own.pair("corrected", "3")
+    model = read_ply(folders / "scene.ply")
+    source, target = pair.cameras
+    assert (source.name, target.name) == ("0", "3")
+    view = warp_view(model, source, target, PRESETS["corrected"])
+    assert torch.equal(view.mask, pair.view.mask) and pair.truth is None
+    assert pair.images[1] == pytest.approx(read_image(folders / "images" / "3.png") / 255, abs=1e-6)
+    depth = render(model, target).median_depth
+    for column, row in np.random.default_rng(0).integers(0, 32, (20, 2)).tolist():
+        result = report(pair, column, row)
+        np.testing.assert_equal(result.xy, view.correspondence.xy[row, column].numpy())
+        np.testing.assert_equal(result.depths["intersection, median"], float(depth[row, column]))
+        assert result.exact is None and "endpoint" not in "".join(result.lines())
+    assert set(pair.colorings) == {"picture", "mask", "rules", "incidence"}
+
+
+def test_the_centre_is_where_the_cameras_look_and_up_is_theirs(own):
+    # The cameras stand on a line at z = 3 and look at (x / 2, 0, 0): their axes meet at z = -3.
+    assert own.center == pytest.approx([0, 0, -3], abs=1e-6)
+    assert own.up == pytest.approx([0, 1, 0], abs=1e-6)
+
+
+def test_what_stands_before_a_point_comes_from_the_sources_own_depth(own):
+    pair = own.pair("paper", "4")
+    pair = type(pair)(pair.views, "4", PRESETS["corrected"], pair.model)
+    surface = pair.surfaces[0]
+    near = np.asarray(surface.depth).copy() * 0.5
+    closer = type(surface)(near, surface.normal, surface.alpha, surface.image)
+    pair.__dict__["surfaces"] = (closer, pair.surfaces[1])
+    accepted = np.argwhere(pair.view.correspondence.defined.numpy())
+    hidden = [report(pair, int(c), int(r)) for r, c in accepted[::37]]
+    seen = [result for result in hidden if result.seen_instead is not None]
+    assert len(seen) > 3
+    for result in seen:
+        # On the ray to the point, at half its depth.
+        xy, z = pair.cameras[0].project(result.seen_instead)
+        assert xy == pytest.approx(result.xy, abs=1e-6)
+        assert z == pytest.approx(result.source_depth)
+
+
+def test_an_edit_shows_its_own_files_and_settings(edited, folders):
+    manifest = json.loads((folders / "edit/manifest.json").read_text())
+    pair = edited.pair(subject.EDIT_VARIANT, edited.targets[0])
+    assert pair.settings.to_dict() == manifest["settings"]["warp"]
+    assert edited.preferred == subject.EDIT_VARIANT
+    assert edited.edit.steps == ("before", "stage 1", "edited")
+    first = [name for stage in manifest["stages"] for name in stage]
+    assert set(edited.targets[: len(first)]) == set(first)
+    name = edited.targets[0]
+    insets = pair.insets()
+    picture = read_image(folders / f"edit/views/{name}.png") / 255
+    assert insets["target, edited"] == pytest.approx(picture, abs=1e-6)
+    after = read_image(folders / f"edit/renders/after/{name}.png") / 255
+    assert pair.picture("edited") == pytest.approx(after, abs=1e-6)
+    stage = render(read_ply(folders / "edit/stages/1.ply"), pair.cameras[1]).color.clamp(0, 1)
+    assert pair.picture("stage 1") == pytest.approx(stage.numpy(), abs=1e-6)
+    assert torch.equal(edited.edit.splats("edited").sh, read_ply(folders / "edit/edited.ply").sh)
+
+
+def test_disagreement_is_the_difference_of_the_edits_along_the_warp(edited, folders):
+    name = edited.targets[0]
+    pair = edited.pair(subject.EDIT_VARIANT, name)
+    source = torch.as_tensor(read_image(folders / "edit/source.png") / 255).permute(2, 0, 1)
+    target = read_image(folders / f"edit/views/{name}.png") / 255
+    warped = sample(source, pair.view.correspondence)[0].permute(1, 2, 0).numpy()
+    expected = abs(warped - target).mean(axis=2)
+    mask = pair.view.mask.numpy()
+    assert mask.any()
+    assert pair.disagreement[mask] == pytest.approx(expected[mask], abs=1e-6)
+    assert np.isnan(pair.disagreement[~mask]).all()
+    assert "edit disagreement" in pair.colorings
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(source="../../etc/passwd"), "view '../../etc/passwd', which DATA has"),
+        (lambda m: m.update(stages=[["../x"]]), "view '../x', which DATA has"),
+        (lambda m: m.update(stages=[[1]]), "not the manifest of an edit"),
+        (lambda m: m.update(stages=7), "not the manifest of an edit"),
+        (lambda m: m["settings"].update(warp={"opaque": 7}), "not the manifest of an edit"),
+        (lambda m: m.clear(), "not the manifest of an edit"),
+    ],
+)
+def test_a_manifest_that_lies_is_refused_in_one_line(folders, tmp_path, change, message):
+    manifest = json.loads((folders / "edit/manifest.json").read_text())
+    change(manifest)
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(InputError, match=message) as error:
+        read_edit(tmp_path, [str(k) for k in range(5)])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{", "\x00", '"a"', "[]", "\ud800"])
+def test_a_damaged_manifest_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "manifest.json").write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(InputError, match="not the manifest of an edit"):
+        read_edit(tmp_path, ["0"])
+
+
+def test_a_huge_manifest_is_not_read(tmp_path):
+    with (tmp_path / "manifest.json").open("wb") as stream:
+        stream.truncate(2**30)
+    with pytest.raises(InputError, match="expected an edit's manifest"):
+        read_edit(tmp_path, ["0"])
+
+
+def test_inspecting_an_edit_writes_nothing_to_its_folder(folders, tmp_path):
+    shutil.copytree(folders / "edit", tmp_path / "edit")
+    (tmp_path / "edit/masks").rename(tmp_path / "edit/gone")
+    before = sorted(tmp_path.rglob("*"))
+    chosen = subject.of_capture(tmp_path / "edit", folders, ply=folders / "scene.ply")
+    chosen.pair(subject.EDIT_VARIANT, chosen.targets[0]).insets(None, "stage 1")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_what_is_missing_is_named_with_the_remedy(folders, tmp_path):
+    for arguments, message in (
+        ((folders / "edit", folders), "name them with --ply FILE.ply"),
+        ((tmp_path, folders), r"expected splats \(.ply, .splat\) or a folder of attnwarp edit"),
+    ):
+        with pytest.raises(InputError, match=message):
+            subject.of_capture(*arguments)
+    with pytest.raises(InputError, match="source: got '9'"):
+        subject.of_capture(folders / "scene.ply", folders, source="9")
+    with pytest.raises(InputError, match="expected at least a source and a target"):
+        data = subject.read_dataset(folders)
+        one = type(data)(data.cameras[:1], data.image_paths[:1])
+        Capture(read_ply(folders / "scene.ply"), one)
+
+
+def test_names_are_drawn_as_they_stand():
+    assert plain("a\x1b[2Jb\x00$x^2$\u202e") == "a?[2Jb?\\$x^2\\$?"
+    assert len(plain("x" * 10_000)) == 120

@@ -1,0 +1,261 @@
+"""The command as its user has it: a real window, a real browser, a machine without OpenGL, and a large scene."""
+
+import asyncio
+import os
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import browser
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.slow
+
+COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
+
+
+def environment(**changes):
+    hidden = {"DISPLAY", "WAYLAND_DISPLAY"}
+    return {**{k: v for k, v in os.environ.items() if k not in hidden}, **changes}
+
+
+@pytest.fixture
+def display():
+    """The name of a screen of a virtual X server."""
+    if shutil.which("Xvfb") is None:
+        pytest.skip("needs Xvfb (Debian: xvfb)")
+    read, write = os.pipe()
+    server = subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "1000x700x24", "-nolisten", "tcp"],
+        pass_fds=[write], stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    os.close(write)
+    with os.fdopen(read) as stream:
+        name = f":{stream.readline().strip()}"
+    yield name
+    server.terminate()
+    server.wait(30)
+
+
+class Screen:
+    """What a person has: a picture of the screen, a keyboard and a mouse."""
+
+    def __init__(self, name):
+        from Xlib.display import Display
+
+        self.display = Display(name)
+        self.root = self.display.screen().root
+
+    def picture(self):
+        from Xlib import X
+
+        size = self.root.get_geometry()
+        data = self.root.get_image(0, 0, size.width, size.height, X.ZPixmap, 0xFFFFFFFF).data
+        return np.frombuffer(data, np.uint8).reshape(size.height, size.width, 4)[..., :3].copy()
+
+    def settled(self, different=None, seconds=120):
+        """The picture once it no longer changes, and differs from another one."""
+        end, last = time.monotonic() + seconds, self.picture()
+        while time.monotonic() < end:
+            time.sleep(1.0)
+            now = self.picture()
+            if (now == last).all() and (different is None or (now != different).any()):
+                return now
+            last = now
+        raise AssertionError("the screen did not change")
+
+    def press(self, key, shift=False):
+        from Xlib import XK, X
+        from Xlib.ext import xtest
+
+        codes = [self.display.keysym_to_keycode(XK.string_to_keysym(key))]
+        if shift:
+            codes.insert(0, self.display.keysym_to_keycode(XK.string_to_keysym("Shift_L")))
+        for code in codes:
+            xtest.fake_input(self.display, X.KeyPress, code)
+        for code in reversed(codes):
+            xtest.fake_input(self.display, X.KeyRelease, code)
+        self.display.sync()
+
+    def move(self, x, y):
+        from Xlib import X
+        from Xlib.ext import xtest
+
+        xtest.fake_input(self.display, X.MotionNotify, x=x, y=y)
+        self.display.sync()
+
+    def click(self, x, y):
+        from Xlib import X
+        from Xlib.ext import xtest
+
+        self.move(x, y)
+        for kind in (X.ButtonPress, X.ButtonRelease):
+            xtest.fake_input(self.display, kind, 1)
+            self.display.sync()
+            time.sleep(0.2)
+
+
+def test_a_real_window_follows_its_keys_and_closes(display, tmp_path):
+    process = subprocess.Popen(
+        [*COMMAND, "spheres", "--size", "32", "--view", "yaw060"],
+        env=environment(DISPLAY=display), stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    try:
+        screen = Screen(display)
+        empty = screen.picture()
+        before = screen.settled(different=empty)
+        screen.move(550, 300)
+        for key, shift in (("question", True), ("question", True), ("n", False), ("v", False),
+                           ("c", False), ("l", False), ("l", False), ("d", False), ("2", False)):  # fmt: skip
+            screen.press(key, shift)
+            before = screen.settled(different=before)
+        screen.click(550, 450)
+        screen.settled(different=before)
+        screen.press("q")
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == 0 and not errors
+    finally:
+        process.kill()
+
+
+def children(pid):
+    listed = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True
+    )
+    return [int(word) for word in listed.stdout.split()]
+
+
+@pytest.fixture
+def served(tmp_path):
+    """A served window: its process and its address."""
+    if browser.executable() is None:
+        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+    process = subprocess.Popen(
+        [*COMMAND, "spheres", "--size", "32", "--view", "yaw060", "--web"],
+        env=environment(), stdout=subprocess.PIPE, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    url = ""
+    while not url.startswith("http"):
+        url = process.stdout.readline()
+        assert url, "the server ended"
+    yield process, url.strip()
+    process.kill()
+    process.wait()
+
+
+def listening(port):
+    """Local addresses, in hexadecimal, at which a port is open."""
+    with open("/proc/net/tcp") as stream:
+        rows = [line.split()[1:4] for line in stream.readlines()[1:]]
+    return [own.split(":")[0] for own, _, state in rows
+            if state == "0A" and int(own.split(":")[1], 16) == port]  # fmt: skip
+
+
+def test_a_browser_shows_it_and_closing_the_page_leaves_no_process(served):
+    process, url = served
+    port = int(re.search(r":(\d+)/", url)[1])
+    assert listening(port) == ["0100007F"]  # 127.0.0.1 alone
+    asyncio.run(_browse(url))
+    assert process.wait(60) == 0
+    assert not listening(port)
+
+
+async def _browse(url):
+    loaded = "document.querySelector('img')?.src?.length > 10"
+    async with browser.opened(url.split("?")[0]) as tab:
+        await asyncio.sleep(5)
+        assert not await tab.run(loaded)  # without the secret there is no picture
+    async with browser.opened(url) as tab:
+        await tab.until(loaded)
+        await asyncio.sleep(2)
+        before = await tab.picture()
+        source = await tab.run("document.querySelector('img').src")
+        await tab.run("document.querySelector('.slider-target [role=slider]').focus()")
+        await tab.press("ArrowRight", 39)
+        await tab.until(f"document.querySelector('img').src != '{source}'")
+        assert "view: yaw075" in await tab.run("document.body.innerText")
+        after = await tab.picture()
+        assert (before[:, 340:] != after[:, 340:]).mean() > 0.02
+        for x, y in ((560, 360), (600, 330), (640, 380), (700, 420)):
+            await tab.click(x, y)
+            await asyncio.sleep(3)
+            if await tab.run("document.querySelector('pre').innerText.length > 20"):
+                break
+        await tab.until("document.querySelector('pre').innerText.includes('depth, truth')")
+
+
+def test_ctrl_c_ends_the_server(served):
+    process, _ = served
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) in (0, 130)
+    assert not children(process.pid)
+
+
+def test_a_page_to_share_draws_itself_without_a_network(tmp_path):
+    if browser.executable() is None:
+        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+    page = tmp_path / "a.html"
+    subprocess.run([*COMMAND, "spheres", "--size", "32", "--view", "yaw060", "--pixel", "16,20",
+                    "--export", page], env=environment(), check=True)  # fmt: skip
+    assert not re.search(r"<(script|link)[^>]+(src|href)=.https?:", page.read_text())
+
+    async def look():
+        async with browser.opened(page.as_uri()) as tab:
+            await tab.until("document.querySelector('canvas') != null")
+            for _ in range(60):
+                await asyncio.sleep(1)
+                picture = await tab.picture()
+                green = (picture[..., 1] > picture[..., 0] + 40).mean()
+                if green > 0.02:  # the mask's "visible, accepted"
+                    return green
+        return 0.0
+
+    assert asyncio.run(look()) > 0.02
+
+
+def test_without_opengl_the_error_names_the_remedy_and_files_are_written(tmp_path):
+    # A driver list that names no driver: neither EGL nor a display, and no OSMesa on test machines.
+    hidden = environment(__EGL_VENDOR_LIBRARY_FILENAMES=str(tmp_path / "none"))
+    small = [*COMMAND, "spheres", "--size", "32"]
+    done = subprocess.run(
+        [*small, "--screenshot", tmp_path / "a.png"], env=hidden, capture_output=True, text=True
+    )
+    from attnwarp_eval.inspect.gl import OSMESA, _loads
+
+    if any(_loads(name) for name in OSMESA):
+        assert done.returncode == 0
+        return
+    assert done.returncode == 2 and "libegl1" in done.stderr and done.stderr.count("\n") == 1
+    done = subprocess.run([*small, "--export", tmp_path / "a.glb"], env=hidden)
+    assert done.returncode == 0 and (tmp_path / "a.glb").stat().st_size > 10_000
+
+
+def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
+    out = tmp_path / "a.glb"
+    done = subprocess.run(
+        [sys.executable, "-m", "attnwarp.cli", "inspect", folders / "scene.ply", folders,
+         "--pixel", "16,16", "--export", out],
+        env=environment(), capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "pixel (16, 16)" in done.stdout and out.stat().st_size > 1000
+
+
+FIRST_PICTURE = """
+import resource, sys, time
+import numpy as np, torch
+from attnwarp_eval.inspect import subject
+from attnwarp_eval.inspect.scene import State
+from attnwarp_eval.inspect.window import Window
+begin = time.process_time()
+chosen = subject.of_capture(sys.argv[1], sys.argv[2])
+window = Window(chosen, State("corrected", chosen.targets[0], splats=True), off_screen=True)
+window.plotter.add_mesh(triangles := __import__("pyvista").Plane(i_resolution=700, j_resolution=500).triangulate())
+window.plotter.screenshot(return_img=True)
+print(triangles.n_cells, time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
