@@ -12,13 +12,16 @@ from attnwarp.propagate.pictures import Size
 
 Array = npt.NDArray[np.float64]
 
+ROUNDING = 1e-12
+"""Share of two centres' coordinates below which their distance is rounding."""
+
 
 def fundamental(view: Camera, key: Camera) -> Array:
     """(3, 3) float64 F with y^T F x = 0 for pixels x of ``view`` and y of ``key`` that see one
     point.
 
     F = K_key^-T [t]_x R K_view^-1 with the motion (R, t) from ``view`` to ``key`` (Hartley and
-    Zisserman 2004, section 9.2). It is 0 where the centres of projection coincide.
+    Zisserman 2004, section 9.2). Its scale is that of t.
 
     Example:
         >>> from attnwarp import Camera
@@ -53,9 +56,10 @@ def line_distances(view: Camera, key: Camera, size: Size) -> Tensor | None:
         [0.0, 1.0, 2.0]
     """
     h, w = size
-    matrix = fundamental(view.resize(w, h), key.resize(w, h))
-    if not matrix.any():
+    scale = np.linalg.norm(view.position) + np.linalg.norm(key.position)
+    if np.linalg.norm(view.position - key.position) <= ROUNDING * scale:
         return None
+    matrix = fundamental(view.resize(w, h), key.resize(w, h))
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     cells = np.stack([x.ravel(), y.ravel(), np.ones(h * w)], axis=1)
     lines = cells @ matrix.T
