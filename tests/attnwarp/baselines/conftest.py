@@ -1,6 +1,7 @@
 import pytest
 import torch
-from tiny_editors import controlnet, pix2pix
+from diffusers import ControlNetModel
+from tiny_editors import parts, unet
 from tiny_scenes import cameras, pictures, splats
 
 from attnwarp.editing.controlnet import DepthControlNet
@@ -17,31 +18,42 @@ def one_thread():
 
 
 def loud(network):
-    """With random weights attention is a faint mean of all tokens; it is made to look and to count."""
+    """With random weights attention is a faint mean of all tokens; it is made to look and to
+    count. A factor of 10 would turn the last bits of float32 into other pictures.
+    """
     for name, module in network.named_modules():
         if name.endswith(".attn1"):
             for part in (module.to_q, module.to_k, module.to_v, module.to_out[0]):
-                part.weight.data *= 10
+                part.weight.data *= 4
+
+
+ONE_LEVEL = {
+    "block_out_channels": (16,),
+    "down_block_types": ("CrossAttnDownBlock2D",),
+    "up_block_types": ("CrossAttnUpBlock2D",),
+}
 
 
 @pytest.fixture(scope="session")
 def editor():
     """Of pictures."""
-    pipe = pix2pix()
-    loud(pipe.unet)
-    return InstructPix2Pix(
-        pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler, text_guidance=3.0
-    )
+    net = unet(8, **ONE_LEVEL)
+    loud(net)
+    return InstructPix2Pix(net, **parts(), text_guidance=3.0)
 
 
 @pytest.fixture(scope="session")
 def depth_editor():
     """Of depth maps."""
-    pipe = controlnet()
-    loud(pipe.unet)
-    loud(pipe.controlnet)
-    names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
-    return DepthControlNet(*(getattr(pipe, name) for name in names), guidance=3.0)
+    net = unet(4, **ONE_LEVEL)
+    torch.manual_seed(1)
+    control = ControlNetModel.from_unet(net, conditioning_embedding_out_channels=(8, 8)).eval()
+    for block in (*control.controlnet_down_blocks, control.controlnet_mid_block):
+        torch.nn.init.normal_(block.weight, std=0.1)  # from_unet leaves them zero
+    torch.nn.init.normal_(control.controlnet_cond_embedding.conv_out.weight, std=0.1)
+    loud(net)
+    loud(control)
+    return DepthControlNet(net, **parts(), controlnet=control, guidance=3.0)
 
 
 @pytest.fixture(scope="session")

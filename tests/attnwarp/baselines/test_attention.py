@@ -1,6 +1,5 @@
 """Oracle: attention, matches and their average written out in float64, token by token, from the inputs of every layer."""
 
-import copy
 import functools
 from contextlib import contextmanager
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from drawn_lines import drawn_distances
+from tiny_editors import unet as tiny_unet
 
 from attnwarp import Camera
 from attnwarp.baselines.attention import aligned, self_attention
@@ -18,8 +18,12 @@ SIDE = 8  # of the latents; half of it in the lower layers
 
 
 @pytest.fixture(scope="module")
-def unet(editor):
-    return copy.deepcopy(editor.unet).double()
+def network():
+    net = tiny_unet(8).double().requires_grad_(False)
+    for module in layers(net).values():  # with random weights attention is a faint mean
+        for part in (module.to_q, module.to_k, module.to_v, module.to_out[0]):
+            part.weight *= 4
+    return net
 
 
 def layers(network):
@@ -73,21 +77,21 @@ def attention(module, query_tokens, key_tokens):
     return np.concatenate(heads, axis=1) @ out.weight.numpy().T + out.bias.numpy()
 
 
-def test_gaussctrls_attention_is_its_formula_in_every_layer(unet):
+def test_gaussctrls_attention_is_its_formula_in_every_layer(network):
     references, views, branches = 2, 3, 2
-    with self_attention(unet, aligned(references, 0.6, branches)), watched(unet) as calls:
-        forward(unet, branches * views)
-    assert len(calls) == len(layers(unet)) > 2
-    for name, module in layers(unet).items():
+    with self_attention(network, aligned(references, 0.6, branches)), watched(network) as calls:
+        forward(network, branches * views)
+    assert len(calls) == len(layers(network)) > 2
+    for name, module in layers(network).items():
         tokens, output = calls[name]
         for row in range(branches * views):
             first = row // views * views  # of the row's branch
             means = [attention(module, tokens[row], tokens[first + r]) for r in range(references)]
             expected = 0.6 * attention(module, tokens[row], tokens[row]) + 0.4 * np.mean(means, 0)
             assert np.abs(output[row] - expected).max() < 1e-9 * max(1, np.abs(expected).max())
-    plain = forward(unet, branches * views)
-    with self_attention(unet, aligned(references, 0.0, branches)):
-        assert (forward(unet, branches * views) - plain).abs().max() > 1e-3
+    plain = forward(network, branches * views)
+    with self_attention(network, aligned(references, 0.0, branches)):
+        assert (forward(network, branches * views) - plain).abs().max() > 1e-3
 
 
 def ring():
@@ -129,16 +133,16 @@ def matched(tokens, key_tokens, key_outputs, views, keys, size, nearest, radius)
 
 
 @pytest.mark.parametrize(("nearest", "radius"), [(2, 1.0), (1, None)])
-def test_dges_attention_is_a_loop_over_tokens_in_every_layer(unet, nearest, radius):
+def test_dges_attention_is_a_loop_over_tokens_in_every_layer(network, nearest, radius):
     views, keys = ring()
     branches = ("text", "image", "uncond")
-    with key_views(unet, branches, (SIDE, SIDE), radius) as attention_of:
-        with attention_of.key_pass(), watched(unet) as of_keys:
-            forward(unet, 6, seed=1)
-        with attention_of.view_pass(views, keys, nearest), watched(unet) as of_views:
-            forward(unet, 9, seed=2)
+    with key_views(network, branches, (SIDE, SIDE), radius) as attention_of:
+        with attention_of.key_pass(), watched(network) as of_keys:
+            forward(network, 6, seed=1)
+        with attention_of.view_pass(views, keys, nearest), watched(network) as of_views:
+            forward(network, 9, seed=2)
     excluded = 0
-    for name, module in layers(unet).items():
+    for name, module in layers(network).items():
         tokens, outputs = of_keys[name]
         for row in range(6):  # two key views look at the tokens of both, branch by branch
             both = tokens[row // 2 * 2 : row // 2 * 2 + 2].reshape(-1, tokens.shape[2])
@@ -171,19 +175,19 @@ def test_a_match_is_the_best_of_the_pairs_that_count_and_of_all_where_none_does(
         assert result[i] == max(allowed, key=lambda j: cosines[j])
 
 
-def test_a_network_is_as_before_once_a_method_is_done(unet):
-    before, processors = forward(unet, 6), dict(unet.attn_processors)
-    with self_attention(unet, aligned(1, 0.6, 3)):
+def test_a_network_is_as_before_once_a_method_is_done(network):
+    before, processors = forward(network, 6), dict(network.attn_processors)
+    with self_attention(network, aligned(1, 0.6, 3)):
         pass
     with (
         pytest.raises(RuntimeError, match="stopped"),
-        key_views(unet, ("text",), (SIDE, SIDE), 1.0),
+        key_views(network, ("text",), (SIDE, SIDE), 1.0),
     ):
         raise RuntimeError("stopped")
-    assert unet.attn_processors == processors
-    assert torch.equal(forward(unet, 6), before)
-    with key_views(unet, ("text",), (SIDE, SIDE), 1.0):  # outside of a pass
-        assert torch.equal(forward(unet, 6), before)
+    assert network.attn_processors == processors
+    assert torch.equal(forward(network, 6), before)
+    with key_views(network, ("text",), (SIDE, SIDE), 1.0):  # outside of a pass
+        assert torch.equal(forward(network, 6), before)
 
 
 def test_cameras_on_a_ring_are_sorted_all_the_way_round():
