@@ -1,9 +1,11 @@
 import pytest
 import torch
 from diffusers import ControlNetModel
+from tiny_baselines import QUICK
 from tiny_editors import parts, unet
 from tiny_scenes import cameras, pictures, splats
 
+from attnwarp.baselines import METHODS
 from attnwarp.editing.controlnet import DepthControlNet
 from attnwarp.editing.pix2pix import InstructPix2Pix
 
@@ -61,3 +63,16 @@ def scene():
     """Splats, cameras, and pictures before the edit."""
     model, views = splats(30), cameras(3)
     return model, views, pictures(model, views)
+
+
+@pytest.fixture
+def run(scene, editor, depth_editor):
+    """Run a method on the scene with its kind of editor."""
+
+    def call(name, settings=None, model_and_views=None, words="a bear", **options):
+        model, views, images = model_and_views or scene
+        kind = depth_editor if name == "gaussctrl" else editor
+        chosen = QUICK[name] if settings is None else settings
+        return METHODS[name](model, views, images, kind, words, chosen, **options)
+
+    return call
