@@ -40,16 +40,19 @@ class Folder:
     Args:
         path: made if need be.
         cameras: of the views, whose names the files have.
+        folders: inside it, made if need be.
 
     Attributes:
         path: see there.
         names: file names of the views, without suffix.
     """
 
-    def __init__(self, path: Path, cameras: Sequence[Camera]) -> None:
+    def __init__(
+        self, path: Path, cameras: Sequence[Camera], folders: Sequence[str] = FOLDERS
+    ) -> None:
         self.path = path
         self.names = file_stems(cameras)
-        for name in FOLDERS:
+        for name in folders:
             (path / name).mkdir(parents=True, exist_ok=True)
 
     def claim(self, manifest: dict[str, Any]) -> None:

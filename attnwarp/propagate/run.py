@@ -20,7 +20,6 @@ from attnwarp.camera import Camera
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
 from attnwarp.errors import InputError
-from attnwarp.fit import FitSettings, extent_of
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, ViewEditor
@@ -39,10 +38,16 @@ from attnwarp.propagate.pictures import (
 )
 from attnwarp.propagate.plan import Plan
 from attnwarp.propagate.progress import Step
-from attnwarp.propagate.scene import Scene, Segments
+from attnwarp.propagate.scene import (
+    Scene,
+    Segments,
+    editor_digest,
+    near_of,
+    render_picture,
+    splats_digest,
+)
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.tune import TrainingView, Tuning
-from attnwarp.render import render
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 
 RECORDING = ".recording"
@@ -164,8 +169,8 @@ def propagate(
     if not instruction.strip():
         raise ValueError("instruction: is empty, expected words such as 'make it red'")
     if images is None:
-        near = _near(cameras)
-        images = [_render(gaussians, camera, near, backend) for camera in cameras]
+        near = near_of(cameras)
+        images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
     scene = Scene.checked(cameras, images, segments)
     by_hand = None if source_picture is None else _by_hand(source_picture)
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
@@ -215,7 +220,7 @@ class _Run:
         self.tuning = Tuning(
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
-        self.near = _near(scene.cameras)
+        self.near = near_of(scene.cameras)
         self._frozen_surface: Surface | None = None
         self.seconds: dict[str, float] = {}
         self.done = 0
@@ -228,9 +233,9 @@ class _Run:
                 "source": self.names[source],
                 "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],
                 "inputs": {
-                    "splats": _splats_digest(gaussians),
+                    "splats": splats_digest(gaussians),
                     **scene.digest(),
-                    "editor": _editor_digest(editor),
+                    "editor": editor_digest(editor),
                     "source_picture": None if by_hand is None else digest(by_hand),
                 },
             }
@@ -415,7 +420,7 @@ class _Run:
         h, w = self.sizes[view]
         if self.settings.start_picture == "original":
             return resized(self.scene.pictures[view], (h, w))
-        return _render(model, self.scene.cameras[view].resize(w, h), self.near, self.backend)
+        return render_picture(model, self.scene.cameras[view].resize(w, h), self.near, self.backend)
 
     def _composite(self, view: int, picture: Image) -> Image:
         if self.scene.segments is None:
@@ -479,7 +484,7 @@ class _Run:
                 for camera, name in zip(self.scene.cameras, self.names, strict=True):
                     path = f"renders/{part}/{name}.png"
                     if not self.folder.has(path):
-                        pixels = to_bytes(_render(model, camera, self.near, self.backend))
+                        pixels = to_bytes(render_picture(model, camera, self.near, self.backend))
                         self.folder.write_picture(path, pixels)
             psnr = self._edit_psnr(final)
         counters = self._counters(final)
@@ -502,7 +507,7 @@ class _Run:
         errors = []
         for view in views:
             target = self._training(view)
-            picture = _render(final, target.camera, self.near, self.backend)
+            picture = render_picture(final, target.camera, self.near, self.backend)
             errors.append(float(np.square(picture.astype(np.float64) - target.picture).mean()))
         each = [losses.psnr_of_mse(error) for error in errors]
         finite = [value for value in each if np.isfinite(value)]
@@ -554,18 +559,6 @@ class _Run:
             self.watch(Step(min(self.done, self.total), self.total, text))
 
 
-def _near(cameras: Sequence[Camera]) -> float:
-    """Nothing nearer is drawn, as in the tuning."""
-    return FitSettings().near * extent_of(cameras)
-
-
-def _render(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
-    """(H, W, 3) float32 in [0, 1], over black."""
-    with torch.no_grad():
-        color = render(gaussians, camera, backend=backend, near=near).color
-    return np.asarray(color.clamp(0, 1).float().cpu().numpy())
-
-
 def _by_hand(picture: npt.NDArray[Any]) -> Image:
     array = np.asarray(picture)
     check.shape(array, ("H", "W", 3), "source_picture")
@@ -575,22 +568,3 @@ def _by_hand(picture: npt.NDArray[Any]) -> Image:
     if array.dtype.kind != "f" or array.min() < 0 or array.max() > 1:
         raise ValueError("source_picture: expected uint8, or floating values in [0, 1]")
     return array.astype(np.float32)
-
-
-def _splats_digest(gaussians: Gaussians) -> str:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    arrays = [getattr(gaussians, name).detach().cpu().numpy() for name in names]
-    return digest(gaussians.kind, gaussians.antialiased, gaussians.origin, *arrays)
-
-
-def _editor_digest(editor: Any) -> str:
-    """SHA-256 of an editor's networks, schedule and guidance."""
-    parts: list[Any] = [type(editor).__name__]
-    for name in ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt"):
-        parts.append(getattr(editor, name, None))
-    parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
-    for name in ("unet", "vae", "text_encoder", "controlnet"):
-        network = getattr(editor, name, None)
-        for key, value in sorted(network.state_dict().items()) if network is not None else ():
-            parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
-    return digest(*parts)

@@ -8,11 +8,15 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.fit import FitSettings, extent_of
+from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.folder import digest
 from attnwarp.propagate.pictures import Image, Mask
+from attnwarp.render import render
 
 Segments: TypeAlias = Sequence[npt.NDArray[Any]] | Callable[[int, Image], npt.NDArray[Any]]
 """(H, W) bool masks of what is edited: one for each view, or a function of a view's number and its
@@ -93,3 +97,35 @@ def _picture(image: npt.NDArray[Any], camera: Camera, name: str) -> Image:
     if array.min() < 0 or array.max() > 1:
         raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
     return array.astype(np.float32)
+
+
+def near_of(cameras: Sequence[Camera]) -> float:
+    """Nothing nearer is drawn, as in the tuning."""
+    return FitSettings().near * extent_of(cameras)
+
+
+def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
+    """(H, W, 3) float32 in [0, 1], over black."""
+    with torch.no_grad():
+        color = render(gaussians, camera, backend=backend, near=near).color
+    return np.asarray(color.clamp(0, 1).float().cpu().numpy())
+
+
+def splats_digest(gaussians: Gaussians) -> str:
+    """SHA-256 of splats."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    arrays = [getattr(gaussians, name).detach().cpu().numpy() for name in names]
+    return digest(gaussians.kind, gaussians.antialiased, gaussians.origin, *arrays)
+
+
+def editor_digest(editor: Any) -> str:
+    """SHA-256 of an editor's networks, schedule and guidance."""
+    parts: list[Any] = [type(editor).__name__]
+    for name in ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt"):
+        parts.append(getattr(editor, name, None))
+    parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
+    for name in ("unet", "vae", "text_encoder", "controlnet"):
+        network = getattr(editor, name, None)
+        for key, value in sorted(network.state_dict().items()) if network is not None else ():
+            parts += [key, value.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy()]
+    return digest(*parts)

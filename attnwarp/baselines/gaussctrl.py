@@ -1,0 +1,176 @@
+"""GaussCtrl (Wu et al. 2024): views by their depth, with attention to reference views, from the
+inverted noise of their renders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, Unpack
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from attnwarp.baselines.attention import aligned, self_attention
+from attnwarp.baselines.run import Baseline, Kind, Options, run
+from attnwarp.baselines.settings import GaussCtrlSettings
+from attnwarp.baselines.work import VIEWS, Round, ViewEdit, Work, chunks
+from attnwarp.camera import Camera
+from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.inversion import ddim_invert
+from attnwarp.gaussians import Gaussians
+from attnwarp.propagate.editing import Guide, guided
+
+
+def gaussctrl(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[npt.NDArray[Any]] | None,
+    editor: Editor,
+    instruction: str,
+    settings: GaussCtrlSettings | None = None,
+    **options: Unpack[Options],
+) -> Baseline:
+    """Edit views by their depth with attention to reference views, then tune the splats on them.
+
+    Each edit starts from the DDIM inversion of the view's render, without guidance, or from random
+    latents. The reference views go through the network with every batch.
+
+    Args:
+        gaussians, cameras, images, options: see :func:`by_view`. ``images`` serve the segments and
+            the detail that an edit at a smaller size lacks; guides are of the splats.
+        editor: a :class:`~attnwarp.editing.controlnet.DepthControlNet`. Inversion needs one that
+            predicts noise or v.
+        instruction: a prompt.
+        settings: :class:`GaussCtrlSettings`, its defaults if left out.
+
+    Raises:
+        ValueError, InputError, RuntimeError: see :func:`by_view`.
+
+    Example:
+        >>> from attnwarp.baselines import gaussctrl
+        >>> from attnwarp.editing.small import load_editor
+        >>> from attnwarp import Camera
+        >>> camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=32, height=32, fov_y=40,
+        ...                         up=(0, 1, 0))
+        >>> import torch
+        >>> from attnwarp import Gaussians
+        >>> disc = Gaussians("2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]),
+        ...                  torch.full((1, 2), 0.5), torch.ones(1), torch.zeros(1, 1, 3))
+        >>> gaussctrl(disc, [camera], None, load_editor("small-plain"), "red")
+        Traceback (most recent call last):
+        ValueError: editor: gaussctrl is made for a depth ControlNet, got InstructPix2Pix, which
+        takes pictures; choose another editor or method
+    """
+    kind = Kind("gaussctrl", GaussCtrlSettings, _GaussCtrl)
+    return run(kind, gaussians, cameras, images, editor, instruction, settings, **options)
+
+
+class _GaussCtrl:
+    def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
+        work.takes("gaussctrl", "depth")
+        work.one_size("gaussctrl")
+        if settings.latents == "inversion" and work.editor.schedule.prediction == "sample":
+            raise ValueError(
+                "latents: this editor predicts the picture, and DDIM inversion needs its noise; use"
+                " latents='random'"
+            )
+        self.work, self.settings = work, settings
+        generator = work.generator(VIEWS)
+        views = _spread_draw(range(len(work.sizes)), settings.references, settings.views, generator)
+        parts = _quarters(views, settings.references)
+        self.references = [_choice(part, 1, generator)[0] for part in parts]
+        self.rounds = [Round(chunks(views, settings.batch), tuple(views), settings.iterations)]
+        self._latents: dict[int, Tensor] = {}
+
+    def rows(self, number: int, group: Sequence[int]) -> int:
+        s = self.settings
+        edits = (len(self.references) + len(group)) * s.steps * self.work.branches()
+        if s.latents == "random":
+            return edits
+        first = group == self.rounds[0].groups[0]
+        inverted = set(group) | set(self.references) if first else set(group) - set(self.references)
+        return edits + len(inverted) * s.steps
+
+    def edit(
+        self, number: int, group: Sequence[int], model: Gaussians, watch: Callable[[], None]
+    ) -> list[ViewEdit]:
+        work, s = self.work, self.settings
+        editor: Any = work.editor
+        views = [*self.references, *group]
+        guides = {view: work.depth(view) for view in set(views)}
+        latents = torch.cat([self.latents(view, guides[view]) for view in views])
+        with ExitStack() as stack:
+            stack.enter_context(work.guided())
+            if s.negative_prompt is not None:
+                stack.enter_context(_negative(editor, s.negative_prompt))
+            count, branches = len(self.references), len(editor.branches)
+            rule = aligned(count, s.self_share, branches)
+            stack.enter_context(self_attention(editor.unet, rule))
+            if s.control_share is not None:
+                rule = aligned(count, s.control_share, branches)
+                stack.enter_context(self_attention(editor.controlnet, rule))
+            result = edit(
+                editor,
+                [guides[view] for view in views],
+                work.instruction + s.suffix,
+                steps=s.steps,
+                latents=latents,
+                watch=lambda step, steps, x: watch(),
+            )
+        about = {"references": [work.scene.cameras[view].name for view in self.references]}
+        return [ViewEdit(picture, about) for picture in result.images[count:]]
+
+    def latents(self, view: int, depth: Guide) -> Tensor:
+        """(1, C, h, w) that the edit of a view starts from, computed once a sitting."""
+        work, s = self.work, self.settings
+        if s.latents == "random":
+            return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
+        if view not in self._latents:
+            prompt = work.instruction + s.suffix if s.source_prompt is None else s.source_prompt
+            with guided(work.editor, 1.0):
+                task = work.editor.task([depth], prompt)
+                before = work.editor.encode([work.render(view, work.frozen)])
+                self._latents[view] = ddim_invert(
+                    work.editor.schedule, task.predict, before, work.editor.timesteps(s.steps)
+                )
+        return self._latents[view]
+
+
+@contextmanager
+def _negative(editor: Any, prompt: str) -> Iterator[None]:
+    """Use another negative prompt while the block runs."""
+    before = editor.negative_prompt
+    editor.negative_prompt = prompt
+    try:
+        yield
+    finally:
+        editor.negative_prompt = before
+
+
+def _quarters(views: Sequence[int], count: int) -> list[list[int]]:
+    """Contiguous parts of views, as equal as can be; fewer where there are fewer views."""
+    count = min(count, len(views))
+    return [list(part) for part in np.array_split(np.asarray(views), count)]
+
+
+def _choice(views: Sequence[int], count: int, generator: torch.Generator) -> list[int]:
+    """So many different ones at random, in their order."""
+    order = torch.randperm(len(views), generator=generator)[:count].tolist()
+    return [int(views[k]) for k in sorted(order)]
+
+
+def _spread_draw(
+    views: Sequence[int], parts: int, most: int, generator: torch.Generator
+) -> list[int]:
+    """At most so many views: an equal share of each contiguous part, at random."""
+    if len(views) <= most:
+        return list(views)
+    shares = [len(part) for part in np.array_split(np.arange(most), min(parts, len(views)))]
+    return [
+        view
+        for part, share in zip(_quarters(views, parts), shares, strict=True)
+        for view in _choice(part, share, generator)
+    ]

@@ -1,0 +1,231 @@
+"""What every baseline edits with: the scene, the editor, and the noise of each edit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from attnwarp.baselines.settings import BaselineSettings
+from attnwarp.editing.editor import Editor, shared_noise
+from attnwarp.gaussians import Gaussians
+from attnwarp.propagate.editing import Guide, guided
+from attnwarp.propagate.pictures import Image, Size, composite, edit_size, resized
+from attnwarp.propagate.scene import Scene, near_of, render_picture
+from attnwarp.warp import WarpSettings, render_surface
+
+NOISE, TIMESTEP, KEYS, VIEWS = range(4)
+"""What a random number is drawn for: no two draws share their seed."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """A round: views are edited, and the splats are tuned on edited views.
+
+    Attributes:
+        groups: numbers of the views that go through the network together, in the order of editing.
+        training: numbers of the views that the round tunes on.
+        iterations: of tuning.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    training: tuple[int, ...]
+    iterations: int
+
+    @property
+    def views(self) -> tuple[int, ...]:
+        """All views that the round edits, in the order of editing."""
+        return tuple(view for group in self.groups for view in group)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewEdit:
+    """An edited view.
+
+    Attributes:
+        picture: (h, w, 3) in [0, 1].
+        about: what the edit was, for its JSON file.
+    """
+
+    picture: Image
+    about: dict[str, Any] = field(default_factory=dict)
+
+
+class Method(Protocol):
+    """What a baseline says of itself: :mod:`attnwarp.baselines.run` does the rest."""
+
+    rounds: list[Round]
+
+    def rows(self, number: int, group: Sequence[int]) -> int:
+        """Rows through the UNet that the edit of a group takes, in a round counted from 0."""
+        ...
+
+    def edit(
+        self, number: int, group: Sequence[int], model: Gaussians, watch: Callable[[], None]
+    ) -> list[ViewEdit]:
+        """Edit a group of views.
+
+        Args:
+            number: of the round, from 0.
+            group: numbers of views.
+            model: the splats as they stand.
+            watch: called after each step of denoising.
+        """
+        ...
+
+
+class Work:
+    """A scene and an editor at work on it.
+
+    Args:
+        gaussians: the splats before the edit.
+        scene: cameras, pictures and segments.
+        editor: see :mod:`attnwarp.editing`.
+        instruction: in words.
+        settings: see there.
+        backend: of the renderer.
+
+    Attributes:
+        frozen: the splats before the edit, outside autograd.
+        sizes: (h, w) px of each view's edit.
+        near: nothing nearer is drawn.
+    """
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        scene: Scene,
+        editor: Editor,
+        instruction: str,
+        settings: BaselineSettings,
+        backend: str,
+    ) -> None:
+        self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
+        self.instruction, self.settings, self.backend = instruction, settings, backend
+        multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
+        self.sizes: list[Size] = [
+            edit_size(camera.height, camera.width, settings.size, multiple)
+            for camera in scene.cameras
+        ]
+        self.near = near_of(scene.cameras)
+
+    def picture(self, view: int) -> Image:
+        """(h, w, 3) of a view before the edit, at the size of its edit."""
+        return resized(self.scene.pictures[view], self.sizes[view])
+
+    def render(self, view: int, model: Gaussians) -> Image:
+        """(h, w, 3) of a view of the splats, at the size of its edit."""
+        h, w = self.sizes[view]
+        camera = self.scene.cameras[view].resize(w, h)
+        return render_picture(model, camera, self.near, self.backend)
+
+    def depth(self, view: int) -> Guide:
+        """(h, w) depth of the splats before the edit; NaN where undefined."""
+        h, w = self.sizes[view]
+        camera = self.scene.cameras[view].resize(w, h)
+        return np.asarray(
+            render_surface(self.frozen, camera, WarpSettings(), backend=self.backend).depth
+        )
+
+    def guide(self, view: int) -> Guide:
+        """What the editor takes of a view: its picture or its depth."""
+        return self.picture(view) if self.editor.guide == "picture" else self.depth(view)
+
+    def composite(self, view: int, picture: Image) -> Image:
+        """The edit inside the view's segment and the original outside, where there are segments."""
+        if self.scene.segments is None:
+            return picture
+        return composite(picture, self.picture(view), self.scene.segments[view], "original", 0.0)
+
+    def one_size(self, method: str) -> None:
+        """Raise ValueError unless all views are edited at one size."""
+        if len(set(self.sizes)) > 1:
+            sizes = " and ".join(f"{w} x {h}" for h, w in sorted(set(self.sizes))[:2])
+            raise ValueError(
+                f"cameras: {method} edits views together, got edits of {sizes} px; crop the"
+                " pictures to one shape"
+            )
+
+    def takes(self, method: str, guide: str) -> None:
+        """Raise ValueError unless the editor is of the kind that a method is made for."""
+        kinds = {"picture": "InstructPix2Pix, which takes pictures", "depth": "a depth ControlNet"}
+        if self.editor.guide != guide:
+            raise ValueError(
+                f"editor: {method} is made for {kinds[guide]}, got {kinds[self.editor.guide]};"
+                " choose another editor or method"
+            )
+
+    def seed(self, purpose: int, *numbers: int) -> int:
+        """A seed of its own for each purpose and numbers such as a round and a view."""
+        entropy = np.random.SeedSequence([self.settings.seed, purpose, *numbers])
+        return int(entropy.generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+    def generator(self, purpose: int, *numbers: int) -> torch.Generator:
+        """Random numbers of their own for each purpose and numbers."""
+        return torch.Generator().manual_seed(self.seed(purpose, *numbers))
+
+    def noise(self, number: int, views: Sequence[int]) -> Tensor:
+        """(B, C, h, w) noise of edits in a round; a view's does not depend on those beside it."""
+        h, w = (side // self.editor.factor for side in self.sizes[views[0]])
+        one = (1, self.editor.unet.config.out_channels, h, w)
+        if self.settings.noise == "shared":
+            return shared_noise((len(views), *one[1:]), self.settings.seed)
+        seeds = [self.seed(NOISE, number, view) for view in views]
+        return torch.cat([shared_noise(one, seed) for seed in seeds])
+
+    def timestep(self, number: int, view: int, limits: tuple[int, int]) -> int:
+        """Timestep that an edit starts from, drawn evenly within limits, both included."""
+        low, high = limits
+        views = () if self.settings.noise == "shared" else (view,)
+        generator = self.generator(TIMESTEP, number, *views)
+        return int(torch.randint(low, high + 1, (1,), generator=generator))
+
+    @contextmanager
+    def guided(self) -> Iterator[None]:
+        """Use the settings' guidance while the block runs."""
+        editor: Any = self.editor
+        image = self.settings.image_guidance
+        if image is not None and not hasattr(editor, "image_guidance"):
+            raise ValueError("image_guidance: this editor has none; leave it out")
+        before = getattr(editor, "image_guidance", None)
+        with guided(editor, self.settings.text_guidance):
+            if image is None:
+                yield
+                return
+            editor.image_guidance = float(image)
+            try:
+                yield
+            finally:
+                editor.image_guidance = before
+
+    def branches(self) -> int:
+        """Rows of the UNet's batch for one view."""
+        with self.guided():
+            return len(self.editor.branches)
+
+
+def chunks(views: Sequence[int], size: int) -> tuple[tuple[int, ...], ...]:
+    """Views in groups of a size, in their order; the last may be smaller.
+
+    Example:
+        >>> chunks([4, 5, 6], 2)
+        ((4, 5), (6,))
+    """
+    return tuple(tuple(views[k : k + size]) for k in range(0, len(views), size))
+
+
+def parts_of(total: int, size: int) -> list[int]:
+    """``total`` in parts of ``size`` and what is left; one part of 0 where there is none.
+
+    Example:
+        >>> parts_of(3000, 2500), parts_of(0, 10)
+        ([2500, 500], [0])
+    """
+    full = [size] * (total // size)
+    rest = total % size
+    return [*full, rest] if rest or not full else full

@@ -1,0 +1,262 @@
+"""Oracles: the editor's own loop, view by view itself, renders of the splats, counts of draws."""
+
+import importlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_baselines import QUICK, close, rows_of
+from tiny_scenes import cameras
+
+from attnwarp import Camera, baselines
+from attnwarp.baselines import (
+    METHODS,
+    ByViewSettings,
+    DGESettings,
+    GaussCtrlSettings,
+    IGS2GSSettings,
+    by_view,
+    preset,
+)
+from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.propagate.pictures import to_bytes
+from attnwarp.render import render
+
+
+def alone(scene):
+    model, views, images = scene
+    return model, views[1:2], images[1:2]
+
+
+def test_one_view_is_view_by_view(run, scene, depth_editor):
+    one = alone(scene)
+    plain = {"steps": 2, "iterations": 0}
+    floor = run("by_view", ByViewSettings(**plain, start=(700, 980)), one).edited[0]
+    assert np.array_equal(run("igs2gs", IGS2GSSettings(**plain), one).edited[0], floor)
+
+    floor = run("by_view", ByViewSettings(**plain, start=(900, 900)), one).edited[0]
+    assert close(run("dge", DGESettings(**plain, starts=(900,)), one).edited[0], floor)
+
+    model, views, images = one
+    settings = ByViewSettings(**plain)
+    floor = by_view(model, views, images, depth_editor, "a bear", settings).edited[0]
+    assert close(
+        run("gaussctrl", GaussCtrlSettings(**plain, latents="random"), one).edited[0], floor
+    )
+    assert not close(run("gaussctrl", GaussCtrlSettings(**plain), one).edited[0], floor)  # inverted
+
+
+SETTINGS = {
+    "by_view": ByViewSettings(start=(700, 980)),
+    "igs2gs": IGS2GSSettings(),
+    "dge": DGESettings(batch=2),
+    "gaussctrl": GaussCtrlSettings(latents="random", references=2, batch=2),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_identical_views_with_shared_noise_get_identical_edits(name, run, scene):
+    model, views, images = scene
+    twins = [Camera(views[1].K, views[1].world_to_camera, 32, 32, f"{k}.png") for k in range(3)]
+    same = model, twins, [images[1]] * 3
+    shared = replace(SETTINGS[name], steps=1, iterations=0, noise="shared")
+    first, *others = run(name, shared, same).edited.values()
+    assert len(others) == 2
+    assert all(close(first, other) for other in others)
+    if name == "by_view":
+        first, *others = run(name, replace(shared, noise="fresh"), same).edited.values()
+        assert not any(close(first, other) for other in others)
+
+
+def test_view_by_view_with_shared_noise_is_the_editors_own_loop(run, scene, editor):
+    settings = replace(QUICK["by_view"], noise="shared", iterations=0, batch=1, seed=4)
+    result = run("by_view", settings)
+    for view, picture in enumerate(scene[2]):
+        expected = edit(editor, [picture], "a bear", steps=2, seed=4).images[0]
+        assert np.array_equal(result.edited[view], to_bytes(expected))
+
+
+@pytest.mark.parametrize(
+    ("name", "off"), [("dge", {"plain_below": 1000}), ("gaussctrl", {"self_share": 1.0})]
+)
+def test_views_that_look_at_others_differ_from_views_alone(
+    name, off, run, scene, editor, depth_editor
+):
+    settings = replace(SETTINGS[name], steps=2, iterations=0)
+    together, apart = run(name, settings).edited, run(name, replace(settings, **off)).edited
+    assert not any(close(together[view], apart[view]) for view in range(3))
+    # What they are without each other is view by view.
+    model, views, images = scene
+    kind, start = (editor, (998, 998)) if name == "dge" else (depth_editor, None)
+    alone = ByViewSettings(steps=2, iterations=0, start=start)
+    floor = by_view(model, views, images, kind, "a bear", alone).edited
+    assert all(close(apart[view], floor[view]) for view in range(3))
+
+
+# --- Instruct-GS2GS
+
+
+def test_igs2gs_edits_every_view_in_every_round_from_the_render_as_tuned(
+    run, scene, tmp_path, monkeypatch
+):
+    edits = []
+
+    def noted(*args, **kwargs):
+        edits.append((args[1][0], kwargs["start"], kwargs["pictures"][0]))
+        return edit(*args, **kwargs)
+
+    # The package's own name of the module is the function.
+    monkeypatch.setattr(importlib.import_module("attnwarp.baselines.igs2gs"), "edit", noted)
+    # Colours alone, whose rate does not fall with the iterations to come.
+    settings = IGS2GSSettings(steps=1, iterations=7, every=3, geometry_rate=0.0)
+    result = run("igs2gs", settings, folder=tmp_path)
+    assert len(edits) == 3 * 3  # after 0, 3 and 6 iterations
+    model, views, images = scene
+    states = [model] + [
+        run("igs2gs", replace(settings, iterations=done)).gaussians for done in (3, 6)
+    ]
+    for number, state in enumerate(states):
+        for view in range(3):
+            guide, start, noised = edits[3 * number + view]
+            assert np.array_equal(guide, images[view])
+            expected = render(state, views[view]).color.clamp(0, 1).numpy()
+            assert np.abs(noised - expected).max() < 1e-5
+            name = Path(views[view].name).stem
+            about = json.loads((tmp_path / f"rounds/{number + 1}/{name}.json").read_text())
+            assert about["start"] == start
+    starts = {start for _, start, _ in edits}
+    assert len(starts) > 5
+    assert min(starts) >= 700
+    assert max(starts) <= 980
+    assert result.counters["rounds"] == 3
+    # Seven iterations of rounds of 3, 3 and 1: every view is tuned on twice, one of them again.
+    tuned = json.loads((tmp_path / "result.json").read_text())["tuned"]
+    assert sorted(tuned.values()) == [2, 2, 3]
+
+
+def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
+    from attnwarp.baselines.work import Work
+    from attnwarp.propagate.scene import Scene
+
+    model, views, images = scene
+    work = Work(
+        model, Scene.checked(views, images, None), editor, "a bear", IGS2GSSettings(), "auto"
+    )
+    drawn = [work.timestep(number, view, (20, 29)) for number in range(100) for view in range(10)]
+    counts = np.bincount(drawn, minlength=30)
+    assert counts[:20].sum() == 0
+    assert ((counts[20:] - 100) ** 2 / 100).sum() < 33.7  # chi squared, 9 degrees, p = 1e-4
+    noises = torch.stack([work.noise(number, [view])[0] for number in (0, 1) for view in (0, 1)])
+    assert torch.equal(noises[1], work.noise(0, [0, 1])[1])  # whoever is beside it
+    correlations = np.corrcoef(noises.flatten(1).numpy())
+    assert np.abs(correlations - np.eye(4)).max() < 0.2  # 1024 values: 6 sigma
+
+
+def test_the_published_numbers():
+    released, improved = preset("igs2gs", "released"), preset("igs2gs", "improved")
+    assert (released.iterations, improved.iterations, released.every) == (7500, 3000, 2500)
+    assert (released.text_guidance, released.image_guidance) == (12.5, 1.5)
+    assert (released.start, released.l1, released.ssim) == ((700, 980), 1.0, 0.2)
+    of_dge = preset("dge", "released")
+    assert (of_dge.text_guidance, of_dge.image_guidance, of_dge.steps) == (7.5, 1.5, 20)
+    assert (of_dge.views, of_dge.batch, of_dge.every, of_dge.iterations) == (20, 5, 500, 1500)
+    assert (of_dge.l1, of_dge.perceptual, of_dge.plain_below, of_dge.epipolar) == (10, 10, 100, 1)
+    of_gaussctrl = preset("gaussctrl", "released")
+    assert (of_gaussctrl.views, of_gaussctrl.references, of_gaussctrl.self_share) == (40, 4, 0.6)
+    assert (of_gaussctrl.text_guidance, of_gaussctrl.steps) == (5.0, 20)
+
+
+# --- DGE
+
+
+def test_dge_draws_other_views_each_round_and_a_key_view_of_each_batch_at_each_step(
+    run, scene, tmp_path
+):
+    model, _, _ = scene
+    views = cameras(7)
+    settings = DGESettings(
+        steps=4, iterations=2, every=1, views=4, batch=2, starts=(998, 299), perceptual=0.0
+    )
+    run("dge", settings, (model, views, None), folder=tmp_path)
+    chosen, keys = [], []
+    for number in (1, 2):
+        names = sorted(path.stem for path in tmp_path.glob(f"rounds/{number}/*.png"))
+        about = json.loads((tmp_path / f"rounds/{number}/{names[0]}.json").read_text())
+        # Steps from 998: 998, 748, 498, 248. From 299: 299, 224, 149 and 74, where each is alone.
+        assert about["start"] == (998 if number == 1 else 299)
+        assert len(about["keys"]) == (4 if number == 1 else 3)
+        chosen.append(tuple(names))
+        # In a row the order by angle is that by name, so that a batch is a half of it.
+        halves = [set(names[:2]), set(names[2:])]
+        for pair in about["keys"]:
+            (a,), (b,) = ([k for k in (0, 1) if Path(key).stem in halves[k]] for key in pair)
+            assert a != b
+            keys.append(tuple(pair))
+    assert chosen[0] != chosen[1]
+    assert len(set(keys)) > 3
+
+
+# --- GaussCtrl
+
+
+def test_gaussctrl_draws_ten_views_and_a_reference_of_each_quarter():
+    from attnwarp.baselines.gaussctrl import _choice, _quarters, _spread_draw
+
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        views = _spread_draw(range(101), 4, 40, generator)
+        assert views == sorted(set(views))
+        assert np.histogram(views, bins=[0, 26, 51, 76, 101])[0].tolist() == [10] * 4
+        for part in _quarters(views, 4):
+            (reference,) = _choice(part, 1, generator)
+            assert len(part) == 10
+            assert reference in part
+    assert _spread_draw(range(7), 4, 40, generator) == list(range(7))
+
+
+def test_gaussctrl_inverts_without_guidance_and_edits_with_references(run, depth_editor):
+    rows, _ = rows_of(depth_editor.unet, lambda: run("gaussctrl"))
+    # Two of three views are references. First batch: two views, both or one of them references.
+    # Each inversion has one row a step, each step of an edit two branches of references and views.
+    inversions, edits = [n for n in rows if n == 1], [n for n in rows if n > 1]
+    assert len(inversions) == 3 * 2
+    assert edits == [2 * (2 + 2)] * 2 + [2 * (2 + 1)] * 2
+    assert depth_editor.guidance == 3.0
+    texts = []
+    embed = depth_editor.embed
+    depth_editor.embed = lambda prompts: texts.append(list(prompts)) or embed(prompts)
+    try:
+        words = {"negative_prompt": "red", "suffix": ", best"}
+        run("gaussctrl", preset("gaussctrl", "paper", steps=2, iterations=0, **words))
+    finally:
+        del depth_editor.embed
+    assert texts == [[""]] * 3 + [["red", "a bear, best"]]
+    assert (depth_editor.guidance, depth_editor.negative_prompt) == (3.0, "")
+
+
+def test_the_controlnets_attention_is_aligned_where_the_settings_say(run):
+    quick = replace(QUICK["gaussctrl"], iterations=0, latents="random")
+    plain = run("gaussctrl", quick).edited
+    aligned = run("gaussctrl", replace(quick, control_share=0.0)).edited
+    assert not any(close(plain[view], aligned[view]) for view in range(3))
+
+
+def test_shared_noise_is_that_of_the_seed(run, scene, editor):
+    from attnwarp.baselines.work import Work
+    from attnwarp.propagate.scene import Scene
+
+    model, views, images = scene
+    checked = Scene.checked(views, images, None)
+    work = Work(model, checked, editor, "a bear", ByViewSettings(noise="shared", seed=9), "auto")
+    assert torch.equal(work.noise(3, [0, 2]), shared_noise((2, 4, 16, 16), 9))
+
+
+def test_every_method_has_settings_and_presets():
+    assert set(METHODS) == set(baselines.PRESETS)
+    for name in METHODS:
+        values = preset(name).to_dict()
+        assert json.loads(json.dumps(values)) == values
+        assert type(preset(name))(**values) == preset(name)

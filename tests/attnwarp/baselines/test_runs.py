@@ -1,0 +1,250 @@
+"""Oracles: rows counted by hooks on the network, bytes of files, a clock that counts."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_baselines import QUICK, rows_of
+
+from attnwarp import Camera
+from attnwarp.baselines import (
+    METHODS,
+    Budget,
+    ByViewSettings,
+    GaussCtrlSettings,
+    IGS2GSSettings,
+    dge,
+    gaussctrl,
+    igs2gs,
+    preset,
+)
+from attnwarp.errors import InputError
+from attnwarp.io import read_image, read_ply
+from attnwarp.propagate.pictures import to_bytes
+
+
+def files(folder):
+    """Everything that has to be the same after a kill: all but the seconds."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file() and path.name != "times.json"
+    }
+
+
+@pytest.fixture(scope="module")
+def finished():
+    """Whole runs by method."""
+    return {}
+
+
+@pytest.fixture
+def whole(finished, run, editor, depth_editor, tmp_path_factory):
+    """The folder, the rows through the network and the result of a whole run of a method."""
+
+    def of(name):
+        if name not in finished:
+            folder = tmp_path_factory.mktemp(name)
+            network = (depth_editor if name == "gaussctrl" else editor).unet
+            counted = rows_of(network, lambda: run(name, folder=folder, checkpoint_seconds=0))
+            finished[name] = folder, *counted
+        return finished[name]
+
+    return of
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth_editor):
+    folder, rows, result = whole(name)
+    assert result.counters["network_rows"] == sum(rows) > 0
+    assert result.counters["edits"] == len(list(folder.glob("rounds/*/*.png")))
+    assert result.counters["views"] == len(list(folder.glob("views/*.png"))) == len(result.edited)
+    assert result.counters["iterations"] == QUICK[name].iterations
+    tuned = json.loads((folder / "result.json").read_text())["tuned"]
+    assert sum(tuned.values()) == QUICK[name].iterations
+    assert result.cut is None
+    assert torch.allclose(read_ply(folder / "edited.ply").sh, result.gaussians.sh, atol=1e-6)
+    assert read_image(folder / "sheet.png").shape == (3 * 32, 3 * 32, 3)
+    assert set(result.seconds) == {"edit", "write", "tune", "render"}
+    # The folder's views are the result's, and a second call makes nothing anew.
+    before = files(folder)
+    network = (depth_editor if name == "gaussctrl" else editor).unet
+    rows, again = rows_of(network, lambda: run(name, folder=folder))
+    assert not rows
+    assert files(folder) == before
+    for view, pixels in result.edited.items():
+        assert np.array_equal(again.edited[view], pixels)
+
+
+# --- killed and resumed
+
+
+class Killed(BaseException):
+    """Leaves the files as a kill would: nothing catches it but the atomic write."""
+
+
+def killed_at(run, name, folder, moment):
+    """Die at a step of progress or at a write, before it or after it; whether it came so far."""
+    from attnwarp.fit import checkpoint
+    from attnwarp.io import ply
+    from attnwarp.propagate import folder as folders
+
+    count = 0
+
+    def event(*_):
+        nonlocal count
+        count += 1
+        if count == moment:
+            raise Killed
+
+    def wrapped(write):
+        def around(*args, **kwargs):
+            event()
+            write(*args, **kwargs)
+            event()
+
+        return around
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (checkpoint, ply, folders):
+            patch.setattr(module, "write_atomically", wrapped(module.write_atomically))
+        try:
+            run(name, folder=folder, progress=event, checkpoint_seconds=0)
+        except Killed:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_killed_at_a_random_moment_and_resumed_it_gives_the_same_bytes(name, whole, run, tmp_path):
+    moment = int(np.random.default_rng([*name.encode()]).integers(2, 40))
+    assert killed_at(run, name, tmp_path, moment)
+    folder, _, result = whole(name)
+    assert files(tmp_path) != files(folder)
+    resumed = run(name, folder=tmp_path, checkpoint_seconds=0)
+    assert files(tmp_path) == files(folder)
+    assert resumed.counters == result.counters
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_killed_again_and_again_it_gives_the_same_bytes(name, whole, run, tmp_path):
+    for moment in np.random.default_rng(0).integers(2, 30, 40).tolist():
+        if not killed_at(run, name, tmp_path, moment):
+            break
+    run(name, folder=tmp_path, checkpoint_seconds=0)
+    assert files(tmp_path) == files(whole(name)[0])
+
+
+# --- budget
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_no_more_rows_go_through_the_network_than_the_budget_has(
+    name, whole, run, editor, depth_editor, tmp_path
+):
+    network = (depth_editor if name == "gaussctrl" else editor).unet
+    folder, all_rows, full = whole(name)
+    limited = Budget(network_rows=sum(all_rows) - 1)
+    rows, result = rows_of(network, lambda: run(name, folder=tmp_path, budget=limited))
+    assert sum(rows) == result.counters["network_rows"] < sum(all_rows)
+    assert result.cut == "network_rows"
+    # The last batch of edits is missing, and those before are the whole run's.
+    edits = [path.relative_to(tmp_path) for path in tmp_path.glob("rounds/*/*.png")]
+    assert len(edits) == result.counters["edits"] < full.counters["edits"]
+    assert len(edits) > 0
+    for path in edits:
+        assert (tmp_path / path).read_bytes() == (folder / path).read_bytes()
+    rows, again = rows_of(network, lambda: run(name, folder=tmp_path, budget=limited))
+    assert not rows
+    assert again.counters == result.counters
+
+
+def test_igs2gs_with_rows_for_a_part_of_a_round_ends_after_its_tuning(run, whole):
+    rows = whole("igs2gs")[2].counters["network_rows"]
+    assert rows == 2 * 3 * 2 * 3  # two rounds of three views, two steps of three branches
+    result = run("igs2gs", budget=Budget(network_rows=rows * 5 // 6))
+    assert (result.counters["edits"], result.counters["iterations"]) == (5, 5)
+    result = run("igs2gs", budget=Budget(network_rows=rows // 2))
+    assert (result.counters["edits"], result.counters["iterations"]) == (3, 3)
+
+
+class Clock:
+    """Each look at it takes a hundredth of a second."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        self.now += 0.01
+        return self.now
+
+
+def test_no_iteration_begins_once_the_seconds_are_spent(run, scene, tmp_path, monkeypatch):
+    import time
+
+    monkeypatch.setattr(time, "perf_counter", Clock())
+    long = replace(QUICK["igs2gs"], iterations=10_000, every=10_000)
+    result = run("igs2gs", long, folder=tmp_path, budget=Budget(seconds=1.0))
+    assert result.cut == "seconds"
+    assert 0 < result.counters["iterations"] < 100
+    assert len(result.edited) == 3
+    # Rendering the results is not counted, nor is the look at the clock that ends it.
+    assert 1.0 <= sum(result.seconds[part] for part in ("edit", "write", "tune")) < 1.1
+    again = run("igs2gs", long, folder=tmp_path, budget=Budget(seconds=1.0))
+    assert again.counters == result.counters
+
+    nothing = run("igs2gs", long, budget=Budget(seconds=0.0))
+    assert nothing.edited == {}
+    assert torch.allclose(nothing.gaussians.means, scene[0].means, atol=1e-6)
+    assert nothing.counters["iterations"] == nothing.counters["network_rows"] == 0
+
+
+# --- arguments
+
+
+def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, tmp_path):
+    model, views, images = scene
+    with pytest.raises(ValueError, match="editor: igs2gs is made for InstructPix2Pix"):
+        igs2gs(model, views, images, depth_editor, "a bear")
+    with pytest.raises(ValueError, match="editor: dge is made for InstructPix2Pix"):
+        dge(model, views, images, depth_editor, "a bear")
+    with pytest.raises(ValueError, match="editor: gaussctrl is made for a depth ControlNet"):
+        gaussctrl(model, views, images, editor, "a bear")
+    with pytest.raises(ValueError, match="settings: dge takes DGESettings, got IGS2GSSettings"):
+        run("dge", IGS2GSSettings())
+    with pytest.raises(ValueError, match="option: got 'foldr'.*folder"):
+        run("by_view", foldr=tmp_path)
+    with pytest.raises(ValueError, match="image_guidance: this editor has none"):
+        run("gaussctrl", GaussCtrlSettings(image_guidance=1.5))
+    wide = [*views[:2], Camera.look_at((0, 0, 3), (0, 0, 0), width=64, height=32, fov_y=40, up=(0, 1, 0))]  # fmt: skip
+    with pytest.raises(ValueError, match="cameras: dge edits views together, got edits of 32 x 32 and 64 x 32"):  # fmt: skip
+        dge(model, wide, None, editor, "a bear", QUICK["dge"])
+    with pytest.raises(ValueError, match="seconds: got -1"):
+        Budget(seconds=-1)
+    with pytest.raises(ValueError, match="method: got 'dgee'.*dge"):
+        preset("dgee")
+    with pytest.raises(ValueError, match=r"start: got \(9, 3\)"):
+        IGS2GSSettings(start=(9, 3))
+
+
+def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
+    none = {"steps": 2, "iterations": 0}
+    run("by_view", ByViewSettings(**none), folder=tmp_path)
+    with pytest.raises(InputError, match=r'method \("by_view", now "igs2gs"\)'):
+        run("igs2gs", IGS2GSSettings(**none), folder=tmp_path)
+    with pytest.raises(InputError, match=r"budget\.seconds \(null, now 5\)"):
+        run("by_view", ByViewSettings(**none), folder=tmp_path, budget=Budget(seconds=5))
+
+
+def test_segments_leave_the_original_outside(run, scene):
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :16] = True
+    alone = ByViewSettings(steps=1, iterations=0)
+    whole, half = run("by_view", alone), run("by_view", alone, segments=[left] * 3)
+    for view in range(3):
+        assert np.array_equal(half.edited[view][:, :16], whole.edited[view][:, :16])
+        assert np.array_equal(half.edited[view][:, 16:], to_bytes(scene[2][view])[:, 16:])
