@@ -82,7 +82,7 @@ class DepthStage:
     seed: int = 0
 
 
-DEPTH_STAGES = {"depth-64": DepthStage(64, 10_000, 8e-4, 200, start="plain-64", seed=5)}
+DEPTH_STAGES = {"depth-64": DepthStage(64, 6_000, 1e-3, 200, start="plain-64", seed=5)}
 
 
 class DepthNet(torch.nn.Module):
