@@ -144,9 +144,7 @@ def attributes_of(worlds: Worlds, world: int) -> npt.NDArray[np.int64]:
     return np.concatenate([thing, worlds.looks[world]], axis=1)
 
 
-def draw_prompt(
-    look: Sequence[int], rng: np.random.Generator
-) -> tuple[str, npt.NDArray[np.int64]]:
+def draw_prompt(look: Sequence[int], rng: np.random.Generator) -> tuple[str, npt.NDArray[np.int64]]:
     """A prompt that is true of a look, and the attributes that it names, -1 for the others."""
     thing, finish, color, second, ground, time = (int(v) for v in look)
     if rng.uniform() < 0.15:
