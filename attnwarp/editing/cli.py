@@ -72,6 +72,8 @@ def edit_image(
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     model = load_editor(editor, device=device, **given)
+    if model.guide != "picture":
+        raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
     image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)
     h, w = image.shape[:2]
     share = None

@@ -35,12 +35,17 @@ def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
 
 @app.command()
 def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
-    """Train a stage: plain-64, features-64, control-64, parts-64, parts-128, features-128, control-128."""
+    """Train a stage: plain-64, features-64, control-64, parts-64, parts-128, features-128, control-128, depth-64."""
+    from training.depth_editor import DEPTH_STAGES, train_depth_stage
     from training.editor import STAGES, train_stage
 
-    if stage not in STAGES:
-        raise typer.BadParameter(f"got {stage!r}, expected one of {', '.join(STAGES)}")
-    train_stage(stage, data, out, threads=threads)
+    if stage in DEPTH_STAGES:
+        train_depth_stage(stage, data, out, threads=threads)
+    elif stage in STAGES:
+        train_stage(stage, data, out, threads=threads)
+    else:
+        names = ", ".join([*STAGES, *DEPTH_STAGES])
+        raise typer.BadParameter(f"got {stage!r}, expected one of {names}")
 
 
 @app.command()
@@ -48,9 +53,11 @@ def export(
     stage: str, name: str, out: Out = CACHE, weights: Annotated[Path, typer.Option()] = WEIGHTS
 ) -> None:
     """Write a stage's editor, as far as it has come, into the package under a name such as small-plain."""
-    from training.editor_export import export_editor
+    from training.depth_editor import DEPTH_STAGES
+    from training.editor_export import export_depth_editor, export_editor
 
-    typer.echo(export_editor(stage, out, weights / name))
+    write = export_depth_editor if stage in DEPTH_STAGES else export_editor
+    typer.echo(write(stage, out, weights / name))
 
 
 @app.command()
@@ -61,10 +68,16 @@ def assess(
     rounds: Annotated[int, typer.Option(min=0, help="Of swapped features; 0 for none.")] = 0,
 ) -> None:  # fmt: skip
     """Measure an exported editor on what it has never seen, and write its card."""
+    from training.depth_assess import assess_depth_editor
+    from training.depth_editor import DEPTH_STAGES
     from training.editor_assess import assess_editor
-    from training.editor_export import facts_of
+    from training.editor_export import depth_facts_of, facts_of
 
-    card = assess_editor(weights / name, data, facts_of(stage, out), worlds=worlds, rounds=rounds)
+    if stage in DEPTH_STAGES:
+        card = assess_depth_editor(weights / name, data, depth_facts_of(stage, out), worlds=worlds)
+    else:
+        facts = facts_of(stage, out)
+        card = assess_editor(weights / name, data, facts, worlds=worlds, rounds=rounds)
     (weights / name / "card.md").write_text(card)
     typer.echo(card)
 

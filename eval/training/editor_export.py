@@ -4,35 +4,66 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import torch
 from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
-from training.editor import STAGES, TOKENS, EditorNet, scheduler
+from training.depth_editor import DEPTH_STAGES, DepthNet
+from training.editor import STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
 
 
 def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
     """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
-    from training.editor import STEPS_AN_EPOCH
-
     tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
     net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size)
-    stored = torch.load(out / f"{stage}.pt", weights_only=True)
+    return net, tokenizer, *_load(net, out / f"{stage}.pt")
+
+
+def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, int, float]:
+    """As :func:`averaged`, of a stage of :mod:`training.depth_editor`."""
+    tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
+    net = DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size)
+    return net, tokenizer, *_load(net, out / f"{stage}.pt")
+
+
+def _load(net: torch.nn.Module, checkpoint: Path) -> tuple[int, float]:
+    """Load a checkpoint's averaged weights; its steps so far and their seconds."""
+    stored = torch.load(checkpoint, weights_only=True)
     average = {k.removeprefix("module."): v for k, v in stored["average"].items()}
     del average["n_averaged"]
     net.load_state_dict(average)
-    return (
-        net.eval(), tokenizer, STEPS_AN_EPOCH * int(stored["epoch"]), float(stored["seconds"])
-    )  # fmt: skip
+    net.eval()
+    return STEPS_AN_EPOCH * int(stored["epoch"]), float(stored["seconds"])
 
 
 def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
+    net, tokenizer, _, _ = averaged(stage, out)
+    parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"], "image_encoder": [None, None]}
+    return _write(folder, net, tokenizer, "StableDiffusionInstructPix2PixPipeline", parts)
+
+
+def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
+    """Write a stage of :mod:`training.depth_editor` to ``folder``, as :func:`export_editor` does."""
+    net, tokenizer, _, _ = depth_averaged(stage, out)
+    net.half()
+    net.controlnet.save_pretrained(folder / "controlnet")
+    parts = {
+        "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
+        "image_encoder": [None, None],
+    }  # fmt: skip
+    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts)
+
+
+def _write(
+    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str | None]]
+) -> Path:
+    """Write what both kinds have, the list of all parts and their checksums."""
     from transformers import PreTrainedTokenizerFast
 
-    net, tokenizer, _, _ = averaged(stage, out)
     net.half()
     net.unet.save_pretrained(folder / "unet")
     net.text.save_pretrained(folder / "text_encoder")
@@ -42,17 +73,13 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
         tokenizer_object=tokenizer, pad_token="<pad>", eos_token="<end>", model_max_length=TOKENS
     )
     words.save_pretrained(folder / "tokenizer")
-    parts = {
-        "unet": ["attnwarp.editing.small_unet", "EditUNet"], "vae": ["attnwarp.editing.latents", "HaarLatents"],
+    index = {
+        "_class_name": pipeline, "requires_safety_checker": False,
+        "vae": ["attnwarp.editing.latents", "HaarLatents"],
         "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "PreTrainedTokenizerFast"],
         "scheduler": ["diffusers", "DDIMScheduler"], "safety_checker": [None, None], "feature_extractor": [None, None],
-        "image_encoder": [None, None],
-    }  # fmt: skip
-    index = {
-        "_class_name": "StableDiffusionInstructPix2PixPipeline",
-        "requires_safety_checker": False,
         **parts,
-    }
+    }  # fmt: skip
     (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
     write_sums(folder)
     for path in folder.rglob("*"):  # safetensors makes files that only their owner can read
@@ -78,4 +105,16 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
             " an editor's own working may rest on it alone.",
             "control": "the same steps as the injection stage without the injection.",
         }[plan.inject],
+    }  # fmt: skip
+
+
+def depth_facts_of(stage: str, out: Path) -> dict[str, object]:
+    """What the card of an editor of depth maps says about its training."""
+    _, _, steps, seconds = depth_averaged(stage, out)
+    plan = DEPTH_STAGES[stage]
+    done = steps >= plan.steps
+    return {
+        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds,
+        "start": plan.start,
+        "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
     }  # fmt: skip
