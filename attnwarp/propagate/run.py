@@ -24,7 +24,7 @@ from attnwarp.fit import FitSettings, extent_of
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, ViewEditor
-from attnwarp.propagate.folder import Folder, digest
+from attnwarp.propagate.folder import SEGMENTS_FOLDER, Folder, digest
 from attnwarp.propagate.pictures import (
     Bytes,
     Image,
@@ -237,6 +237,7 @@ class _Run:
         )
 
     def go(self) -> Propagation:
+        self._write_segments()
         if self.folder.has("times.json"):
             self.seconds = dict(self.folder.read_json("times.json"))
         self._edited_source()
@@ -247,6 +248,15 @@ class _Run:
         result = self._finish()
         self._tell("done", done=self.total)
         return result
+
+    def _write_segments(self) -> None:
+        if self.scene.segments is None:
+            return
+        (self.folder.path / SEGMENTS_FOLDER).mkdir(exist_ok=True)
+        for name, segment in zip(self.names, self.scene.segments, strict=True):
+            path = f"{SEGMENTS_FOLDER}/{name}.png"
+            if not self.folder.has(path):
+                self.folder.write_picture(path, mask_picture(torch.from_numpy(segment)))
 
     # --- editing
 

@@ -159,7 +159,9 @@ class PropagateSettings:
             ):
                 raise ValueError(f"{name}: got {value!r}, expected a list")
         for name, (low, high) in _LIMITS.items():
-            _check_number(name, getattr(self, name), low, high)
+            value = getattr(self, name)
+            if value is not None or name not in _OPTIONAL:
+                check.number(value, low, high, name, whole=name in _WHOLE)
         _check_start(self.start)
 
     def to_dict(self) -> dict[str, Any]:
@@ -216,17 +218,6 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "color_rate": (0, math.inf),
     "geometry_rate": (0, math.inf),
 }
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    if value is None and name in _OPTIONAL:
-        return
-    whole = name in _WHOLE
-    right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or not low <= value <= high:
-        kind = "a whole number" if whole else "a number"
-        bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
 
 
 def _check_start(start: tuple[int, int] | None) -> None:

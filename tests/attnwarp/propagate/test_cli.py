@@ -159,6 +159,7 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
+        (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
@@ -185,6 +186,26 @@ def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
     assert result.exit_code == 2
     assert 'instruction ("a bear", now "a robot")' in result.output
     assert "name another folder" in result.output
+
+
+def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
+    ply = ("--ply", place / "splats.ply")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((32, 32, 3), np.uint8)
+    half[:, :16] = 255
+    for camera in cameras():
+        (masks / camera.name).write_bytes(encode_png(half))
+    assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
+    stored = {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()}
+    assert stored == {camera.name: encode_png(half) for camera in cameras()}
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam", seed=2)
+    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    result = run(place, tmp_path / "out", *ply, "--where", "bear", *segmenter)
+    assert result.exit_code == 2
+    assert "holds an edit of other inputs.segments" in result.output
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
 
 
 def test_help_imports_nothing_heavy():
