@@ -533,11 +533,11 @@ def edit(
     ] = None,
     fit_iterations: Annotated[
         int, typer.Option(min=1, help="Of the fit, where no PLY is given.")
-    ] = 3000,
+    ] = 3_000,
     kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids, for the fit.")] = Kind.two,
     max_splats: Annotated[
-        int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
-    ] = None,
+        int, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
+    ] = 30_000,
     max_size: Annotated[
         int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
     ] = None,

@@ -32,17 +32,18 @@ FIRST_POINTS = 10_000
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a scene is fitted before it is edited.
+    """How a scene is fitted before it is edited. ``reports/editing/time.md`` has what the defaults
+    take, and what half and twice as much time buys.
 
     Args:
         iterations: of the fit.
         kind: "2d" or "3d".
-        max_splats: no more than these; None for no limit.
+        max_splats: no more than these.
     """
 
-    iterations: int
-    kind: str
-    max_splats: int | None
+    iterations: int = 3_000
+    kind: str = "2d"
+    max_splats: int = 30_000
 
 
 def edit_dataset(
