@@ -82,6 +82,7 @@ class Preset(StrEnum):
     """What a person may type for the choices of an edit."""
 
     corrected = "corrected"
+    extended = "extended"
     paper = "paper"
     released = "released"
     released_controlnet = "released-controlnet"

@@ -264,8 +264,8 @@ class ViewEditor:
         """
         s = self.settings
         if s.noise == "shared":
-            _, *shape = self._shape(targets[0])
-            return shared_noise((len(targets), *shape), s.seed)
+            _, c, h, w = self._shape(targets[0])
+            return shared_noise((len(targets), c, h, w), s.seed)
         if s.noise == "surface":
             return torch.stack([self.noise_field(target, sources).values for target in targets])
         return torch.cat([self._own_noise(target) for target in targets])

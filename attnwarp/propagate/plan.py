@@ -123,6 +123,8 @@ def choose_chain(
             seen_by_some[view] = seen_by_some.get(view, np.zeros_like(pixels)) | (pixels & surface)
             shares[view] = float(seen_by_some[view].sum() / max(1, surface.sum()))
         enough = {view: share for view, share in shares.items() if share >= coverage}
-        last = min(enough, key=enough.__getitem__) if enough else max(shares, key=shares.__getitem__)
+        last = (
+            min(enough, key=enough.__getitem__) if enough else max(shares, key=shares.__getitem__)
+        )
         chain.append(last)
     return tuple(chain)

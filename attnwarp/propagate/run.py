@@ -213,9 +213,7 @@ class _Run:
         self.names = self.folder.names
         disk = folder / RECORDING
         place: Store = disk if store == "disk" else "device" if store == "device" else "cpu"
-        self.view_editor = ViewEditor(
-            editor, instruction, settings, store=place, announce=announce
-        )
+        self.view_editor = ViewEditor(editor, instruction, settings, store=place, announce=announce)
         self.near = _near(scene.cameras)
         self._frozen_surfaces: dict[int, Surface] = {}
         self.seconds: dict[str, float] = {}
@@ -226,7 +224,9 @@ class _Run:
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
         self.done = 0
-        self.total = len(self.plan.edited) * settings.steps + len(self.plan.stages) * settings.iterations
+        self.total = (
+            len(self.plan.edited) * settings.steps + len(self.plan.stages) * settings.iterations
+        )
         chain = self.plan.chain
         self.folder.claim(
             {

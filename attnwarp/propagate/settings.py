@@ -285,6 +285,7 @@ PRESETS: dict[str, PropagateSettings] = {
         source_text_guidance=7.5,
     ),
     "corrected": PropagateSettings(),
+    "extended": PropagateSettings(sources=4),
 }
 """Sets of choices, each with the warp of that name (:data:`attnwarp.warp.PRESETS`).
 
@@ -299,6 +300,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
+
+``extended``: ``corrected`` with ideas beyond the paper, those that helped against truth.
 """
 
 

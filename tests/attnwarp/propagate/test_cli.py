@@ -1,5 +1,6 @@
 """The command as a person runs it, on a small random editor in a folder; the oracle is the library and the files."""
 
+import json
 import os
 import re
 import signal
@@ -102,6 +103,25 @@ def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_
     assert len(page.pictures) == 4 + 2 * 5 + 2 * 2
     assert (tmp_path / "source.png").read_bytes() in page.pictures
     assert not (tmp_path / "fit").exists()
+
+
+def test_the_page_shows_the_further_sources_in_their_order(place, tmp_path):
+    more = ("--ply", place / "splats.ply", "--set", "sources=3")
+    assert run(place, tmp_path, *more).exit_code == 0
+    chain = json.loads((tmp_path / "manifest.json").read_text())["chain"]
+    text = (tmp_path / "index.html").read_text()
+    section = text[text.index("<h2>Further sources") : text.index("<h2>Edited views")]
+    assert re.findall("<h3>(v.):", section) == chain
+    pictures = Page(section).pictures
+    for part in ("views", "masks", "features"):
+        for name in chain:
+            assert (tmp_path / part / f"{name}.png").read_bytes() in pictures
+    # The mask's colours are the sources' of the legend, the first of which is white.
+    colors = re.findall(r"background:rgb\((\d+), (\d+), (\d+)\)", section)
+    assert len(colors) == 3
+    allowed = {(0, 0, 0), *(tuple(map(int, color)) for color in colors)}
+    mask = read_image(tmp_path / "masks" / f"{chain[1]}.png").reshape(-1, 3)
+    assert {tuple(pixel) for pixel in mask.tolist()} <= allowed
 
 
 def test_without_splats_it_fits_them_first(place, tmp_path):

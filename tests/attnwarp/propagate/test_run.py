@@ -593,9 +593,7 @@ def test_a_view_at_a_further_sources_place_gets_that_sources_edit(scene, editor)
     settings = replace(
         QUICK, stages=1, views_per_stage=9, iterations=0, a0=1.0, decay="constant", sources=2, batch=1
     )  # fmt: skip
-    result = propagate(
-        model, [*views, twin], [*images, images[first]], editor, "a bear", settings
-    )
+    result = propagate(model, [*views, twin], [*images, images[first]], editor, "a bear", settings)
     assert result.plan.chain == (first,)
     assert np.array_equal(result.edited[first], result.edited[5])
     assert not np.array_equal(result.edited[0], result.edited[5])
