@@ -25,7 +25,7 @@ from attnwarp.editing.attention import (
 from attnwarp.editing.editor import Editor, edit, shared_noise
 from attnwarp.editing.inversion import edit_friendly_invert, replay
 from attnwarp.editing.schedule import steps_from
-from attnwarp.propagate.noise import NoiseField, carried
+from attnwarp.propagate.noise import carried, unmoved
 from attnwarp.propagate.pictures import Image
 from attnwarp.propagate.settings import PropagateSettings
 from attnwarp.propagate.sight import Sight
@@ -62,14 +62,14 @@ class Source:
         picture: (h, w, 3) in [0, 1].
         recording: its features; None where every view is edited alone.
         branches: of the batch while it was edited.
-        noise: that it started from, where noise sticks to the surface.
+        noise: (h, w) order of the noise that it started from, where noise sticks to the surface.
         estimates: (C, h, w) clean latents that were predicted at each step, where they are warped.
     """
 
     picture: Image
     recording: Recording | None
     branches: tuple[str, ...]
-    noise: NoiseField | None = None
+    noise: Tensor | None = None
     estimates: Sequence[Tensor] = ()
 
 
@@ -150,7 +150,7 @@ class ViewEditor:
                 replay(self.editor.schedule, task.predict, maps, watch=_ignoring(watch))
                 picture = by_hand
                 estimates = [self.editor.encode([by_hand])[0]] * s.steps
-        noise = self.noise_field(target, before) if s.noise == "surface" else None
+        noise = self.noise_order(target, before) if s.noise == "surface" else None
         return Source(picture, features, task.branches, noise, estimates)
 
     def targets(
@@ -267,30 +267,31 @@ class ViewEditor:
             _, c, h, w = self._shape(targets[0])
             return shared_noise((len(targets), c, h, w), s.seed)
         if s.noise == "surface":
-            return torch.stack([self.noise_field(target, sources).values for target in targets])
-        return torch.cat([self._own_noise(target) for target in targets])
+            rows = [shared_noise(self._shape(target), s.seed)[0].flatten(1) for target in targets]
+            orders = [self.noise_order(target, sources) for target in targets]
+            return torch.stack(
+                [
+                    row[:, order.flatten()].unflatten(1, tuple(order.shape))
+                    for row, order in zip(rows, orders, strict=True)
+                ]
+            )
+        return torch.cat([shared_noise(self._shape(t), s.seed + 1 + t.view) for t in targets])
 
-    def noise_field(self, target: Target, sources: Sequence[Source]) -> NoiseField:
-        """The noise of a view where noise sticks to the surface; the first source's is the shared
-        one.
+    def noise_order(self, target: Target, sources: Sequence[Source]) -> Tensor:
+        """(h, w) int64: the order of a view's noise where noise sticks to the surface; sources of
+        another size have none to give.
         """
-        if not sources:
-            noise = shared_noise(self._shape(target), self.settings.seed)[0]
-            return NoiseField.own(noise, target.view)
-        own = NoiseField.own(self._own_noise(target)[0], target.view)
-        fields = [source.noise for source in sources if source.noise is not None]
+        _, _, h, w = self._shape(target)
         if target.sight is None:
-            return own
-        size = (own.origin.shape[0], own.origin.shape[1])
-        positions = [
-            warp.at(size, source_size=(f.origin.shape[0], f.origin.shape[1])).correspondence.xy
-            for warp, f in zip(target.sight.views, fields, strict=True)
-        ]
-        return carried(own, fields, positions, target.sight.choice(size))
-
-    def _own_noise(self, target: Target) -> Tensor:
-        """(1, C, h, w)."""
-        return shared_noise(self._shape(target), self.settings.seed + 1 + target.view)
+            return unmoved((h, w))
+        orders, positions = [], []
+        for source, view in zip(sources, target.sight.views, strict=True):
+            order = source.noise
+            if order is None or tuple(order.shape) != (h, w):
+                return unmoved((h, w))
+            orders.append(order)
+            positions.append(view.at((h, w), source_size=(h, w)).correspondence.xy)
+        return carried(orders, positions, target.sight.choice((h, w)))
 
     def _shape(self, target: Target) -> tuple[int, int, int, int]:
         """Of one view's latents."""

@@ -1,16 +1,15 @@
 """Noise that sticks to the surface: a point has the same noise in every view that shows it.
 
-Every pixel of every view has a white value of its own. A target's pixel takes the value of the
-nearest pixel of its source instead, unless another pixel of the target takes that very value. So the
-pixels of a view hold different values, chosen by geometry alone: their noise is white, exactly.
-(Interpolated noise is not: its variance falls and neighbours correlate. Chang et al., "How I Warped
-Your Noise", ICLR 2024, sum the parts of subdivided pixels instead.)
+The noise of a view is that of all views with its pixels in another order. A pixel takes the value
+of the nearest pixel of its source; values that no pixel takes go to those without a source. The
+order follows from the geometry alone, so a view's noise is exactly as white as the one it is drawn
+from, with the same mean. (Interpolated noise is not: its variance falls and neighbours correlate.
+Chang et al., "How I Warped Your Noise", ICLR 2024, subdivide pixels and sum the parts instead.)
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,82 +18,61 @@ from torch import Tensor
 from attnwarp import check
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseField:
-    """The noise of a view.
+def unmoved(size: tuple[int, int]) -> Tensor:
+    """(h, w) int64: the order of a first source, each pixel with its own value.
 
-    Attributes:
-        values: (C, h, w), white with unit variance.
-        origin: (h, w) int64: view and pixel whose own value it is; equal numbers, equal values.
+    Example:
+        >>> unmoved((2, 3)).tolist()
+        [[0, 1, 2], [3, 4, 5]]
     """
-
-    values: Tensor
-    origin: Tensor
-
-    @classmethod
-    def own(cls, values: Tensor, view: int) -> NoiseField:
-        """A field that carries nothing.
-
-        Args:
-            values: (C, h, w) white noise of the view's own.
-            view: its number.
-
-        Example:
-            >>> NoiseField.own(torch.zeros(4, 2, 3), 1).origin[1].tolist()
-            [4294967299, 4294967300, 4294967301]
-        """
-        check.shape(values, ("C", "h", "w"), "values")
-        h, w = values.shape[1:]
-        return cls(values, (view << 32) + torch.arange(h * w).reshape(h, w))
+    return torch.arange(size[0] * size[1]).reshape(size)
 
 
-def carried(
-    own: NoiseField, sources: Sequence[NoiseField], positions: Sequence[Tensor], choice: Tensor
-) -> NoiseField:
-    """A target's noise: its source's where it sees one, its own elsewhere.
+def carried(sources: Sequence[Tensor], positions: Sequence[Tensor], choice: Tensor) -> Tensor:
+    """The order of a target's noise.
 
     Of pixels that would take the same value, the one nearest to the value's pixel gets it, the
-    first of equally near ones.
+    first of equally near ones. Of the others, those whose own value is free take that one, and the
+    rest the free values in their order.
 
     Args:
-        own: of the target, (C, h, w).
-        sources: fields of the sources, of any size.
+        sources: (h, w) int64 orders: pixel p of the source has value number ``order[p]``.
         positions: (h, w, 2) px of each source's grid (centres at +0.5).
         choice: (h, w) number of the source that a pixel takes, -1 for none.
 
+    Returns:
+        (h, w) int64, a permutation of the h w numbers.
+
     Example:
-        >>> source = NoiseField.own(torch.arange(4.0).reshape(1, 1, 4), 0)
-        >>> target = NoiseField.own(-torch.ones(1, 1, 4), 1)
         >>> x = torch.tensor([1.2, 1.6, 2.5, 3.5])  # the first two both fall into pixel 1
         >>> xy = torch.stack([x, torch.full((4,), 0.5)], dim=-1)[None]
-        >>> carried(target, [source], [xy], torch.zeros(1, 4, dtype=torch.int64)).values
-        tensor([[[-1.,  1.,  2.,  3.]]])
+        >>> carried([unmoved((1, 4))], [xy], torch.zeros(1, 4, dtype=torch.int64)).tolist()
+        [[0, 1, 2, 3]]
+        >>> carried([unmoved((1, 4))], [xy + torch.tensor([1.0, 0])], torch.zeros(1, 4, dtype=torch.int64)).tolist()
+        [[0, 2, 3, 1]]
     """
-    shape = tuple(own.origin.shape)
-    check.shape(choice, shape, "choice")
-    values, origin = own.values.flatten(1).clone(), own.origin.flatten().clone()
-    pixels, taken, distances = [], [], []
-    for number, (source, xy) in enumerate(zip(sources, positions, strict=True)):
-        check.shape(xy, (*shape, 2), "positions")
-        h, w = source.origin.shape
-        wanted = ((choice == number) & torch.isfinite(xy).all(dim=-1)).flatten()
+    h, w = choice.shape
+    pixels, values, distances = [], [], []
+    for number, (order, xy) in enumerate(zip(sources, positions, strict=True)):
+        check.shape(order, (h, w), "sources")
+        check.shape(xy, (h, w, 2), "positions")
+        inside = (xy >= 0).all(dim=-1) & (xy[..., 0] <= w) & (xy[..., 1] <= h)  # not for NaN
+        wanted = ((choice == number) & inside).flatten()
         place = xy.reshape(-1, 2)[wanted]
-        column, row = place[:, 0].floor().clamp(0, w - 1), place[:, 1].floor().clamp(0, h - 1)
-        index = (row * w + column).long()
-        pixels.append(wanted.nonzero()[:, 0])
-        taken.append(source.origin.flatten()[index])
-        offset = place - torch.stack([column, row], dim=-1) - 0.5
-        distances.append(offset.square().sum(dim=-1))
-        values[:, wanted] = source.values.flatten(1)[:, index].to(values)
-    pixel, value = torch.cat(pixels), torch.cat(taken)
-    order = np.lexsort((pixel.numpy(), torch.cat(distances).numpy(), value.numpy()))
-    sorted_values = value.numpy()[order]
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = sorted_values[1:] != sorted_values[:-1]
-    winners = pixel[torch.from_numpy(order[first])]
-    lost = torch.ones(origin.shape, dtype=torch.bool)
-    lost[winners] = False
-    origin[pixel] = value
-    values[:, lost] = own.values.flatten(1)[:, lost]
-    origin[lost] = own.origin.flatten()[lost]
-    return NoiseField(values.reshape(own.values.shape), origin.reshape(shape))
+        column, row = place[:, 0].floor().clamp(max=w - 1), place[:, 1].floor().clamp(max=h - 1)
+        pixels.append(wanted.nonzero()[:, 0].numpy())
+        values.append(order.flatten()[(row * w + column).long()].numpy())
+        center = torch.stack([column, row], dim=-1) + 0.5
+        distances.append((place - center).square().sum(dim=-1).numpy())
+    pixel, value = np.concatenate(pixels), np.concatenate(values)
+    ranked = np.lexsort((pixel, np.concatenate(distances), value))
+    pixel, value = pixel[ranked], value[ranked]
+    first = np.ones(len(value), dtype=bool)
+    first[1:] = value[1:] != value[:-1]
+    result = np.full(h * w, -1)
+    result[pixel[first]] = value[first]
+    free = np.setdiff1d(np.arange(h * w), value)
+    own = free[result[free] < 0]
+    result[own] = own
+    result[result < 0] = np.setdiff1d(free, own)
+    return torch.from_numpy(result.reshape(h, w))
