@@ -46,9 +46,10 @@ def carried(sources: Sequence[Tensor], positions: Sequence[Tensor], choice: Tens
     Example:
         >>> x = torch.tensor([1.2, 1.6, 2.5, 3.5])  # the first two both fall into pixel 1
         >>> xy = torch.stack([x, torch.full((4,), 0.5)], dim=-1)[None]
-        >>> carried([unmoved((1, 4))], [xy], torch.zeros(1, 4, dtype=torch.int64)).tolist()
+        >>> source, first = unmoved((1, 4)), torch.zeros(1, 4, dtype=torch.int64)
+        >>> carried([source], [xy], first).tolist()
         [[0, 1, 2, 3]]
-        >>> carried([unmoved((1, 4))], [xy + torch.tensor([1.0, 0])], torch.zeros(1, 4, dtype=torch.int64)).tolist()
+        >>> carried([source], [xy + torch.tensor([1.0, 0])], first).tolist()
         [[0, 2, 3, 1]]
     """
     h, w = choice.shape
