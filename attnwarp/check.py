@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -47,6 +48,22 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
             f"{name}: {array[index]} at index {index}; {int(bad.sum())} of {array.size} values are"
             " not finite"
         )
+
+
+def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> None:
+    """Raise ValueError unless ``value`` is a finite number in [low, high], whole if asked.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.number(2.5, 0, float("inf"), "steps", whole=True)
+        Traceback (most recent call last):
+        ValueError: steps: got 2.5, expected a whole number >= 0
+    """
+    right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    if not right or not math.isfinite(value) or not low <= value <= high:
+        kind = "a whole number" if whole else "a number"
+        bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+        raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
 
 
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:

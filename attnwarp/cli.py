@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
-from attnwarp.editing.cli import SegmenterOption, WhereOption, edit_image
+from attnwarp.editing.cli import (
+    SEGMENTER,
+    SegmenterOption,
+    ThreadsOption,
+    WhereOption,
+    check_segmenter,
+    edit_image,
+)
 from attnwarp.errors import InputWarning
 
 if TYPE_CHECKING:
@@ -75,6 +82,7 @@ class Preset(StrEnum):
     """What a person may type for the choices of an edit."""
 
     corrected = "corrected"
+    extended = "extended"
     paper = "paper"
     released = "released"
     released_controlnet = "released-controlnet"
@@ -503,7 +511,7 @@ def edit(
         Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
     ] = None,
     words: WhereOption = None,
-    segmenter: SegmenterOption = "clip-small",
+    segmenter: SegmenterOption = None,
     stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
     views_per_stage: Annotated[
         int | None, typer.Option(min=1, help="New views a stage edits.")
@@ -526,20 +534,17 @@ def edit(
     ] = None,
     fit_iterations: Annotated[
         int, typer.Option(min=1, help="Of the fit, where no PLY is given.")
-    ] = 3000,
+    ] = 3_000,
     kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids, for the fit.")] = Kind.two,
     max_splats: Annotated[
-        int | None, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
-    ] = None,
+        int, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
+    ] = 30_000,
     max_size: Annotated[
         int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
     ] = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, help="CPU threads; all cores if left out, one for a bundled editor."),
-    ] = None,
+    threads: ThreadsOption = None,
     format: FormatOption = None,
     images: ImagesOption = None,
     missing_images: MissingOption = MissingImages.error,
@@ -556,19 +561,13 @@ def edit(
         changes = {name: value for name, value in options.items() if value is not None}
         flags = {name: f"--{name.replace('_', '-')}" for name in options}
         changes |= _assignments(change or [], {**flags, "method": "--each-view-alone"})
+        check_segmenter(segmenter, words)
         _check_out(out)
 
         from attnwarp.propagate.settings import preset as choices
 
         settings = choices(preset.value, **changes)
         _use_threads(threads)
-        import torch
-
-        from attnwarp.editing.small import bundled
-
-        # Bundled networks gain little from threads, and lose much where others want the cores.
-        small = editor in bundled()
-        torch.set_num_threads(threads or (1 if small else len(os.sched_getaffinity(0))))
         dataset = _read_views(
             data,
             format=format,
@@ -583,8 +582,9 @@ def edit(
         result, page = edit_dataset(
             dataset, splats, editor, instruction, settings, out,
             fit_plan=FitPlan(fit_iterations, kind.value[:2], max_splats), source=source,
-            source_picture=source_picture, masks=masks, words=words, segmenter=segmenter,
-            max_size=max_size, store=store.value, device=device,
+            source_picture=source_picture, masks=masks, words=words,
+            segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
+            threads=threads,
             say=lambda text: typer.echo(text, err=True),
         )  # fmt: skip
         seconds = sum(result.seconds.values())

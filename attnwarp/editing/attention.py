@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.warp import FeatureWarp, resize_mask
+from attnwarp.warp import resize_mask
 
 Kind = Literal["self", "cross"]
 Block = Literal["down", "mid", "up"]
@@ -30,11 +30,19 @@ CONTROLNET_BRANCHES = ("uncond", "text")
 """The same of its ControlNet and plain pipelines."""
 
 
+class TokenWarp(Protocol):
+    """The warp of one grid, such as :class:`attnwarp.warp.FeatureWarp`."""
+
+    def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
+        """(1, H W, C) of the source's (1, h w, C) tokens, warped, and the target's own."""
+        ...
+
+
 class LayerWarp(Protocol):
     """What leads from a source view to a target view, such as
     :class:`attnwarp.warp.WarpedView`."""
 
-    def at(self, size: Size, *, source_size: Size | None = None) -> FeatureWarp:
+    def at(self, size: Size, *, source_size: Size | None = None) -> TokenWarp:
         """The warp of an (h, w) grid of the target from a grid of the source."""
         ...
 

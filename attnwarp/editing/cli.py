@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 TILE_COLUMNS = 5
 
+SEGMENTER = "clip-small"
+"""What ``--where`` asks if ``--segmenter`` is left out."""
+
 WhereOption = Annotated[
     str | None,
     typer.Option(
@@ -19,8 +22,14 @@ WhereOption = Annotated[
     ),
 ]
 SegmenterOption = Annotated[
-    str,
-    typer.Option(help="What --where asks: clip-small, or DINO_FOLDER,SAM_FOLDER (transformers)."),
+    str | None,
+    typer.Option(
+        help="What --where asks: clip-small if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
+    ),
+]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="CPU threads; if left out, one for a small editor, else all cores."),
 ]
 
 
@@ -47,15 +56,17 @@ def edit_image(
         Path | None, typer.Option(help="PNG file for a sheet of the picture after every step.")
     ] = None,
     words: WhereOption = None,
-    segmenter: SegmenterOption = "clip-small",
+    segmenter: SegmenterOption = None,
     mask_out: Annotated[
         Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
     ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""
     if mask_out is not None and words is None:
         raise ValueError("--mask: needs --where, which makes the mask")
+    check_segmenter(segmenter, words)
     for path in (out, sheet, mask_out):
         if path is not None and path.suffix.lower() != ".png":
             raise ValueError(f"{path}: expected a name that ends in .png")
@@ -64,21 +75,23 @@ def edit_image(
     image = _read(picture)
 
     import numpy as np
+    import torch
 
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
-    from attnwarp.editing.small import load_editor
+    from attnwarp.editing.small import load_editor, thread_count
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     model = load_editor(editor, device=device, **given)
     if model.guide != "picture":
         raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
+    torch.set_num_threads(thread_count(model, threads))
     image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)
     h, w = image.shape[:2]
     share = None
     if words is not None:
-        mask = load_segmenter(segmenter, device=device).segment(image, words)
+        mask = load_segmenter(segmenter or SEGMENTER, device=device).segment(image, words)
         share = mask[..., None].astype(np.float32)
         if mask_out is not None:
             _write(mask_out, np.repeat(share, 3, axis=2))
@@ -96,6 +109,12 @@ def edit_image(
     if sheet is not None:
         _write(sheet, _sheet(tiles))
     typer.echo(out)
+
+
+def check_segmenter(segmenter: str | None, words: str | None) -> None:
+    """Refuse ``--segmenter`` without ``--where``."""
+    if segmenter is not None and words is None:
+        raise ValueError("--segmenter: needs --where, the words that it looks for")
 
 
 def _stderr() -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -112,6 +113,7 @@ def edit(
     noise: Tensor | None = None,
     latents: Tensor | None = None,
     watch: Callable[[int, int, Tensor], None] | None = None,
+    estimate: Callable[[int, Tensor], Tensor] | None = None,
 ) -> Edit:
     """Edit views together. Record or inject attention by running this inside
     :func:`attnwarp.editing.attention.record` or :func:`~attnwarp.editing.attention.inject`.
@@ -128,6 +130,8 @@ def edit(
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion.
         watch: called with the step, the number of steps and the latents after each step.
+        estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
+            what it returns takes their place.
 
     Returns:
         The edited views.
@@ -155,7 +159,8 @@ def edit(
         x = editor.schedule.add_noise(before, noise, start)
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
-            x = editor.schedule.step(task.predict(x, now), x, now, then)
+            change = None if estimate is None else partial(estimate, number)
+            x = editor.schedule.step(task.predict(x, now), x, now, then, change)
             if watch is not None:
                 watch(number, len(timesteps), x)
     return Edit(editor.decode(x), x, timesteps)

@@ -100,7 +100,7 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     """A network of diffusers or transformers from its folder.
 
     Raises:
-        InputError: files that cannot be read, or that lack tensors.
+        InputError: files that cannot be read, lack tensors, or hold values that are not finite.
     """
     from transformers import PreTrainedModel
     from transformers.utils import logging
@@ -124,6 +124,12 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
         lost = sorted(report["missing_keys"])
         raise InputError(
             f"{folder}: its weights lack {lost[0]} and {len(lost) - 1} more; fetch the model again"
+        )
+    damaged = [name for name, v in network.state_dict().items() if not bool(v.isfinite().all())]
+    if damaged:
+        raise InputError(
+            f"{folder}: its weights have NaN or infinite values in {damaged[0]}"
+            f"{f' and {len(damaged) - 1} more' if len(damaged) > 1 else ''}; fetch the model again"
         )
     return network.to(device)
 

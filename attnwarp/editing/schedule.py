@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -54,15 +55,29 @@ class Schedule:
                 return output, (x - a.sqrt() * output) / (1 - a).sqrt()
         return a.sqrt() * x - (1 - a).sqrt() * output, a.sqrt() * output + (1 - a).sqrt() * x
 
-    def step(self, output: Tensor, x: Tensor, timestep: int, following: int | None) -> Tensor:
+    def step(
+        self,
+        output: Tensor,
+        x: Tensor,
+        timestep: int,
+        following: int | None,
+        change: Callable[[Tensor], Tensor] | None = None,
+    ) -> Tensor:
         """One deterministic DDIM step (Song et al. 2021, eq. 12 with eta 0).
 
         Args:
             output: of the network at ``x``.
             timestep: of ``x``.
             following: the step that follows, None after the last.
+            change: takes the predicted x_0 and returns what stands in its place; the noise is then
+                what that x_0 leaves of ``x``.
         """
-        x0, noise = self.split(output, x, self.alpha(timestep))
+        now = self.alpha(timestep)
+        x0, noise = self.split(output, x, now)
+        if change is not None:
+            changed = change(x0)
+            if changed is not x0:
+                x0, noise = changed, (x - now.to(x).sqrt() * changed) / (1 - now.to(x)).sqrt()
         a = self.alpha(following).to(x)
         return a.sqrt() * x0 + (1 - a).sqrt() * noise
 

@@ -134,11 +134,7 @@ class FitSettings:
             if value is None and name in _OPTIONAL:
                 continue
             whole = name in _WHOLE
-            right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-            if not right or not math.isfinite(value) or not low <= value <= high:
-                kind = "a whole number" if whole else "a number"
-                bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-                raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
+            check.number(value, low, high, name, whole=whole)
             if not whole:
                 object.__setattr__(self, name, float(value))
 

@@ -2,53 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from attnwarp.camera import Camera
-from attnwarp.editing.segment import Segmenter, load_segmenter, segments_of
-from attnwarp.editing.small import load_editor
+from attnwarp.editing.segment import load_segmenter, segments_of
+from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, random_points
 from attnwarp.fit.progress import progress_display as fit_progress
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, read_image
-from attnwarp.io.file import write_atomically
-from attnwarp.io.images import encode_png
-from attnwarp.io.names import file_stems
-from attnwarp.propagate.folder import Folder
+from attnwarp.propagate.folder import SEGMENTS_FOLDER, Folder
 from attnwarp.propagate.page import write_page
-from attnwarp.propagate.pictures import mask_picture
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.settings import PropagateSettings
 
 FIT_FOLDER = "fit"
-SEGMENTS_FOLDER = "segments"
 
 FIRST_POINTS = 10_000
 
 
 @dataclass(frozen=True)
 class FitPlan:
-    """How a scene is fitted before it is edited.
+    """How a scene is fitted before it is edited. ``reports/editing/time.md`` has what the defaults
+    take, and what half and twice as much time buys.
 
     Args:
         iterations: of the fit.
         kind: "2d" or "3d".
-        max_splats: no more than these; None for no limit.
+        max_splats: no more than these.
     """
 
-    iterations: int
-    kind: str
-    max_splats: int | None
+    iterations: int = 3_000
+    kind: str = "2d"
+    max_splats: int = 30_000
 
 
 def edit_dataset(
@@ -68,6 +63,7 @@ def edit_dataset(
     max_size: int | None,
     store: Any,
     device: str,
+    threads: int | None,
     say: Callable[[str], None],
 ) -> tuple[Propagation, Path]:
     """Fit where no splats are given, edit, and write the page.
@@ -83,10 +79,11 @@ def edit_dataset(
         source: name or number of the source view; the first if None.
         source_picture: file of the source view edited elsewhere.
         masks: folder with a mask picture for each view.
-        words: of what is edited, instead of masks; the masks go to ``segments/`` of the folder.
+        words: of what is edited, instead of masks.
         segmenter: makes them; see :func:`attnwarp.editing.segment.load_segmenter`.
         max_size: larger pictures are averaged down to it.
         store, device: see :func:`attnwarp.propagate.propagate` and ``load_editor``.
+        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
         say: shows a line to the user.
 
     Returns:
@@ -106,13 +103,15 @@ def edit_dataset(
     if words is not None:
         by_words = load_segmenter(segmenter, device=device)
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
-        segments = _masks_by_words(by_words, words, images, views, out / SEGMENTS_FOLDER)
+        segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
+        segments = [segment(k, image) for k, image in enumerate(images)]
     by_hand = None if source_picture is None else _rgb(read_image(source_picture))
     editor = load_editor(editor_name, device=device)
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
+    torch.set_num_threads(thread_count(editor, threads))
     with progress_display(title=out.name) as watch:
         result = propagate(
             splats,
@@ -186,28 +185,6 @@ def _masks(folder: Path, cameras: Any) -> list[npt.NDArray[np.bool_]]:
             raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
         masks.append(_mask(path, camera))
     return masks
-
-
-def _masks_by_words(
-    segmenter: Segmenter,
-    words: str,
-    images: Sequence[npt.NDArray[np.float32]],
-    views: Views,
-    folder: Path,
-) -> list[npt.NDArray[np.bool_]]:
-    """(H, W) bool of each view, also as NAME.png: what ``--masks`` reads."""
-    segment = segments_of(segmenter, words, [camera.name for camera in views.cameras])
-    folder.mkdir(parents=True, exist_ok=True)
-    masks = []
-    for k, (name, image) in enumerate(zip(file_stems(views.cameras), images, strict=True)):
-        masks.append(segment(k, image))
-        data = encode_png(mask_picture(torch.from_numpy(masks[-1])))
-        write_atomically(folder / f"{name}.png", partial(_put, data=data))
-    return masks
-
-
-def _put(stream: BinaryIO, data: bytes) -> None:
-    stream.write(data)
 
 
 def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:

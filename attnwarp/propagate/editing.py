@@ -1,9 +1,9 @@
-"""The edit of the source view, recorded, and of target views with its features."""
+"""The edits of source views, recorded, and of target views with their features."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,6 @@ from torch import Tensor
 
 from attnwarp.editing.attention import (
     Layer,
-    LayerWarp,
     Recording,
     RecordingPlan,
     choose_layers,
@@ -26,8 +25,10 @@ from attnwarp.editing.attention import (
 from attnwarp.editing.editor import Editor, edit, shared_noise
 from attnwarp.editing.inversion import edit_friendly_invert, replay
 from attnwarp.editing.schedule import steps_from
-from attnwarp.propagate.pictures import Image, Size
+from attnwarp.propagate.noise import carried, unmoved
+from attnwarp.propagate.pictures import Image
 from attnwarp.propagate.settings import PropagateSettings
+from attnwarp.propagate.sight import Sight
 
 Guide = npt.NDArray[Any]
 Store = Literal["device", "cpu"] | Path
@@ -37,18 +38,39 @@ BRANCHES = ("text", "image")
 
 
 @dataclass(frozen=True, eq=False)
+class Target:
+    """A view to edit.
+
+    Attributes:
+        view: its number, which its own noise depends on.
+        guide: (h, w, 3) picture or (h, w) depth, as the editor takes it.
+        start_picture: (h, w, 3) that is noised to the settings' ``start``.
+        sight: how the sources see it; None where there are none.
+    """
+
+    view: int
+    guide: Guide
+    start_picture: Image | None = None
+    sight: Sight | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Source:
-    """The source's edit.
+    """A source's edit.
 
     Attributes:
         picture: (h, w, 3) in [0, 1].
         recording: its features; None where every view is edited alone.
         branches: of the batch while it was edited.
+        noise: (h, w) order of the noise that it started from, where noise sticks to the surface.
+        estimates: (C, h, w) clean latents that were predicted at each step, where they are warped.
     """
 
     picture: Image
     recording: Recording | None
     branches: tuple[str, ...]
+    noise: Tensor | None = None
+    estimates: Sequence[Tensor] = ()
 
 
 class ViewEditor:
@@ -58,12 +80,10 @@ class ViewEditor:
         editor: the model.
         instruction: in words.
         settings: see there.
-        source_size: (h, w) px of the source's edit.
         store: where recorded features go.
         announce: told the memory of a recording before it is made.
 
     Attributes:
-        calls: passes of the UNet so far, times the rows of their batch.
         timestep: drawn to start from; None for pure noise.
     """
 
@@ -72,13 +92,12 @@ class ViewEditor:
         editor: Editor,
         instruction: str,
         settings: PropagateSettings,
-        source_size: Size,
         *,
         store: Store = "cpu",
         announce: Callable[[str], None] | None = None,
     ) -> None:
         self.editor, self.instruction, self.settings = editor, instruction, settings
-        self.source_size, self.store, self.announce = source_size, store, announce
+        self.store, self.announce = store, announce
         self.layers: tuple[Layer, ...] = ()
         if settings.method == "warp":
             self.layers = choose_layers(
@@ -96,112 +115,192 @@ class ViewEditor:
 
     def source(
         self,
-        view: int,
-        guide: Guide,
-        start_picture: Image | None = None,
+        target: Target,
+        before: Sequence[Source] = (),
+        *,
         by_hand: Image | None = None,
         watch: Callable[[], None] | None = None,
     ) -> Source:
-        """Edit the source view and record its features.
+        """Edit a source view and record its features.
 
         Args:
-            view: number of the source view, which fresh noise depends on.
-            guide: of it.
-            start_picture: (h, w, 3) that is noised to the settings' ``start``.
+            target: the view.
+            before: the sources so far, whose features it gets.
             by_hand: (h, w, 3), an edit made elsewhere; its own noise is then replayed.
             watch: called after each step.
         """
         s = self.settings
-        value = s.guidance(0) if s.source_text_guidance is None else s.source_text_guidance
-        start_pictures = None if start_picture is None else [start_picture]
-        with guided(self.editor, value):
-            task = self.editor.task([guide], self.instruction)
-            recording = (
-                record(self.editor.unet, self._plan(task.branches), announce=self.announce)
-                if self.layers
-                else nullcontext()
-            )
-            if by_hand is None:
-                with recording as features:
-                    picture = self._edit([guide], [view], start_pictures, watch)[0]
+        first_guidance = s.source_text_guidance if not before else None
+        value = s.guidance(0) if first_guidance is None else first_guidance
+        features: Recording | None = None
+        with guided(self.editor, value), ExitStack() as stack:
+            task = self.editor.task([target.guide], self.instruction)
+            maps = None if by_hand is None else self._inversion(task, by_hand)
+            self._inject(stack, before, [target], task.branches)
+            if self.layers:
+                # After the injection: what the next source gets is what this one went on with.
+                plan = self._plan(task.branches, target)
+                features = stack.enter_context(
+                    record(self.editor.unet, plan, announce=self.announce)
+                )
+            estimates: list[Tensor] = []
+            if by_hand is None or maps is None:
+                picture = self._edit([target], before, watch, estimates)[0]
             else:
-                maps = self._inversion(task, by_hand)
-                with recording as features:
-                    replay(self.editor.schedule, task.predict, maps, watch=_ignoring(watch))
+                replay(self.editor.schedule, task.predict, maps, watch=_ignoring(watch))
                 picture = by_hand
-        return Source(picture, features, task.branches)
+                estimates = [self.editor.encode([by_hand])[0]] * s.steps
+        noise = self.noise_order(target, before) if s.noise == "surface" else None
+        return Source(picture, features, task.branches, noise, estimates)
 
     def targets(
         self,
-        source: Source,
-        guides: Sequence[Guide],
-        views: Sequence[int],
-        warps: Sequence[LayerWarp | None],
+        sources: Sequence[Source],
+        targets: Sequence[Target],
         stage: int,
-        start_pictures: Sequence[Image] | None = None,
         watch: Callable[[], None] | None = None,
     ) -> list[Image]:
-        """Edit target views together, with the source's features where there are any.
+        """Edit target views together, with the sources' features where there are any.
 
         Args:
-            source: of :meth:`source`.
-            guides: of the views, all of one size.
-            views: their numbers, which fresh noise depends on.
-            warps: of the views; not used where every view is edited alone.
+            sources: of :meth:`source`.
+            targets: the views, all of one size.
             stage: from 0.
-            start_pictures: as for :meth:`source`.
             watch: called after each step.
         """
+        with guided(self.editor, self.settings.guidance(stage)), ExitStack() as stack:
+            branches = self._branches(sources[0], targets)
+            self._inject(stack, sources, targets, branches)
+            return self._edit(targets, sources, watch)
+
+    def _inject(
+        self,
+        stack: ExitStack,
+        sources: Sequence[Source],
+        targets: Sequence[Target],
+        branches: tuple[str, ...],
+    ) -> None:
+        """Inject every source's features while the stack is open. No pixel takes two sources, so
+        their order does not matter.
+        """
         s = self.settings
-        with guided(self.editor, s.guidance(stage)):
+        weight = decay(s.a0) if s.decay == "linear" else constant(s.a0)
+        for number, source in enumerate(sources):
             if source.recording is None:
-                return self._edit(guides, views, start_pictures, watch)
-            weight = decay(s.a0) if s.decay == "linear" else constant(s.a0)
-            with inject(
-                self.editor.unet,
-                source.recording,
-                branches=self._branches(source, guides[:1]),
-                warps=warps,
-                weight=weight,
-            ):
-                return self._edit(guides, views, start_pictures, watch)
+                continue
+            warps = [None if t.sight is None else t.sight.warp(number) for t in targets]
+            stack.enter_context(
+                inject(
+                    self.editor.unet,
+                    source.recording,
+                    branches=branches,
+                    warps=warps,
+                    weight=weight,
+                )
+            )
 
     def _edit(
         self,
-        guides: Sequence[Guide],
-        views: Sequence[int],
-        start_pictures: Sequence[Image] | None,
+        targets: Sequence[Target],
+        sources: Sequence[Source],
         watch: Callable[[], None] | None,
+        estimates: list[Tensor] | None = None,
     ) -> list[Image]:
         s = self.settings
+        starts = [target.start_picture for target in targets]
         result = edit(
             self.editor,
-            guides,
+            [target.guide for target in targets],
             self.instruction,
             steps=s.steps,
             start=self.timestep,
-            pictures=start_pictures,
-            noise=self.noise(guides, views),
+            pictures=None if starts[0] is None else [p for p in starts if p is not None],
+            noise=self.noise(targets, sources),
             watch=_ignoring(watch),
+            estimate=self._estimate(targets, sources, estimates),
         )
         return result.images
 
-    def noise(self, guides: Sequence[Guide], views: Sequence[int]) -> Tensor:
-        """(B, C, h, w) noise of views: one for all of a size, or one of each view's own."""
+    def _estimate(
+        self,
+        targets: Sequence[Target],
+        sources: Sequence[Source],
+        store: list[Tensor] | None,
+    ) -> Callable[[int, Tensor], Tensor] | None:
+        """What stands in the place of the predicted clean latents; ``store`` gets a lone view's."""
         s = self.settings
-        shape = self._shape(guides)
+        if s.estimate == 0:
+            return None
+        warps = [
+            [t.sight.warp(k) for k in range(len(sources))] if t.sight is not None else []
+            for t in targets
+        ]
+
+        def change(number: int, x0: Tensor) -> Tensor:
+            weight = s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
+            result = x0
+            if weight > 0 and sources:
+                rows = []
+                size = (x0.shape[2], x0.shape[3])
+                for own, view_warps in zip(x0, warps, strict=True):
+                    tokens = own.flatten(1).T[None].contiguous()
+                    for warp, source in zip(view_warps, sources, strict=False):
+                        map_ = source.estimates[number].to(own)
+                        layer = warp.at(size, source_size=(map_.shape[1], map_.shape[2]))
+                        tokens = layer.blend_tokens(
+                            map_.flatten(1).T[None].contiguous(), tokens, weight
+                        )
+                    rows.append(tokens[0].T.reshape(own.shape))
+                result = torch.stack(rows)
+            if store is not None:
+                store.append(result[0].clone())
+            return result
+
+        return change
+
+    def noise(self, targets: Sequence[Target], sources: Sequence[Source] = ()) -> Tensor:
+        """(B, C, h, w) noise of views: one for all of a size, one of each view's own, or one that
+        sticks to the surface.
+        """
+        s = self.settings
         if s.noise == "shared":
-            return shared_noise(shape, s.seed)
-        one = (1, *shape[1:])
-        return torch.cat([shared_noise(one, s.seed + 1 + view) for view in views])
+            _, c, h, w = self._shape(targets[0])
+            return shared_noise((len(targets), c, h, w), s.seed)
+        if s.noise == "surface":
+            rows = [shared_noise(self._shape(target), s.seed)[0].flatten(1) for target in targets]
+            orders = [self.noise_order(target, sources) for target in targets]
+            return torch.stack(
+                [
+                    row[:, order.flatten()].unflatten(1, tuple(order.shape))
+                    for row, order in zip(rows, orders, strict=True)
+                ]
+            )
+        return torch.cat([shared_noise(self._shape(t), s.seed + 1 + t.view) for t in targets])
 
-    def _shape(self, guides: Sequence[Guide]) -> tuple[int, int, int, int]:
-        h, w = (side // self.editor.factor for side in guides[0].shape[:2])
-        return len(guides), self.editor.unet.config.out_channels, h, w
+    def noise_order(self, target: Target, sources: Sequence[Source]) -> Tensor:
+        """(h, w) int64: the order of a view's noise where noise sticks to the surface; sources of
+        another size have none to give.
+        """
+        _, _, h, w = self._shape(target)
+        if target.sight is None:
+            return unmoved((h, w))
+        orders, positions = [], []
+        for source, view in zip(sources, target.sight.views, strict=True):
+            order = source.noise
+            if order is None or tuple(order.shape) != (h, w):
+                return unmoved((h, w))
+            orders.append(order)
+            positions.append(view.at((h, w), source_size=(h, w)).correspondence.xy)
+        return carried(orders, positions, target.sight.choice((h, w)))
 
-    def _plan(self, branches: tuple[str, ...]) -> RecordingPlan:
+    def _shape(self, target: Target) -> tuple[int, int, int, int]:
+        """Of one view's latents."""
+        h, w = (side // self.editor.factor for side in target.guide.shape[:2])
+        return 1, self.editor.unet.config.out_channels, h, w
+
+    def _plan(self, branches: tuple[str, ...], target: Target) -> RecordingPlan:
         s = self.settings
-        h, w = (side // self.editor.factor for side in self.source_size)
+        _, _, h, w = self._shape(target)
         if s.branches is not None:
             keep = s.branches
         elif self.editor.guide == "picture":
@@ -215,15 +314,15 @@ class ViewEditor:
             keep,
             s.steps,
             dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
-            store=self.store,
+            store=self.store / str(target.view) if isinstance(self.store, Path) else self.store,
         )
 
-    def _branches(self, source: Source, guides: Sequence[Guide]) -> tuple[str, ...]:
+    def _branches(self, source: Source, targets: Sequence[Target]) -> tuple[str, ...]:
         """Of the targets' batch; they differ from the source's where guidance of 1 drops some."""
         s = self.settings
         if s.text_guidance is None and s.source_text_guidance is None:
             return source.branches
-        return self.editor.task(guides, self.instruction).branches
+        return self.editor.task([targets[0].guide], self.instruction).branches
 
     def _inversion(self, task: Any, picture: Image) -> Any:
         s = self.settings

@@ -10,6 +10,7 @@ from typing import Any
 
 from attnwarp.io.file import write_atomically
 from attnwarp.propagate.folder import MANIFEST, Folder
+from attnwarp.propagate.pictures import SOURCE_COLORS
 
 PAGE = "index.html"
 
@@ -40,7 +41,8 @@ def write_page(folder: Folder) -> Path:
     seconds = folder.read_json("times.json")
     source = manifest["source"]
     targets = [name for stage in manifest["stages"] for name in stage]
-    about = {name: folder.read_json(f"views/{name}.json") for name in targets}
+    chain = manifest.get("chain", [])
+    about = {name: folder.read_json(f"views/{name}.json") for name in [*chain, *targets]}
     parts = [
         f"<h1>{escape(manifest['instruction'])}</h1>",
         _summary(manifest, result),
@@ -52,24 +54,16 @@ def write_page(folder: Folder) -> Path:
             ("its attention features, three principal components", "features.png"),
             ("edited scene", f"renders/after/{source}.png"),
         ),
+        *_chain(folder, source, chain, about),
         "<h2>Edited views</h2>",
         f"<p>{min(len(targets), MOST_ROWS)} of {len(targets)}; the folder has all.</p>",
     ]
     for name in _spread(targets, MOST_ROWS):
-        share = about[name]["injected"]
         parts += [
-            f"<h3>{escape(name)}, stage {about[name]['stage']}: {share:.0%} of the pixels get"
-            " features of the source</h3>",
-            _row(
-                folder,
-                ("before, render", f"renders/before/{name}.png"),
-                ("edited view", f"views/{name}.png"),
-                ("mask", f"masks/{name}.png"),
-                ("warped features", f"features/{name}.png"),
-                ("edited scene", f"renders/after/{name}.png"),
-            ),
+            f"<h3>{escape(name)}, stage {about[name]['stage']}: {_shares(about[name])}</h3>",
+            _target(folder, name),
         ]
-    rest = [name for name in folder.names if name not in {source, *targets}]
+    rest = [name for name in folder.names if name not in {source, *chain, *targets}]
     if rest:
         parts.append("<h2>Views that were not edited</h2>")
         for name in _spread(rest, 4):
@@ -95,11 +89,51 @@ def write_page(folder: Folder) -> Path:
     return path
 
 
+def _chain(folder: Folder, source: str, chain: Sequence[str], about: dict[str, Any]) -> list[str]:
+    """The further sources, each with what it got from those before."""
+    if not chain:
+        return []
+    colors = " ".join(
+        f'<span style="background:rgb{SOURCE_COLORS[k % len(SOURCE_COLORS)]};color:#000;'
+        f'padding:0 .5em;border-radius:3px">{escape(name)}</span>'
+        for k, name in enumerate([source, *chain])
+    )
+    parts = [
+        "<h2>Further sources</h2>",
+        f"<p>Edited in this order, each with features of those before. In the masks: {colors}</p>",
+    ]
+    for name in chain:
+        parts += [f"<h3>{escape(name)}: {_shares(about[name])}</h3>", _target(folder, name)]
+    return parts
+
+
+def _shares(about: dict[str, Any]) -> str:
+    """How much of a view gets features, and of which sources."""
+    if "sources" not in about:
+        return f"{about['injected']:.0%} of the pixels get features of the source"
+    each = ", ".join(
+        f"{share:.0%} {escape(name)}" for name, share in about["sources"].items() if share > 0
+    )
+    return f"sources of its pixels: {each or 'none'}"
+
+
+def _target(folder: Folder, name: str) -> str:
+    return _row(
+        folder,
+        ("before, render", f"renders/before/{name}.png"),
+        ("edited view", f"views/{name}.png"),
+        ("mask", f"masks/{name}.png"),
+        ("warped features", f"features/{name}.png"),
+        ("edited scene", f"renders/after/{name}.png"),
+    )
+
+
 def _summary(manifest: dict[str, Any], result: dict[str, Any]) -> str:
     psnr, counters = result["edit_psnr"], result["counters"]
     rows = [
         ("stages", len(manifest["stages"])),
         ("edited views", counters["views"]),
+        *([("sources among them", counters["sources"])] if "sources" in counters else []),
         ("splats", counters["splats"]),
         ("iterations of tuning", counters["iterations"]),
         ("share of the targets' pixels with features of the source", f"{counters['injected']:.0%}"),

@@ -9,6 +9,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from attnwarp.propagate.sight import Sight
+
 Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -97,6 +99,22 @@ def mask_picture(mask: Tensor) -> Bytes:
     """(H, W, 3) uint8: white where the mask is True."""
     pixels = 255 * mask.to(torch.uint8).cpu().numpy()
     return np.repeat(pixels[..., None], 3, axis=2)
+
+
+SOURCE_COLORS = (
+    (255, 255, 255), (240, 180, 60), (80, 170, 240), (90, 200, 110), (220, 110, 190), (200, 90, 70),
+)  # fmt: skip
+"""Of the sources in a picture of masks, the first white; they repeat."""
+
+
+def sight_picture(sight: Sight) -> Bytes:
+    """(H, W, 3) uint8: the colour of the source that a pixel takes, times the weight of its
+    features; black where there is none.
+    """
+    choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
+    colors = torch.tensor(SOURCE_COLORS, dtype=torch.float64)
+    pixels = colors[choice.clamp_min(0) % len(colors)] * sight.weight[..., None].double()
+    return np.asarray(pixels.round().to(torch.uint8).cpu().numpy())
 
 
 class Principal:

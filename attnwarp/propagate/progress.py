@@ -1,18 +1,16 @@
-"""Progress of an edit for people: a bar on a terminal, a line now and then elsewhere."""
+"""Progress of an edit for people."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from attnwarp.progress import display
+
 if TYPE_CHECKING:
     from rich.console import Console
-
-LINE_SECONDS = 10.0
-"""Seconds between two lines where there is no terminal."""
 
 
 @dataclass(frozen=True)
@@ -51,42 +49,5 @@ def progress_display(
         ...     watch(Step(9, 9, "done"))
         bear [9/9] done
     """
-    from rich.console import Console as Terminal
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.table import Column
-
-    target = console or Terminal(stderr=True)
-    if not target.is_terminal:
-        yield _lines(target, title)
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
-        BarColumn(bar_width=12, table_column=Column(no_wrap=True)),
-        MofNCompleteColumn(table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[text]}", markup=False, table_column=Column(no_wrap=False)),
-    )
-    with Progress(*columns, console=target) as bar:
-        task = bar.add_task(title, total=None, text="")
-        yield lambda step: bar.update(task, completed=step.done, total=step.total, text=step.text)
-
-
-def _lines(console: Console, title: str) -> Callable[[Step], None]:
-    last, text = 0.0, ""
-
-    def write(step: Step) -> None:
-        nonlocal last, text
-        now = time.perf_counter()
-        if now - last < LINE_SECONDS and step.done != step.total:
-            return
-        last, text = now, step.text
-        line = f"{title} [{step.done}/{step.total}] {text}"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-    return write
+    with display(console, title=title) as show:
+        yield lambda step: show(step.done, step.total, step.text)

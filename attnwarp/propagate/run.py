@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,11 +23,12 @@ from attnwarp.editing.editor import Editor
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
-from attnwarp.propagate.editing import Guide, Source, Store, ViewEditor
-from attnwarp.propagate.folder import Folder, digest
+from attnwarp.propagate.editing import Guide, Source, Store, Target, ViewEditor
+from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, digest
 from attnwarp.propagate.pictures import (
     Bytes,
     Image,
+    Mask,
     Principal,
     composite,
     edit_size,
@@ -34,9 +36,10 @@ from attnwarp.propagate.pictures import (
     enlarged_change,
     mask_picture,
     resized,
+    sight_picture,
     to_bytes,
 )
-from attnwarp.propagate.plan import Plan
+from attnwarp.propagate.plan import Plan, choose_chain
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
@@ -47,6 +50,7 @@ from attnwarp.propagate.scene import (
     splats_digest,
 )
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
+from attnwarp.propagate.sight import Sight
 from attnwarp.propagate.tune import TrainingView, Tuning
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 
@@ -68,7 +72,8 @@ class Propagation:
         edit_psnr: dB: "pooled" (of the mean squared error over views), "mean" (of the views'
             PSNRs), and "views", the names that were counted.
         counters: "network_rows" (rows through the UNet), "feature_bytes", "iterations", "splats",
-            "injected" (mean share of the targets' pixels that got features).
+            "injected" (mean weight of the warped features over the targets' pixels, before a_t),
+            "sources" where there are several.
         seconds: by part, over all sittings.
 
     Example:
@@ -203,7 +208,6 @@ class _Run:
         self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
         self.settings, self.backend, self.watch = settings, backend, watch
         self.checkpoint_seconds = checkpoint_seconds
-        self.plan = Plan.draw(len(scene.cameras), source, settings)
         multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
         self.sizes = [
             edit_size(camera.height, camera.width, settings.size, multiple)
@@ -214,23 +218,27 @@ class _Run:
         self.names = self.folder.names
         disk = folder / RECORDING
         place: Store = disk if store == "disk" else "device" if store == "device" else "cpu"
-        self.view_editor = ViewEditor(
-            editor, instruction, settings, self.sizes[source], store=place, announce=announce
-        )
+        self.view_editor = ViewEditor(editor, instruction, settings, store=place, announce=announce)
+        self.near = near_of(scene.cameras)
+        self._frozen_surfaces: dict[int, Surface] = {}
+        self.seconds: dict[str, float] = {}
+        if self.folder.has("times.json"):
+            self.seconds = dict(self.folder.read_json("times.json"))
+        self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
         self.tuning = Tuning(
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
-        self.near = near_of(scene.cameras)
-        self._frozen_surface: Surface | None = None
-        self.seconds: dict[str, float] = {}
         self.done = 0
-        rows = 1 + sum(len(stage) for stage in self.plan.stages)
-        self.total = rows * settings.steps + len(self.plan.stages) * settings.iterations
+        self.total = (
+            len(self.plan.edited) * settings.steps + len(self.plan.stages) * settings.iterations
+        )
+        chain = self.plan.chain
         self.folder.claim(
             {
                 "instruction": instruction,
                 "settings": settings.to_dict(),
                 "source": self.names[source],
+                **({"chain": [self.names[view] for view in chain]} if chain else {}),
                 "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],
                 "inputs": {
                     "splats": splats_digest(gaussians),
@@ -242,9 +250,8 @@ class _Run:
         )
 
     def go(self) -> Propagation:
-        if self.folder.has("times.json"):
-            self.seconds = dict(self.folder.read_json("times.json"))
-        self._edited_source()
+        self._write_segments()
+        self._edited_sources()
         for number, stage in enumerate(self.plan.stages):
             self._edit_stage(number, stage)
             self._tune_stage(number)
@@ -253,42 +260,87 @@ class _Run:
         self._tell("done", done=self.total)
         return result
 
+    def _write_segments(self) -> None:
+        if self.scene.segments is None:
+            return
+        (self.folder.path / SEGMENTS_FOLDER).mkdir(exist_ok=True)
+        for name, segment in zip(self.names, self.scene.segments, strict=True):
+            path = f"{SEGMENTS_FOLDER}/{name}.png"
+            if not self.folder.has(path):
+                self.folder.write_picture(path, mask_picture(torch.from_numpy(segment)))
+
     # --- editing
 
-    def _edited_source(self) -> None:
-        if self.folder.has("source.json"):
-            self.done += self.settings.steps
-        else:
-            _ = self.source
+    def _chain(self, source: int) -> tuple[int, ...]:
+        """Further sources; those of the folder's edit are not chosen again."""
+        s = self.settings
+        if s.sources == 1:
+            return ()
+        if self.folder.has(MANIFEST):
+            names = self.folder.read_json(MANIFEST).get("chain", [])
+            if set(names) <= set(self.names):  # else the claim refuses the folder
+                return tuple(self.names.index(name) for name in names)
+        segments = self.scene.segments
+
+        def seen(first: int, target: int) -> tuple[Mask, Mask]:
+            warp = self._warp(first, target, self.frozen)
+            surface = warp.rules["defined"].numpy()
+            return warp.mask.numpy(), surface if segments is None else surface & segments[target]
+
+        with self._timed("warp"):
+            views = len(self.scene.cameras)
+            return choose_chain(views, source, s.sources, s.chain_coverage, seen)
+
+    def _edited_sources(self) -> None:
+        parts = ["source.json", *(f"views/{self.names[view]}.json" for view in self.plan.chain)]
+        finished = sum(self.folder.has(part) for part in parts)
+        self.done += finished * self.settings.steps
+        if finished < len(parts):
+            _ = self.sources
 
     @cached_property
-    def source(self) -> Source:
-        """The source's edit; made anew, to the same bytes, in each sitting that needs it."""
-        view = self.plan.source
-        text = f"editing the source, {self.names[view]}"
+    def sources(self) -> list[Source]:
+        """The sources' edits; made anew, to the same bytes, in each sitting that needs them."""
+        sources: list[Source] = []
+        for view in self.plan.sources:
+            sources.append(self._source(view, sources))
+        return sources
+
+    def _source(self, view: int, before: list[Source]) -> Source:
+        name = self.names[view]
+        text = f"editing the source, {name}" if not before else f"editing a further source, {name}"
+        record = "source.json" if not before else f"views/{name}.json"
         # Edited again for its features, it is no progress.
-        step = 0 if self.folder.has("source.json") else 1
+        step = 0 if self.folder.has(record) else 1
+        sight = self._sight(view, self.frozen, len(before)) if before else None
         with self._timed("source"):
             source = self.view_editor.source(
-                view,
-                self._guide(view, self.frozen),
-                self._start_picture(view, self.frozen),
-                self.by_hand,
+                self._target(view, self.frozen, sight),
+                before,
+                by_hand=None if before else self.by_hand,
                 watch=lambda: self._tell(text, step),
             )
-        pixels = to_bytes(self._composite(view, source.picture))
-        if source.recording is not None:
-            layer, features = self._shown(source.recording)
+        if not before and source.recording is not None:
+            _, features = self._shown(source.recording)
             self._principal = Principal(features)
-        if self.folder.has("source.json"):
-            if not np.array_equal(pixels, self.folder.read_picture("source.png")):
+        if self.folder.has(record):
+            file = "source.png" if not before else f"views/{name}.png"
+            pixels = to_bytes(self._composite(view, source.picture))
+            if not np.array_equal(pixels, self.folder.read_picture(file)):
                 raise InputError(
-                    f"{self.folder.path}: the source's edit is not the one in source.png; go on"
+                    f"{self.folder.path}: the source's edit is not the one in {file}; go on"
                     " with the same device, number of threads and versions, or name another folder"
                 )
-            return source
-        self.folder.write_picture("source.png", pixels)
+        elif before:
+            self._write_view(0, view, source.picture, sight, before)
+        else:
+            self._write_source(view, source)
+        return source
+
+    def _write_source(self, view: int, source: Source) -> None:
+        self.folder.write_picture("source.png", to_bytes(self._composite(view, source.picture)))
         if source.recording is not None:
+            layer, features = self._shown(source.recording)
             size = layer.size(source.recording.plan.latent_size)
             picture = self._principal.picture(features, size)
             shape = self.scene.pictures[view].shape
@@ -301,7 +353,6 @@ class _Run:
                 "feature_bytes": 0 if source.recording is None else source.recording.plan.bytes,
             },
         )
-        return source
 
     def _shown(self, recording: Recording) -> tuple[Layer, torch.Tensor]:
         """The layer whose features are shown as colours, and its (h w, C) features half-way."""
@@ -330,80 +381,106 @@ class _Run:
             yield batch
 
     def _edit_batch(self, number: int, stage: tuple[int, ...], batch: list[int]) -> None:
-        source = self.source  # first, so that its time is not counted here
+        sources = self.sources  # first, so that their time is not counted here
         # Stages before are tuned by now: this is the current model.
         model = self.tuning.gaussians()
         with self._timed("warp"):
-            warps = [self._warp(view, model) for view in batch]
+            sights = [self._sight(view, model, len(sources)) for view in batch]
         text = (
             f"stage {number + 1} of {len(self.plan.stages)}: editing view"
             f" {stage.index(batch[0]) + 1} of {len(stage)}"
         )
-        starts = [self._start_picture(view, model) for view in batch]
+        targets = [
+            self._target(view, model, sight) for view, sight in zip(batch, sights, strict=True)
+        ]
         with self._timed("edit"):
             pictures = self.view_editor.targets(
-                source,
-                [self._guide(view, model) for view in batch],
-                batch,
-                warps,
-                number,
-                None if starts[0] is None else [start for start in starts if start is not None],
-                watch=lambda: self._tell(text, len(batch)),
+                sources, targets, number, watch=lambda: self._tell(text, len(batch))
             )
         with self._timed("write"):
-            for view, picture, warp in zip(batch, pictures, warps, strict=True):
-                self._write_view(number, view, picture, warp, source)
+            for view, picture, sight in zip(batch, pictures, sights, strict=True):
+                self._write_view(number + 1, view, picture, sight, sources)
         self._write_times()
 
+    def _target(self, view: int, model: Gaussians, sight: Sight | None) -> Target:
+        return Target(view, self._guide(view, model), self._start_picture(view, model), sight)
+
     def _write_view(
-        self, number: int, view: int, picture: Image, warp: WarpedView | None, source: Source
+        self,
+        stage: int,
+        view: int,
+        picture: Image,
+        sight: Sight | None,
+        sources: Sequence[Source],
     ) -> None:
         name = self.names[view]
-        about: dict[str, Any] = {"view": name, "stage": number + 1, "injected": 0.0}
-        if warp is not None and source.recording is not None:
-            about["injected"] = float(warp.mask.float().mean())
-            about["rules"] = {k: float(rule.float().mean()) for k, rule in warp.rules.items()}
-            self.folder.write_picture(f"masks/{name}.png", mask_picture(warp.mask))
-            layer, features = self._shown(source.recording)
-            h, w = (side // self.editor.factor for side in self.sizes[view])
-            size = layer.size((h, w))
-            at = warp.at(size, source_size=layer.size(source.recording.plan.latent_size))
-            warped = at.warp_tokens(features[None].cpu())[0]
-            colors = self._principal.picture(warped, size, at.mask)
-            shape = self.scene.pictures[view].shape
-            self.folder.write_picture(f"features/{name}.png", enlarged(colors, shape[:2]))
+        about: dict[str, Any] = {"view": name, "stage": stage, "injected": 0.0}
+        recordings = [source.recording for source in sources if source.recording is not None]
+        if sight is not None and recordings:
+            rules = sight.views[0].rules
+            about["injected"] = float(sight.weight.mean())
+            about["rules"] = {k: float(rule.float().mean()) for k, rule in rules.items()}
+            if len(sources) > 1:
+                choice = sight.choice((sight.mask.shape[0], sight.mask.shape[1]))
+                about["sources"] = {
+                    self.names[source]: float((choice == number).float().mean())
+                    for number, source in enumerate(self.plan.sources[: len(sources)])
+                }
+            self.folder.write_picture(f"masks/{name}.png", sight_picture(sight))
+            self.folder.write_picture(
+                f"features/{name}.png", self._warped_features(view, sight, recordings)
+            )
         self.folder.write_picture(f"views/{name}.png", to_bytes(self._composite(view, picture)))
         # Last: a view counts as edited once this is there.
         self.folder.write_json(f"views/{name}.json", about)
 
-    def _warp(self, view: int, model: Gaussians) -> WarpedView | None:
+    def _warped_features(self, view: int, sight: Sight, recordings: Sequence[Recording]) -> Bytes:
+        h, w = (side // self.editor.factor for side in self.sizes[view])
+        parts = []
+        for number, recording in enumerate(recordings):
+            layer, features = self._shown(recording)
+            size = layer.size((h, w))
+            source_size = layer.size(recording.plan.latent_size)
+            grid = sight.warp(number).at(size, source_size=source_size)
+            warped = grid.warp_tokens(features[None].cpu())[0]
+            parts.append(self._principal.picture(warped, size, grid.mask))
+        # A pixel takes one source at most, and is black in the others' pictures.
+        return enlarged(np.maximum.reduce(parts), self.scene.pictures[view].shape[:2])
+
+    def _sight(self, view: int, model: Gaussians, sources: int) -> Sight | None:
+        """How the first sources see a view; None where nothing is warped."""
         s = self.settings
-        if s.method != "warp":
+        if s.method != "warp" and s.noise != "surface" and s.estimate == 0:
             return None
+        chosen = self.plan.sources[:sources]
+        return Sight([self._warp(source, view, model) for source in chosen], s.confidence)
+
+    def _warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
+        """The warp from one view to another along a model, or along the one before the edit."""
+        s = self.settings
         before = self.frozen if s.depth_from == "frozen" else model
         segments = self.scene.segments
         warp = warp_view(
             before,
-            self.scene.cameras[self.plan.source],
-            self.scene.cameras[view],
+            self.scene.cameras[source],
+            self.scene.cameras[target],
             s.warp,
-            source_image=self.scene.pictures[self.plan.source],
-            target_image=self.scene.pictures[view],
-            target_segment=None if segments is None else torch.from_numpy(segments[view]),
-            source_surface=self._source_surface(before),
+            source_image=self.scene.pictures[source],
+            target_image=self.scene.pictures[target],
+            target_segment=None if segments is None else torch.from_numpy(segments[target]),
+            source_surface=self._surface(source, before),
             backend=self.backend,
         )
         return warp if s.mask else replace(warp, mask=torch.ones_like(warp.mask), _at={})
 
-    def _source_surface(self, model: Gaussians) -> Surface:
-        camera = self.scene.cameras[self.plan.source]
-        if model is not self.frozen:
-            return render_surface(model, camera, self.settings.warp, backend=self.backend)
-        if self._frozen_surface is None:
-            self._frozen_surface = render_surface(
-                model, camera, self.settings.warp, backend=self.backend
-            )
-        return self._frozen_surface
+    def _surface(self, view: int, model: Gaussians) -> Surface:
+        if model is self.frozen and view in self._frozen_surfaces:
+            return self._frozen_surfaces[view]
+        camera = self.scene.cameras[view]
+        surface = render_surface(model, camera, self.settings.warp, backend=self.backend)
+        if model is self.frozen:
+            self._frozen_surfaces[view] = surface
+        return surface
 
     def _guide(self, view: int, model: Gaussians) -> Guide:
         if self.editor.guide == "picture":
@@ -520,15 +597,17 @@ class _Run:
 
     def _counters(self, final: Gaussians) -> dict[str, float]:
         source = self.folder.read_json("source.json")
-        targets = [view for stage in self.plan.stages for view in stage]
+        targets = self.plan.targets
         shares = [
             self.folder.read_json(f"views/{self.names[view]}.json")["injected"] for view in targets
         ]
         rows = (1 + len(targets)) * self.settings.steps * len(source["branches"])
+        sources = len(self.plan.sources)
         return {
             "views": 1 + len(targets),
+            **({"sources": sources} if sources > 1 else {}),
             "network_rows": rows,
-            "feature_bytes": source["feature_bytes"],
+            "feature_bytes": sources * source["feature_bytes"],
             "injected": sum(shares) / len(shares) if shares else 0.0,
             "iterations": self.tuning.iteration,
             "splats": len(final),
@@ -537,9 +616,7 @@ class _Run:
     def _clear_recording(self) -> None:
         recording = self.folder.path / RECORDING
         if recording.is_dir():
-            for path in recording.iterdir():
-                path.unlink()
-            recording.rmdir()
+            shutil.rmtree(recording)
 
     # --- time and progress
 

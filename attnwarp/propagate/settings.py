@@ -14,7 +14,7 @@ from attnwarp.warp import PRESETS as WARP_PRESETS
 from attnwarp.warp import WarpSettings
 
 Method = Literal["warp", "each view alone"]
-Noise = Literal["shared", "fresh"]
+Noise = Literal["shared", "fresh", "surface"]
 StartPicture = Literal["render", "original"]
 DepthFrom = Literal["frozen", "current"]
 Decay = Literal["linear", "constant"]
@@ -57,7 +57,9 @@ class PropagateSettings:
         size: longest side in px at which the editor works; None for the cameras' own. Sides are
             rounded to what the editor takes.
         steps: of denoising.
-        noise: "shared" by source and targets, or "fresh" for each view.
+        noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
+            a point of the surface has the same noise in every view
+            (:mod:`attnwarp.propagate.noise`).
         start: (lowest, highest) timestep, of which one is drawn for all views, to start from in
             place of pure noise.
         start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
@@ -67,6 +69,16 @@ class PropagateSettings:
         batch: target views that go through the network together. Another batch gives other bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
         mask: False injects wherever the target has a depth (the ablation "no M").
+        sources: views whose features are recorded and warped. Those after the first are edited in
+            a chain outward from it, each covered by those before; a target's pixel takes the source
+            that sees it best (:mod:`attnwarp.propagate.sight`).
+        chain_coverage: share of its surface that the sources so far must see of the next one. The
+            view they see least of is taken among those.
+        confidence: weigh the features by how well the source sees the surface (foreshortening and
+            the margin of depth agreement) instead of by the mask alone.
+        estimate: weight of the source's estimate of the clean latents, warped, in the target's own
+            at the first step; it falls to 0 at ``estimate_until``. 0 leaves it out.
+        estimate_until: share of the steps after which it is left out.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
@@ -120,6 +132,11 @@ class PropagateSettings:
     batch: int = 4
     warp: WarpSettings = WARP_PRESETS["corrected"]
     mask: bool = True
+    sources: int = 1
+    chain_coverage: float = 0.5
+    confidence: bool = False
+    estimate: float = 0.0
+    estimate_until: float = 0.5
     depth_from: DepthFrom = "frozen"
     a0: float = 0.9
     decay: Decay = "linear"
@@ -146,8 +163,9 @@ class PropagateSettings:
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
             check.one_of(getattr(self, name), get_args(choices), name)
-        if not isinstance(self.mask, bool):
-            raise ValueError(f"mask: got {self.mask!r}, expected true or false")
+        for name in ("mask", "confidence"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
         if not isinstance(self.warp, WarpSettings):
             raise ValueError(f"warp: got {self.warp!r}, expected WarpSettings")
         for name in ("fractions", "kinds", "blocks", "branches", "start"):
@@ -159,7 +177,9 @@ class PropagateSettings:
             ):
                 raise ValueError(f"{name}: got {value!r}, expected a list")
         for name, (low, high) in _LIMITS.items():
-            _check_number(name, getattr(self, name), low, high)
+            value = getattr(self, name)
+            if value is not None or name not in _OPTIONAL:
+                check.number(value, low, high, name, whole=name in _WHOLE)
         _check_start(self.start)
 
     def to_dict(self) -> dict[str, Any]:
@@ -194,7 +214,9 @@ class PropagateSettings:
         return self.text_guidance - self.guidance_drop * stage
 
 
-_WHOLE = {"stages", "views_per_stage", "seed", "size", "steps", "batch", "iterations"}
+_WHOLE = {
+    "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
+}  # fmt: skip
 _OPTIONAL = {"views_per_stage", "size", "text_guidance", "source_text_guidance"}
 _LIMITS: dict[str, tuple[float, float]] = {
     "stages": (1, math.inf),
@@ -206,6 +228,10 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "guidance_drop": (0, math.inf),
     "source_text_guidance": (0, math.inf),
     "batch": (1, math.inf),
+    "sources": (1, math.inf),
+    "chain_coverage": (0, 1),
+    "estimate": (0, 1),
+    "estimate_until": (0, math.inf),
     "a0": (0, 1),
     "composite_blur": (0, math.inf),
     "iterations": (0, math.inf),
@@ -216,17 +242,6 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "color_rate": (0, math.inf),
     "geometry_rate": (0, math.inf),
 }
-
-
-def _check_number(name: str, value: Any, low: float, high: float) -> None:
-    if value is None and name in _OPTIONAL:
-        return
-    whole = name in _WHOLE
-    right = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not right or not math.isfinite(value) or not low <= value <= high:
-        kind = "a whole number" if whole else "a number"
-        bounds = f">= {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
-        raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
 
 
 def _check_start(start: tuple[int, int] | None) -> None:
@@ -270,6 +285,7 @@ PRESETS: dict[str, PropagateSettings] = {
         source_text_guidance=7.5,
     ),
     "corrected": PropagateSettings(),
+    "extended": PropagateSettings(sources=4),
 }
 """Sets of choices, each with the warp of that name (:data:`attnwarp.warp.PRESETS`).
 
@@ -284,6 +300,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
+
+``extended``: ``corrected`` with ideas beyond the paper, those that helped against truth.
 """
 
 

@@ -113,13 +113,16 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
         ({"picture": "text.png"}, "text.png: cannot be read as a picture"),
         ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
         ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
+        ({"segmenter": "clip-small"}, "--segmenter: needs --where, the words that it looks for"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_line(change, message, folder, photo, tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     picture = tmp_path / change["picture"] if "picture" in change else photo[0]
+    segmenter = ("--segmenter", change["segmenter"]) if "segmenter" in change else ()
     result = run(
         picture, "--instruction", "a bear", "--editor", change.get("editor", folder), "--out", tmp_path / change.get("out", "a.png"),
+        *segmenter,
     )  # fmt: skip
     assert result.exit_code == 2
     assert message in result.output

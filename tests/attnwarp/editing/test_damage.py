@@ -91,6 +91,15 @@ def test_a_damaged_model_is_refused_in_one_line_or_is_that_of_its_files(folder, 
     assert not (failed := failures(folder, name, range(FAST))), "\n".join(failed)
 
 
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_weights_that_are_not_finite_are_refused_by_name(value, tmp_path):
+    pipe = tiny_editors.pix2pix()
+    pipe.unet.conv_in.weight.data[0, 0, 0, 0] = value
+    pipe.save_pretrained(tmp_path)
+    with pytest.raises(InputError, match=r"unet: its weights have NaN or inf.* in conv_in\.weight"):
+        load_parts(tmp_path, dtype=torch.float32)
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("name", FILES)

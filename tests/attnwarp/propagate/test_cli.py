@@ -1,5 +1,6 @@
 """The command as a person runs it, on a small random editor in a folder; the oracle is the library and the files."""
 
+import json
 import os
 import re
 import signal
@@ -104,6 +105,25 @@ def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_
     assert not (tmp_path / "fit").exists()
 
 
+def test_the_page_shows_the_further_sources_in_their_order(place, tmp_path):
+    more = ("--ply", place / "splats.ply", "--set", "sources=3")
+    assert run(place, tmp_path, *more).exit_code == 0
+    chain = json.loads((tmp_path / "manifest.json").read_text())["chain"]
+    text = (tmp_path / "index.html").read_text()
+    section = text[text.index("<h2>Further sources") : text.index("<h2>Edited views")]
+    assert re.findall("<h3>(v.):", section) == chain
+    pictures = Page(section).pictures
+    for part in ("views", "masks", "features"):
+        for name in chain:
+            assert (tmp_path / part / f"{name}.png").read_bytes() in pictures
+    # The mask's colours are the sources' of the legend, the first of which is white.
+    colors = re.findall(r"background:rgb\((\d+), (\d+), (\d+)\)", section)
+    assert len(colors) == 3
+    allowed = {(0, 0, 0), *(tuple(map(int, color)) for color in colors)}
+    mask = read_image(tmp_path / "masks" / f"{chain[1]}.png").reshape(-1, 3)
+    assert {tuple(pixel) for pixel in mask.tolist()} <= allowed
+
+
 def test_without_splats_it_fits_them_first(place, tmp_path):
     result = run(place, tmp_path, "--fit-iterations", 5)
     assert result.exit_code == 0, result.output
@@ -159,6 +179,7 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
+        (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
@@ -185,6 +206,26 @@ def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
     assert result.exit_code == 2
     assert 'instruction ("a bear", now "a robot")' in result.output
     assert "name another folder" in result.output
+
+
+def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
+    ply = ("--ply", place / "splats.ply")
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((32, 32, 3), np.uint8)
+    half[:, :16] = 255
+    for camera in cameras():
+        (masks / camera.name).write_bytes(encode_png(half))
+    assert run(place, tmp_path / "out", *ply, "--masks", masks).exit_code == 0
+    stored = {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()}
+    assert stored == {camera.name: encode_png(half) for camera in cameras()}
+    save_dino(tmp_path / "dino")
+    save_sam(tmp_path / "sam", seed=2)
+    segmenter = ("--segmenter", f"{tmp_path / 'dino'},{tmp_path / 'sam'}")
+    result = run(place, tmp_path / "out", *ply, "--where", "bear", *segmenter)
+    assert result.exit_code == 2
+    assert "holds an edit of other inputs.segments" in result.output
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
 
 
 def test_help_imports_nothing_heavy():

@@ -354,16 +354,16 @@ def test_a_picture_edited_by_hand_is_the_source(scene, editor):
 
 
 def test_fresh_noise_is_each_views_own_and_shared_noise_is_one(scene, editor):
-    from attnwarp.propagate.editing import ViewEditor
+    from attnwarp.propagate.editing import Target, ViewEditor
 
-    guides = [scene[2][0]] * 2
-    shared = ViewEditor(editor, "a bear", QUICK, (32, 32)).noise(guides, [1, 2])
+    targets = [Target(view, scene[2][0]) for view in (1, 2)]
+    shared = ViewEditor(editor, "a bear", QUICK).noise(targets)
     assert torch.equal(shared[0], shared[1])
-    fresh = ViewEditor(editor, "a bear", replace(QUICK, noise="fresh"), (32, 32))
-    first = fresh.noise(guides, [1, 2])
+    fresh = ViewEditor(editor, "a bear", replace(QUICK, noise="fresh"))
+    first = fresh.noise(targets)
     assert not torch.equal(first[0], first[1])
     # A view's noise does not depend on who is edited beside it.
-    assert torch.equal(first[1], fresh.noise(guides[:1], [2])[0])
+    assert torch.equal(first[1], fresh.noise(targets[1:])[0])
 
 
 def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
@@ -372,7 +372,7 @@ def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
     drawn = set()
     for seed in range(50):
         settings = replace(QUICK, start=(700, 980), seed=seed)
-        drawn.add(ViewEditor(editor, "a bear", settings, (32, 32)).timestep)
+        drawn.add(ViewEditor(editor, "a bear", settings).timestep)
     assert min(drawn) >= 700
     assert max(drawn) <= 980
     assert len(drawn) > 30
@@ -494,11 +494,11 @@ def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
 
 
 def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor):
-    from attnwarp.propagate.editing import ViewEditor
+    from attnwarp.propagate.editing import Target, ViewEditor
 
     whole, half = (
-        ViewEditor(editor, "a bear", replace(QUICK, feature_type=name), (32, 32))
-        .source(0, scene[2][0])
+        ViewEditor(editor, "a bear", replace(QUICK, feature_type=name))
+        .source(Target(0, scene[2][0]))
         .recording
         for name in ("float32", "float16")
     )
@@ -507,3 +507,111 @@ def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor):
         for timestep in whole.timesteps:
             exact = whole.features(timestep, layer, "text")
             assert torch.equal(half.features(timestep, layer, "text"), exact.half())
+
+
+IDEAS = {
+    "sources": {"sources": 3},
+    "surface noise": {"noise": "surface"},
+    "confidence": {"confidence": True},
+    "estimate": {"estimate": 0.9},
+}
+ALL_IDEAS = {name: value for idea in IDEAS.values() for name, value in idea.items()}
+
+
+def pictures_in(folder):
+    return {name: data for name, data in files(folder).items() if name.startswith("views/")}
+
+
+@pytest.mark.parametrize("idea", IDEAS)
+def test_each_idea_alone_changes_the_views(idea, finished, scene, editor, tmp_path):
+    run(scene, editor, tmp_path, replace(QUICK, iterations=0, **IDEAS[idea]))
+    before, after = pictures_in(finished[1]), pictures_in(tmp_path)
+    assert set(before) == set(after) or idea == "sources"
+    # The first stage's views are edited before any tuning, so tuning is no part of the difference.
+    first = [f"views/{Path(scene[1][view].name).stem}.png" for view in finished[0].plan.stages[0]]
+    assert any(after.get(name) != before[name] for name in first)
+
+
+@pytest.fixture(scope="module")
+def extended(scene, editor, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("extended")
+    return run(scene, editor, folder, replace(QUICK, **ALL_IDEAS)), folder
+
+
+def test_further_sources_are_edited_first_and_counted(extended, scene):
+    result, folder = extended
+    assert len(result.plan.chain) == 2
+    manifest = json.loads((folder / "manifest.json").read_text())
+    names = [Path(camera.name).stem for camera in scene[1]]
+    chain = [names[view] for view in result.plan.chain]
+    assert manifest["chain"] == chain
+    assert set(chain).isdisjoint(name for stage in manifest["stages"] for name in stage)
+    for number, name in enumerate(chain):
+        about = json.loads((folder / "views" / f"{name}.json").read_text())
+        assert about["stage"] == 0
+        if number:
+            assert list(about["sources"]) == [names[0], *chain[:number]]
+    assert result.counters["sources"] == 3
+    assert result.counters["views"] == 5
+    assert result.counters["network_rows"] == 5 * 2 * 3
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    assert result.counters["feature_bytes"] == 3 * (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+
+
+def test_one_more_pass_of_the_network_is_run_for_no_further_source(scene, editor):
+    rows = 0
+
+    def count(module, args, kwargs):
+        nonlocal rows
+        rows += (args[0] if args else kwargs["sample"]).shape[0]
+
+    handle = editor.unet.register_forward_pre_hook(count, with_kwargs=True)
+    settings = replace(QUICK, stages=1, views_per_stage=4, iterations=0, **ALL_IDEAS)
+    result = run(scene, editor, settings=settings)
+    handle.remove()
+    assert rows == result.counters["network_rows"] == 5 * 2 * 3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_with_every_idea_a_killed_run_gives_the_same_bytes(seed, extended, scene, editor, tmp_path):
+    settings = replace(QUICK, **ALL_IDEAS)
+    moment = int(np.random.default_rng(seed).integers(5, 60))
+    with pytest.MonkeyPatch.context() as patch:
+        watch, _ = events(patch, moment)
+        with pytest.raises(Killed):
+            run(scene, editor, tmp_path, settings, watch=watch, checkpoint_seconds=0)
+    run(scene, editor, tmp_path, settings)
+    assert files(tmp_path) == files(extended[1])
+
+
+def test_a_view_at_a_further_sources_place_gets_that_sources_edit(scene, editor):
+    """With one more camera at the place of a further source and all features taken over, its edit
+    is that source's, not the first one's."""
+    model, views, images = scene
+    first = run(scene, editor, settings=replace(QUICK, sources=2, iterations=0)).plan.chain[0]
+    twin = Camera(views[first].K, views[first].world_to_camera, 32, 32, "twin")
+    settings = replace(
+        QUICK, stages=1, views_per_stage=9, iterations=0, a0=1.0, decay="constant", sources=2, batch=1
+    )  # fmt: skip
+    result = propagate(model, [*views, twin], [*images, images[first]], editor, "a bear", settings)
+    assert result.plan.chain == (first,)
+    assert np.array_equal(result.edited[first], result.edited[5])
+    assert not np.array_equal(result.edited[0], result.edited[5])
+
+
+def test_the_estimate_of_a_twin_is_the_sources(scene, editor):
+    """At weight 1 in every step the clean latents of a view at the source's place are the source's."""
+    _, views, images = scene
+    twin = Camera(views[0].K, views[0].world_to_camera, 32, 32, "twin")
+    other = 1 - images[0]  # guided by another picture, it would become another
+    settings = replace(
+        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
+    )
+
+    def difference(settings):
+        pair = [views[0], twin], [images[0], other]
+        result = propagate(wall(), *pair, editor, "a bear", settings)
+        return np.abs(result.edited[0].astype(int) - result.edited[1]).max()
+
+    assert difference(settings) <= 1
+    assert difference(replace(settings, estimate=0.0)) > 50

@@ -42,6 +42,10 @@ def test_a_controlnet_of_the_released_code_draws_fresh_noise_and_has_other_guida
     assert [one.guidance(stage) for stage in range(3)] == [12.5, 11.0, 9.5]
 
 
+def test_extended_is_corrected_with_several_sources():
+    assert PRESETS["extended"] == replace(PRESETS["corrected"], sources=4)
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_settings_survive_json(name):
     text = json.dumps(PRESETS[name].to_dict())
@@ -59,6 +63,9 @@ def test_settings_survive_json(name):
         ({"stagse": 1}, "did you mean 'stages'"),
         ({"warp.opaqe": 1}, "did you mean 'opaque'"),
         ({"mask": 1}, "mask: got 1, expected true or false"),
+        ({"confidence": 1}, "confidence: got 1, expected true or false"),
+        ({"sources": 0}, "sources: got 0, expected a whole number >= 1"),
+        ({"estimate": 1.5}, "estimate: got 1.5, expected a number in"),
     ],
 )
 def test_a_wrong_setting_is_named(change, message):

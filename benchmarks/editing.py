@@ -1,0 +1,166 @@
+"""What half and twice the time of `attnwarp edit` buys: fit, editing and tuning of one scene.
+
+Each plan is fitted on seven of eight views, which gives its held-out PSNR, and the edit then takes
+all views. A plan's fit and edit are resumed in --work.
+
+    python -m benchmarks.editing DATA --work FOLDER --out reports/editing/time.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+
+from attnwarp.editing.small import load_editor, thread_count
+from attnwarp.fit import FitSettings, fit, from_points, hold_out, load_views
+from attnwarp.io import read_dataset
+from attnwarp.propagate import PRESETS, preset, propagate
+from attnwarp.propagate.command import FitPlan
+from attnwarp.render.threads import set_thread_count
+
+INSTRUCTION = "make it snow"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A share of the time.
+
+    Args:
+        name: of the row.
+        fit: iterations and splats.
+        tuning: iterations a stage.
+    """
+
+    name: str
+    fit: FitPlan
+    tuning: int
+
+
+def plans() -> list[Plan]:
+    """The default of `attnwarp edit`, and about half and twice its time."""
+    default, tuning = FitPlan(), PRESETS["corrected"].iterations
+    return [
+        Plan("default", default, tuning),
+        Plan("half", FitPlan(default.iterations // 2, max_splats=15_000), tuning // 2),
+        Plan("twice", FitPlan(5_500, max_splats=60_000), 2 * tuning),
+    ]
+
+
+def measure(plan: Plan, data: Path, work: Path, editor_name: str) -> dict[str, Any]:
+    """Fit and edit by a plan; figures as in :func:`table`."""
+    stored = work / plan.name / "figures.json"
+    if stored.exists():
+        figures: dict[str, Any] = json.loads(stored.read_text())
+        return figures
+    dataset = read_dataset(data)
+    train, test = hold_out(dataset)
+    if test is None or dataset.points is None:
+        raise ValueError(f"{data}: expected points and at least two views")
+    settings = FitSettings(
+        kind="2d", iterations=plan.fit.iterations, max_splats=plan.fit.max_splats
+    )
+    start = from_points(dataset.points, dataset.colors, kind="2d", sh_degree=settings.sh_degree)
+    fitted = fit(
+        start, load_views(train), settings, held_out=load_views(test), folder=work / plan.name
+    )
+    views = load_views(dataset)
+    images = [views.target(k, torch.zeros(3)).numpy() for k in range(len(views))]
+    editor = load_editor(editor_name)
+    torch.set_num_threads(thread_count(editor))
+    chosen = preset(
+        "corrected",
+        iterations=plan.tuning,
+        size=editor.unet.config.sample_size * editor.factor,
+    )
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = propagate(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
+    figures = {
+        "name": plan.name,
+        "fit": asdict(plan.fit),
+        "tuning": plan.tuning,
+        "splats": len(fitted.gaussians),
+        "held_out": fitted.history[-1].psnr,
+        "edit_psnr": result.edit_psnr["mean"],
+        "fit_cpu": fitted.cpu_seconds,
+        "fit_wall": fitted.seconds,
+        "edit_cpu": time.process_time() - cpu,
+        "edit_wall": time.perf_counter() - wall,
+        "parts": result.seconds,
+    }
+    stored.write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+def table(rows: Sequence[dict[str, Any]], data: Path, load: float) -> str:
+    """A Markdown page of the figures."""
+    lines = [
+        "# Time of an edit",
+        "",
+        f"`attnwarp edit` on `{data.name}` with its defaults, and about half and twice their time."
+        " 2DGS, three stages, all views edited, every 8th held out of the fit alone. CPU seconds"
+        " are of all threads.",
+        "",
+        "| time | fit: iterations, splats | tuning a stage | held-out PSNR, dB | Edit PSNR, dB |"
+        " fit, CPU s | edit and tuning, CPU s | all, CPU s | all, s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        cpu, wall = row["fit_cpu"] + row["edit_cpu"], row["fit_wall"] + row["edit_wall"]
+        lines.append(
+            f"| {row['name']} | {row['fit']['iterations']:,}, {row['splats']:,} | {row['tuning']} |"
+            f" {row['held_out']:.2f} | {row['edit_psnr']:.2f} | {row['fit_cpu']:.0f} |"
+            f" {row['edit_cpu']:.0f} | {cpu:.0f} | {wall:.0f} |"
+        )
+    lines += [
+        "",
+        f"{len(os.sched_getaffinity(0))} threads; load average of the machine at the end"
+        f" {load:.1f}. On a busy machine CPU seconds are too long by up to a half, and seconds"
+        " many times.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.editing",
+        description="Time attnwarp edit on DATA. Without DATA, on the scene bear, exported first.",
+    )
+    parser.add_argument("data", type=Path, nargs="?", help="as for attnwarp edit, with points")
+    parser.add_argument("--work", type=Path, default=Path("build/editing"), help="of fits, edits")
+    parser.add_argument("--editor", default="small-plain", help="name or folder")
+    parser.add_argument("--plans", nargs="*", help="names of the rows; all if left out")
+    parser.add_argument("--out", type=Path, help="also write the table here")
+    options = parser.parse_args(arguments)
+    data = options.data
+    if data is None:
+        from attnwarp_eval.cli.main import app
+
+        data = options.work / "bear"
+        if not (data / "transforms.json").exists():
+            app(["scenes", "export", "bear", str(data)], standalone_mode=False)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    set_thread_count(len(os.sched_getaffinity(0)))
+    rows = []
+    for plan in plans():
+        if not options.plans or plan.name in options.plans:
+            rows.append(measure(plan, data, options.work, options.editor))
+            text = table(rows, data, os.getloadavg()[0])
+            if options.out is not None:
+                options.out.write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

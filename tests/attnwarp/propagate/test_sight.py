@@ -1,0 +1,147 @@
+"""Oracles: the Jacobian of a plane's homography by differences, loops over pixels, formulas written out."""
+
+import numpy as np
+import pytest
+import torch
+
+from attnwarp import Camera
+from attnwarp.propagate.plan import choose_chain
+from attnwarp.propagate.sight import Sight, depth_margin, pixel_ratio
+from attnwarp.warp import Surface, preset, resize_mask, warp_surfaces
+
+SIZE = 24
+
+
+def camera(position, size=SIZE):
+    return Camera.look_at(position, (0, 0, 0), width=size, height=size, fov_y=40, up=(0, 1, 0))
+
+
+def on_plane(view):
+    """What a camera sees of the plane z = 0."""
+    rays = view.directions() @ view.rotation
+    depth = -view.position[2] / rays[..., 2]
+    return Surface(depth, np.broadcast_to([0.0, 0, 1], (*depth.shape, 3)))
+
+
+def plane_point(view, xy):
+    """(3,) point of the plane z = 0 that a pixel position shows."""
+    ray = view.directions(np.array([[xy]]))[0, 0] @ view.rotation
+    return view.position - ray * (view.position[2] / ray[2])
+
+
+TARGET, SIDE, FAR = camera((0, 0.3, 3)), camera((2.5, 0, 1.5)), camera((-0.5, 0.2, 7))
+
+
+def warp(source, **changes):
+    settings = preset("corrected", **changes)
+    return warp_surfaces(source, TARGET, on_plane(TARGET), on_plane(source), settings)
+
+
+@pytest.mark.parametrize("source", [SIDE, FAR])
+def test_the_ratio_of_pixels_is_the_determinant_of_the_homographys_jacobian(source):
+    ratio = pixel_ratio(warp(source)).numpy()
+    step = 1e-4
+    for row, column in ((3, 5), (12, 12), (20, 17)):
+        x, y = column + 0.5, row + 0.5
+        moved = [
+            source.project(plane_point(TARGET, (x + dx, y + dy))[None])[0][0]
+            for dx, dy in ((step, 0), (-step, 0), (0, step), (0, -step))
+        ]
+        jacobian = np.stack([moved[0] - moved[1], moved[2] - moved[3]]) / (2 * step)
+        assert ratio[row, column] == pytest.approx(abs(np.linalg.det(jacobian)), rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [(SIZE, SIZE), (8, 8), (6, 6)])
+def test_a_pixel_takes_the_source_that_sees_it_best_by_a_loop(size):
+    views = [warp(FAR), warp(SIDE), warp(camera((0, 0, 1.2)))]
+    sight = Sight(views)
+    h, w = size
+    block = SIZE // h
+    masks = [resize_mask(view.mask, size) & view.at(size).correspondence.defined for view in views]
+    ratios = [pixel_ratio(view).tolist() for view in views]
+    counts = [0] * 4
+    for row in range(h):
+        for column in range(w):
+            best, number = 0.0, -1
+            for k, view in enumerate(views):
+                if not masks[k][row, column]:
+                    continue
+                total = 0.0
+                for y in range(row * block, (row + 1) * block):
+                    for x in range(column * block, (column + 1) * block):
+                        total += min(1.0, ratios[k][y][x]) * bool(view.mask[y, x])
+                if total / block**2 > best + 1e-6:
+                    best, number = total / block**2, k
+            assert int(sight.choice(size)[row, column]) == number
+            counts[number] += 1
+    assert sum(count > 0 for count in counts) >= 2  # more than one answer occurs
+    # Every pixel that some source sees has features of exactly one.
+    layers = [sight.warp(k).at(size, source_size=size).mask for k in range(3)]
+    assert torch.equal(torch.stack(layers).sum(dim=0), torch.stack(masks).any(dim=0).long())
+
+
+def test_one_source_without_confidence_is_the_plain_warp_bit_for_bit():
+    view = warp(SIDE)
+    random = torch.Generator().manual_seed(0)
+    source, new = (torch.randn((1, 64, 5), generator=random) for _ in range(2))
+    expected = view.at((8, 8)).blend_tokens(source, new, 0.7)
+    layer = Sight([view]).warp(0).at((8, 8), source_size=(8, 8))
+    assert torch.equal(layer.blend_tokens(source, new, 0.7), expected)
+
+
+def test_confidence_is_foreshortening_times_the_margin_of_depth():
+    limit = 0.05
+    off = 0.03  # of the depth: the source's own surface stands nearer by that share
+    behind = on_plane(SIDE)
+    nearer = Surface(behind.depth * (1 - off), behind.normal)
+    settings = preset("corrected", depth_relative=limit, depth_slope=0.0)
+    view = warp_surfaces(SIDE, TARGET, on_plane(TARGET), nearer, settings)
+    # (z - d) / (limit z) with d = (1 - off) z
+    inside = view.mask.numpy()
+    assert inside.any()
+    margin = depth_margin(view).numpy()
+    assert np.allclose(margin[inside], 1 - (off / limit) ** 2, atol=1e-6)
+    sight = Sight([view], soft=True)
+    expected = np.where(inside, np.minimum(1, pixel_ratio(view).numpy()) * margin, 0)
+    assert np.allclose(sight.confidence[0].numpy(), expected, atol=1e-12)
+    assert depth_margin(warp(SIDE, depth_agreement=False)).min() == 1
+
+
+def test_features_are_blended_by_confidence_in_float64():
+    view = warp(SIDE)
+    sight = Sight([view], soft=True)
+    random = torch.Generator().manual_seed(0)
+    source, new = (torch.randn((1, 64, 3), generator=random) for _ in range(2))
+    grid = sight.warp(0).at((8, 8), source_size=(8, 8))
+    result = grid.blend_tokens(source, new, 0.6)[0]
+    moved = view.at((8, 8)).warp_tokens(source.double())[0]
+    confidence = sight.confidence[0].reshape(8, 3, 8, 3).mean(dim=(1, 3)).reshape(-1)
+    share = 0.6 * confidence * view.at((8, 8)).mask.reshape(-1)
+    expected = share[:, None] * moved + (1 - share[:, None]) * new[0].double()
+    assert torch.allclose(result.double(), expected, rtol=0, atol=1e-6)
+    assert ((share > 0.05) & (share < 0.55)).sum() > 5
+
+
+def test_a_chain_goes_outward_and_each_is_covered_by_those_before():
+    """Oracle: points on a ring as sets; a view sees a window of them."""
+    views, count = 12, 360
+
+    def window(view):
+        return {(view * 30 + k) % count for k in range(-60, 60)}
+
+    def seen(source, target):
+        points = sorted(window(target))
+        pixels = np.array([[p in window(source) for p in points]])
+        return pixels, np.ones_like(pixels)
+
+    chain = choose_chain(views, 0, 5, 0.5, seen)
+    union = window(0)
+    for number, view in enumerate(chain):
+        rest = [v for v in range(views) if v not in (0, *chain[:number])]
+        share = {v: len(window(v) & union) / len(window(v)) for v in rest}
+        assert share[view] >= 0.5
+        assert share[view] == min(value for value in share.values() if value >= 0.5)
+        union |= window(view)
+    assert len(union) == count  # all around with five sources
+    assert choose_chain(views, 0, 1, 0.5, seen) == ()
+    assert len(choose_chain(3, 0, 9, 0.5, seen)) == 2
