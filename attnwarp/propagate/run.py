@@ -49,6 +49,8 @@ RECORDING = ".recording"
 """Folder of the recorded features while an edit with ``store="disk"`` is in progress."""
 
 Watch = Callable[[Step], object]
+Warps = Callable[[int, int], WarpedView]
+"""The warp from a source view to a target view, by their numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,7 @@ def propagate(
     source: int = 0,
     source_picture: npt.NDArray[Any] | None = None,
     segments: Segments | None = None,
+    warps: Warps | None = None,
     folder: Path | str | None = None,
     store: Literal["device", "cpu", "disk"] = "cpu",
     checkpoint_seconds: float = 30.0,
@@ -129,6 +132,8 @@ def propagate(
             (edit-friendly inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
+        warps: the warp from the source to a target, by their numbers, such as one from exact depth;
+            used in place of those from the splats' depth.
         folder: made if need be.
         store: of the recorded features: on the editor's "device", in main memory ("cpu"), or in
             the folder ("disk") until the edit is done.
@@ -170,8 +175,8 @@ def propagate(
     by_hand = None if source_picture is None else _by_hand(source_picture)
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
-            gaussians, scene, editor, instruction, settings, source, by_hand, Path(str(place)),
-            store, checkpoint_seconds, backend, watch, announce,
+            gaussians, scene, editor, instruction, settings, source, by_hand, warps,
+            Path(str(place)), store, checkpoint_seconds, backend, watch, announce,
         )  # fmt: skip
         return run.go()
 
@@ -188,6 +193,7 @@ class _Run:
         settings: PropagateSettings,
         source: int,
         by_hand: Image | None,
+        warps: Warps | None,
         folder: Path,
         store: str,
         checkpoint_seconds: float,
@@ -197,6 +203,7 @@ class _Run:
     ) -> None:
         self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
         self.settings, self.backend, self.watch = settings, backend, watch
+        self.warps = warps
         self.checkpoint_seconds = checkpoint_seconds
         self.plan = Plan.draw(len(scene.cameras), source, settings)
         multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
@@ -232,6 +239,7 @@ class _Run:
                     **scene.digest(),
                     "editor": _editor_digest(editor),
                     "source_picture": None if by_hand is None else digest(by_hand),
+                    **({} if warps is None else {"warps": self._warps_digest(warps)}),
                 },
             }
         )
@@ -375,6 +383,8 @@ class _Run:
         s = self.settings
         if s.method != "warp":
             return None
+        if self.warps is not None:
+            return self._masked(self.warps(self.plan.source, view))
         before = self.frozen if s.depth_from == "frozen" else model
         segments = self.scene.segments
         warp = warp_view(
@@ -388,7 +398,25 @@ class _Run:
             source_surface=self._source_surface(before),
             backend=self.backend,
         )
-        return warp if s.mask else replace(warp, mask=torch.ones_like(warp.mask), _at={})
+        return self._masked(warp)
+
+    def _masked(self, warp: WarpedView) -> WarpedView:
+        if self.settings.mask:
+            return warp
+        return replace(warp, mask=torch.ones_like(warp.mask), _at={})
+
+    def _warps_digest(self, warps: Warps) -> str:
+        """SHA-256 of the warp of every target: a function has no other identity."""
+        source = self.plan.source
+        views = [view for stage in self.plan.stages for view in stage]
+        given = [warps(source, view) for view in views]
+        for view, warp in zip(views, given, strict=True):
+            camera = self.scene.cameras[view]
+            name = f"warps({source}, {view}).mask"
+            check.shape(warp.mask, (camera.height, camera.width), name)
+        return digest(
+            *(w.correspondence.xy.numpy() for w in given), *(w.mask.numpy() for w in given)
+        )
 
     def _source_surface(self, model: Gaussians) -> Surface:
         camera = self.scene.cameras[self.plan.source]
