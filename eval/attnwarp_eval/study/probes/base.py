@@ -141,6 +141,8 @@ class Probe(ABC, Generic[E]):
         contrasts: metrics in which a variant is tested against a baseline.
         times_in_turn: whether its records have seconds of :class:`InTurn`.
         stage: of :class:`InTurn`, the one whose seconds its figures cost.
+        cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
+            taken in turn, what they are seconds of, and what is in them.
         picture_label: title of its pictures; the variant's name if empty.
     """
 
@@ -156,6 +158,13 @@ class Probe(ABC, Generic[E]):
     contrasts: ClassVar[Sequence[str]] = ()
     times_in_turn: ClassVar[bool] = False
     stage: ClassVar[str] = ""
+    cost: ClassVar[str] = "steady"
+    cost_of: ClassVar[str] = "a view"
+    cost_text: ClassVar[str] = (
+        "Seconds are those of the method alone: a render of the target for depth; render,"
+        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
+        " and is not in them, nor are set-up and checks."
+    )
     picture_label: ClassVar[str] = ""
 
     # From a study to cells
