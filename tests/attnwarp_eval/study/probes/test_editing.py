@@ -197,7 +197,9 @@ def test_the_exact_mask_injects_where_the_source_truly_sees(folder, tmp_path):
     assert record.extra.injected == pytest.approx(
         np.mean([p.visible.mean() for p in pairs]), abs=1e-6
     )
-    assert record.cost.counters["network_rows"] == 4 * 2  # one step; image guidance of 1 drops a branch
+    assert (
+        record.cost.counters["network_rows"] == 4 * 2
+    )  # one step; image guidance of 1 drops a branch
 
 
 @pytest.mark.parametrize(
