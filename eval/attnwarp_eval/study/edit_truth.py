@@ -26,10 +26,6 @@ Mask = npt.NDArray[np.bool_]
 ONLY = "edited"
 """Name of the answer of an edit that has one alone."""
 
-SUCCESS = 0.5
-"""An editor did an edit where its mean squared error to an answer, inside the edited object, is at
-most this part of the unedited picture's: 3 dB nearer to the truth than doing nothing."""
-
 
 @dataclass(frozen=True, eq=False)
 class EditTruth:
@@ -74,7 +70,7 @@ class EditTruth:
         unedited = metrics.edit_psnr(part.originals, part.answers[name], part.union).pooled
         unchanged = metrics.edit_psnr(pictures, part.originals, part.union).pooled
         psnr = scores[name]
-        done = psnr > unchanged and psnr >= unedited - 10 * math.log10(SUCCESS)
+        done = psnr > max(unchanged, unedited)
         return Judgement(name, done, psnr, unedited, unchanged)
 
 
@@ -84,8 +80,7 @@ class Judgement:
 
     Attributes:
         answer: the nearest; None where nothing of the object is in the pictures.
-        done: whether the pictures are nearer to it than to the unedited ones, and by
-            :data:`SUCCESS` nearer than those are.
+        done: whether the pictures are nearer to it than to the unedited ones, and than those are.
         psnr: dB to it inside the edited object, pooled over the views.
         unedited: dB of the unedited pictures to it.
         unchanged: dB of the pictures to the unedited ones.

@@ -44,8 +44,7 @@ def abilities(results: Results, probe: str) -> Section:
     section.text = [
         (
             "An edit counts as done where the picture, inside the edited object, is nearer to a"
-            " right answer than to the unedited picture, with at most half of the unedited"
-            " picture's squared error. PSNR is inside the object, dB; in brackets that of the"
+            " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
             " unedited picture. **Agreement between views is judged only where the source's edit"
             " is done**; the other edits have undefined figures, and stand here by name."
         ),

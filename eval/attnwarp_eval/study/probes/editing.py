@@ -51,6 +51,7 @@ from attnwarp_eval.world import splats
 if TYPE_CHECKING:
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.gaussians import Gaussians
+    from attnwarp_eval.twoview import Hits
 
 Image = npt.NDArray[np.float32]
 
@@ -129,7 +130,7 @@ class EditResult:
         answers: by "edit" and "render": by view, the nearest answer; None where nothing of the
             object shows.
         overall: by "edit" and "render", the answer nearest to all views together.
-        edit_psnr: dB, edited views against renders, pooled.
+        edit_psnr: dB, edited views against renders, pooled, where a surface shows.
         edited: number of edited views.
         injected: mean share of the targets' pixels that got features; 0 without a warp.
     """
@@ -381,6 +382,8 @@ class _Measure:
         psnr = metrics.edit_psnr(
             {name: self.pictures["edit"][name] for name in both},
             {name: self.pictures["render"][name] for name in both},
+            # Sampled splats lie on surfaces: the sky has none.
+            {name: self._hits(name).valid for name in both},
         )
         errors = dict(zip(psnr.views, psnr.psnr, strict=True))
         for name, row in figures.items():
@@ -489,8 +492,11 @@ class _Measure:
                 rows[name][f"embedding.{key}.render"] = float(value)
         return rows
 
+    def _hits(self, name: str) -> Hits:
+        return self.work.world.geometry.trace(self.work.world.camera(name))
+
     def _depth(self, name: str) -> dict[str, float]:
-        hits = self.work.world.geometry.trace(self.work.world.camera(name))
+        hits = self._hits(name)
         camera = self.work.world.camera(name)
         row = {}
         for when, model in (("before", self.before), ("after", self.after)):
