@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from attnwarp_eval.document import charts
-from attnwarp_eval.document.model import Picture, Section, Table
+from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probes.base import Layout
@@ -157,6 +157,27 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     text = ["A dash: the editor did none of the scene's edits in its source view, or one answer."]
     return Section("Edited views by scene", text, tables)
+
+
+def side_by_side(results: Results, probe: str) -> Section | None:
+    """A row for each view of an edit: before, the source's edit, each variant, the truth."""
+    rows: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    for cell, record in results.finished(probe):
+        for picture in record.pictures:
+            own = rows.setdefault((cell.scene, picture.view), {})
+            own.setdefault(cell.variants[0], {})[picture.content] = picture.path
+    if not rows:
+        return None
+    gallery = []
+    for (scene, view), variants in rows.items():
+        first = next(iter(variants.values()))
+        shown = [Picture(first[key], key.replace("-", " ")) for key in ("before", "source-edit")]
+        shown += [Picture(own["edited"], name) for name, own in variants.items() if "edited" in own]
+        if "truth" in first:
+            shown.append(Picture(first["truth"], "truth of the source's answer"))
+        gallery.append((f"**{scene}, {view}**", shown))
+    text = ["The view before the edit, the source's edit, and the edited view by each variant."]
+    return Section("Edited views side by side", text, gallery=Gallery(gallery))
 
 
 def parts_of_time(results: Results, probe: str) -> Section:

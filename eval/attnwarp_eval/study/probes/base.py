@@ -252,6 +252,10 @@ class Probe(ABC, Generic[E]):
         """Sections of the report; none where the run has no record of this probe."""
         return iter(())
 
+    def gallery(self, results: Results) -> Section | None:
+        """A section of its own for its pictures; None where they stand with those of others."""
+        return None
+
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Folded tables below a table of variants.
 

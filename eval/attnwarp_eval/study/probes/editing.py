@@ -332,6 +332,10 @@ class EditingProbe(Probe[EditResult]):
                 editing_sections.choice(results, self.name, part.choice, CHOSEN_BY),
             )
 
+    def gallery(self, results: Results) -> Section | None:
+        """Edited views side by side."""
+        return editing_sections.side_by_side(results, self.name)
+
 
 class _Measure:
     """The figures of one edited scene.
@@ -391,7 +395,7 @@ class _Measure:
             row |= embedded[name]
             row |= self._depth(name)
             edit = work.spec["edit"]["name"]
-            work.add(f"{edit}/{name}", row, partial(self._draw, name, overall["edit"]))
+            work.add(f"{edit}/{name}", row, partial(self._draw, name))
         return EditResult(
             work.spec["edit"]["name"],
             work.spec["edit"]["instruction"],
@@ -516,8 +520,10 @@ class _Measure:
                 for name, camera in zip(self.names, cameras, strict=True)
             }
 
-    def _draw(self, name: str, answer: str | None) -> dict[str, bytes]:
-        """JPEG files of a view: before, the source's edit, truth, the edited view, the render."""
+    def _draw(self, name: str) -> dict[str, bytes]:
+        """JPEG files of a view: before, the source's edit, the edited view, its render, and the
+        truth of the source's answer."""
+        answer = self.judged.answer
         shown = {
             "before": self.truth.originals[name],
             "source edit": self.pictures["edit"][self.source],
