@@ -110,7 +110,7 @@ def answers_of(scene: Scene, edit: str) -> list[tuple[str, str | None]]:
     return [(one.name, one.name) for one in answers] or [(ONLY, None)]
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=8)
 def edit_truth(scene: str, size: int, spp: int, edit: str, views: tuple[str, ...]) -> EditTruth:
     """The truth of an edit; cached, since all variants of a scene share it.
 

@@ -8,6 +8,7 @@ view, figures of agreement between views are undefined: there was nothing to car
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 import tempfile
@@ -223,24 +224,24 @@ class EditingProbe(Probe[EditResult]):
         encoders = sensitivity.encoder_identities(wanted)
         sources = {str(kind): name for kind, name in wanted.encoders.items()}
         for name, scene in scenes.items():
-            for edit in _edits(study, scene):
-                for label in names:
-                    variant = study.variants[label]
-                    editor = editor_of(study, variant)
-                    for seed in study.seeds:
-                        spec = {
-                            **self.common_spec(study, scene, seed),
-                            **self.variant_spec(study, variant, seed),
-                            "edit": edit,
-                            "encoders": encoders,
-                        }
-                        shown = label in study.pictures.variants
-                        views = study.pictures_of(spec["views"]) if shown else ()
-                        yield Cell(
-                            spec, name, label, self.name, seed, (label,),
-                            tuple(f"{edit['name']}/{view}" for view in views),
-                            {**sources, "editor": editor.name},
-                        )  # fmt: skip
+            edits = list(_edits(study, scene))
+            for label in names:
+                variant = study.variants[label]
+                editor = editor_of(study, variant)
+                for seed, edit in itertools.product(study.seeds, edits):
+                    spec = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, variant, seed),
+                        "edit": edit,
+                        "encoders": encoders,
+                    }
+                    shown = label in study.pictures.variants
+                    views = study.pictures_of(spec["views"]) if shown else ()
+                    yield Cell(
+                        spec, name, label, self.name, seed, (label,),
+                        tuple(f"{edit['name']}/{view}" for view in views),
+                        {**sources, "editor": editor.name},
+                    )  # fmt: skip
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""
