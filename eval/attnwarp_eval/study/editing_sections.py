@@ -28,8 +28,13 @@ BY_SCENE = {
     "multiview.same_answer.edit": "Views with the source's answer",
     "multiview.delta_e_above.edit_inside": "Disagreement with the source above its floor, dE00",
     "multiview.delta_e_above.edit_next": "Disagreement of neighbouring views above its floor, dE00",
+    "multiview.delta_e_above.render_inside": "Disagreement of renders above its floor, dE00",
     "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
+    "depth.abs_rel.before": "AbsRel of the splats' depth before the edit",
+    "depth.abs_rel.after": "AbsRel of the splats' depth after tuning",
 }
+
+DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
 PARTS = ("source", "warp", "edit", "tune")
 
@@ -45,8 +50,9 @@ def abilities(results: Results, probe: str) -> Section:
         (
             "An edit counts as done where the picture, inside the edited object, is nearer to a"
             " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
-            " unedited picture. **Agreement between views is judged only where the source's edit"
-            " is done**; the other edits have undefined figures, and stand here by name."
+            " inside the object, dB; in brackets that of the unedited picture."
+            " **Agreement between views is judged only where the source's edit is done**; the"
+            " other edits have undefined figures, and stand here by name."
         ),
     ]
     rows = []
@@ -155,8 +161,36 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
             means = [interval({s: table.get(s, [])}).mean for s in scenes]
             rows.append([name, *(number(value) for value in means), spread(interval(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
+    tables.insert(0, _ratios(results, probe, measured))
     text = ["A dash: the editor did none of the scene's edits in its source view, or one answer."]
     return Section("Edited views by scene", text, tables)
+
+
+def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
+    """Disagreement above its floor as a part of the control's with the same editor."""
+    control = {
+        results.records(probe, name)[0][2].spec["editor"]["sha256"]: name
+        for name in reversed(controls(results, probe))
+    }
+    rows = []
+    for name in names:
+        base = control.get(results.records(probe, name)[0][2].spec["editor"]["sha256"], "")
+        if base in ("", name):
+            continue
+        own, other = (results.views(probe, each, DISAGREEMENT) for each in (name, base))
+        ratios = [
+            _ratio(own.get(scene, {}), other.get(scene, {})) for scene in results.study.scenes
+        ]
+        rows.append([name, base, *(number(ratio) for ratio in ratios)])
+    title = "Disagreement with the source above its floor, as a part of the control's"
+    return Table(["variant", "control", *results.study.scenes], rows, title)
+
+
+def _ratio(own: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """Of the sums over the views that both have."""
+    shared = [v for v in own if v in other and math.isfinite(own[v]) and math.isfinite(other[v])]
+    below = sum(other[view] for view in shared)
+    return sum(own[view] for view in shared) / below if below > 0 else math.nan
 
 
 def side_by_side(results: Results, probe: str) -> Section | None:
