@@ -58,6 +58,8 @@ RECORDING = ".recording"
 """Folder of the recorded features while an edit with ``store="disk"`` is in progress."""
 
 Watch = Callable[[Step], object]
+Warps = Callable[[int, int], WarpedView]
+"""The warp from a source view to a target view, by their numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +109,7 @@ def propagate(
     source: int = 0,
     source_picture: npt.NDArray[Any] | None = None,
     segments: Segments | None = None,
+    warps: Warps | None = None,
     folder: Path | str | None = None,
     store: Literal["device", "cpu", "disk"] = "cpu",
     checkpoint_seconds: float = 30.0,
@@ -139,6 +142,8 @@ def propagate(
             (edit-friendly inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
+        warps: the warp from the source to a target, by their numbers, such as one from exact depth;
+            used in place of those from the splats' depth.
         folder: made if need be.
         store: of the recorded features: on the editor's "device", in main memory ("cpu"), or in
             the folder ("disk") until the edit is done.
@@ -180,8 +185,8 @@ def propagate(
     by_hand = None if source_picture is None else _by_hand(source_picture)
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
-            gaussians, scene, editor, instruction, settings, source, by_hand, Path(str(place)),
-            store, checkpoint_seconds, backend, watch, announce,
+            gaussians, scene, editor, instruction, settings, source, by_hand, warps,
+            Path(str(place)), store, checkpoint_seconds, backend, watch, announce,
         )  # fmt: skip
         return run.go()
 
@@ -198,6 +203,7 @@ class _Run:
         settings: PropagateSettings,
         source: int,
         by_hand: Image | None,
+        warps: Warps | None,
         folder: Path,
         store: str,
         checkpoint_seconds: float,
@@ -207,6 +213,7 @@ class _Run:
     ) -> None:
         self.frozen, self.scene, self.editor = gaussians.detach(), scene, editor
         self.settings, self.backend, self.watch = settings, backend, watch
+        self.warps = warps
         self.checkpoint_seconds = checkpoint_seconds
         multiple = editor.factor * 2 ** (len(editor.unet.config.block_out_channels) - 1)
         self.sizes = [
@@ -245,6 +252,7 @@ class _Run:
                     **scene.digest(),
                     "editor": editor_digest(editor),
                     "source_picture": None if by_hand is None else digest(by_hand),
+                    **({} if warps is None else {"warps": self._warps_digest(warps)}),
                 },
             }
         )
@@ -458,6 +466,8 @@ class _Run:
     def _warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
         """The warp from one view to another along a model, or along the one before the edit."""
         s = self.settings
+        if self.warps is not None:
+            return self._masked(self.warps(source, target))
         before = self.frozen if s.depth_from == "frozen" else model
         segments = self.scene.segments
         warp = warp_view(
@@ -471,7 +481,29 @@ class _Run:
             source_surface=self._surface(source, before),
             backend=self.backend,
         )
-        return warp if s.mask else replace(warp, mask=torch.ones_like(warp.mask), _at={})
+        return self._masked(warp)
+
+    def _masked(self, warp: WarpedView) -> WarpedView:
+        if self.settings.mask:
+            return warp
+        return replace(warp, mask=torch.ones_like(warp.mask), _at={})
+
+    def _warps_digest(self, warps: Warps) -> str:
+        """SHA-256 of every warp there may be: a function has no other identity."""
+        pairs = [
+            (source, target)
+            for source in self.plan.sources
+            for target in self.plan.edited
+            if target != source
+        ]
+        given = [warps(source, target) for source, target in pairs]
+        for (source, target), warp in zip(pairs, given, strict=True):
+            camera = self.scene.cameras[target]
+            name = f"warps({source}, {target}).mask"
+            check.shape(warp.mask, (camera.height, camera.width), name)
+        return digest(
+            *(w.correspondence.xy.numpy() for w in given), *(w.mask.numpy() for w in given)
+        )
 
     def _surface(self, view: int, model: Gaussians) -> Surface:
         if model is self.frozen and view in self._frozen_surfaces:

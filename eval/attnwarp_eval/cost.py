@@ -60,6 +60,10 @@ class Meter:
             self._stages[name] = self._stages.get(name, 0.0) + time.perf_counter() - start
             self._cpu[name] = self._cpu.get(name, 0.0) + time.process_time() - start_cpu
 
+    def add(self, name: str, seconds: float) -> None:
+        """Add seconds that the work itself has measured to stage ``name``."""
+        self._stages[name] = self._stages.get(name, 0.0) + seconds
+
     @contextmanager
     def view(self) -> Iterator[None]:
         """Time the method's work for one view."""

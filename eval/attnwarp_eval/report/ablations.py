@@ -12,8 +12,6 @@ from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Probe, mean_values
 from attnwarp_eval.study.results import Results
 
-ONCE = "ms a view, one pass"
-
 
 def ablations(results: Results) -> list[Section]:
     """A section for each ablation that the study names."""
@@ -31,22 +29,24 @@ def _section(results: Results, ablation: Ablation) -> Section:
         title.format(layer=results.layer): metric.format(layer=results.layer)
         for title, metric in own.columns.items()
     }
+    # Probes that render nothing for a view count no pairs.
+    counted = any("pairs" in results.counters(own.name, name) for name in names)
     rows = []
     for name in names:
         work = results.counters(own.name, name)
         views = sum(len(record.views) for _, _, record in results.records(own.name, name))
-        steady = results.seconds(own.name, name, "steady")
+        once = results.seconds(own.name, name, own.cost)
         rows.append(
             [
                 name,
                 *mean_values(results, own.name, name, columns.values()),
-                number(work["pairs"] / views / 1e6) if views else "–",
-                number(1000 * sum(steady.values()) / len(steady)) if steady else "–",
+                *([number(work["pairs"] / views / 1e6) if views else "–"] if counted else []),
+                number(1000 * sum(once.values()) / len(once)) if once else "–",
             ]
         )
-    section.tables.append(
-        Table(["variant", *columns, "M splat-pixel pairs a view", ONCE], rows, timed=(ONCE,))
-    )
+    time = f"ms {own.cost_of}, one pass"
+    pairs = ["M splat-pixel pairs a view"] if counted else []
+    section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
         section.tables.append(_contrasts(results, own, ablation))

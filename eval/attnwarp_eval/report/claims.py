@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, Literal
 
@@ -23,7 +23,9 @@ from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.study import parse_variant
 
-Verdict = Literal["holds", "does not hold", "can't tell"]
+Verdict = Literal["holds", "does not hold", "can't tell", "depends on the editor"]
+
+Here = Literal["seen", "mixed", "not seen", "depends on the editor"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,22 @@ class Claim:
     yaw: tuple[float, float] | None = None
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
+    editors: tuple[str, ...] = ()
+
+    def of_each_editor(self) -> list[Claim]:
+        """The claim for each of its editors; itself where it has none."""
+        if not self.editors:
+            return [self]
+        return [
+            replace(
+                self,
+                text=f"{self.text} [{name}]",
+                a={**self.a, "editor": {"name": name}},
+                b=None if self.b is None else {**self.b, "editor": {"name": name}},
+                editors=(),
+            )
+            for name in self.editors
+        ]
 
     @property
     def sign(self) -> int:
@@ -97,7 +115,7 @@ class Finding:
     sides: dict[str, Interval]
     contrast: Interval
     agreement: tuple[int, int]
-    here: Literal["seen", "mixed", "not seen"]
+    here: Here
     verdict: Verdict
 
 
@@ -109,7 +127,11 @@ def load_claims() -> list[Claim]:
 
 def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
     return {
-        k: tuple(map(tuple, v)) if k == "compare_yaw" else tuple(v) if k == "yaw" else v
+        k: tuple(map(tuple, v))
+        if k == "compare_yaw"
+        else tuple(v)
+        if k in ("yaw", "editors")
+        else v
         for k, v in entry.items()
     }
 
@@ -117,9 +139,11 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
 def judge(results: Results, claims: list[Claim]) -> list[Finding]:
     """Every claim that the run has measurements for, with its verdict.
 
-    p-values are adjusted over the claims (Benjamini-Hochberg).
+    p-values are adjusted over the claims (Benjamini-Hochberg). A claim about the editor's working
+    is judged for each of its editors; :func:`together` makes one verdict of them.
     """
-    measurements = [(claim, m) for claim in claims if (m := claim.measure(results)) is not None]
+    each = [one for claim in claims for one in claim.of_each_editor()]
+    measurements = [(claim, m) for claim in each if (m := claim.measure(results)) is not None]
     contrasts = [paired(m.a, m.b) for _, m in measurements]
     adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
     return [
@@ -135,6 +159,19 @@ def judge(results: Results, claims: list[Claim]) -> list[Finding]:
         for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views
     ]
+
+
+def together(findings: Sequence[Finding], editors: Sequence[str]) -> tuple[Here, Verdict]:
+    """One verdict of the findings of a claim about the editor's working.
+
+    It has one only where all editors were measured and agree; else it depends on the editor, or
+    cannot be told from the editors that were measured.
+    """
+    here, verdicts = {f.here for f in findings}, {f.verdict for f in findings}
+    seen: Here = next(iter(here)) if len(here) == 1 else "depends on the editor"
+    if len(findings) < len(editors):
+        return seen, "can't tell"
+    return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"
 
 
 def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not seen"]:
@@ -159,6 +196,8 @@ def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | 
         name: of the probe whose records are needed.
     """
     own, study = probe(name), results.study
+    if name not in study.probes:
+        return None
     meaning = own.meaning(study, parse_variant(dict(data)))
     for label, variant in study.variants.items():
         if own.meaning(study, variant) == meaning and results.records(name, label):
@@ -168,8 +207,10 @@ def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | 
 
 def claims(results: Results) -> Section:
     """The section of the report."""
+    declared = {claim.id: claim for claim in load_claims()}
+    findings = judge(results, list(declared.values()))
     rows = []
-    for finding in judge(results, load_claims()):
+    for finding in findings:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
         contrast = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
@@ -185,6 +226,12 @@ def claims(results: Results) -> Section:
                 finding.metric,
             ]
         )
+        editors = declared[claim.id].editors
+        own = [other for other in findings if other.claim.id == claim.id]
+        if editors and finding is own[-1]:
+            here, verdict = together(own, editors)
+            text = f"**{declared[claim.id].text}: both editors together**"
+            rows.append([text, here, verdict, "–", "–", "–", finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]

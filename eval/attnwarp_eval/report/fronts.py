@@ -28,20 +28,27 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None
     ]
     section = Section("What accuracy costs in time")
-    section.text = _text(turns)
+    section.text = _text(results, turns)
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
         points, rows = _points(results, turns, front, metric)
         if not points:
             continue
         path = layout.figure(f"front-{index}.svg")
-        label = f"{metric} ({probe(front.probe).metric(metric).unit})"
+        own = probe(front.probe)
+        label = f"{metric} ({own.metric(metric).unit})"
         with charts.drawing(path) as (axes,):
             on_front = charts.cost_front(
-                axes, points, x="seconds a view", y=label, title=front.title
+                axes,
+                points,
+                x=f"seconds {own.cost_of}",
+                y=label,
+                title=front.title,
+                # A difference of colours above a floor may be negative.
+                log=own.metric(metric).unit != "dE00",
             )
         section.figures.append(Picture(f"figures/{path.name}", front.title))
-        columns = ["variant", label, "ms a view", "time, ratio", "verdict", "on the front"]
+        columns = ["variant", label, f"ms {own.cost_of}", "time, ratio", "verdict", "on the front"]
         marked = [
             [*row, ("yes" if row[0] in on_front else "no") if row[0] in points else "–"]
             for row in rows
@@ -50,11 +57,10 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     return [section] if section.tables else []
 
 
-def _text(turns: list[InTurn]) -> list[str]:
+def _text(results: Results, turns: list[InTurn]) -> list[str]:
+    contents = dict.fromkeys(probe(front.probe).cost_text for front in results.study.fronts)
     text = (
-        "Seconds are those of the method alone: a render of the target for depth; render,"
-        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
-        " and is not in them, nor are set-up and checks. A point is on the front when nothing"
+        f"{' '.join(contents)} A point is on the front when nothing"
         " cheaper is as good, by the means: look at the intervals before believing a close one."
     )
     if not turns:
@@ -115,7 +121,7 @@ def _points(
             text = "1" if name == baseline else _ratio(ratio)
             judged = "baseline" if name == baseline else _judge(ratio, noise)
         else:
-            once = results.seconds(front.probe, name, "steady")
+            once = results.seconds(front.probe, name, probe(front.probe).cost)
             if not once:
                 continue
             seconds, text, judged = (

@@ -4,15 +4,24 @@ from __future__ import annotations
 
 from attnwarp_eval.document.model import Gallery, Picture, Section
 from attnwarp_eval.study.pictures import CLASSES, DEPTH_RANGE, EPE_RANGE, ORDER, SHARED
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 
 
 def galleries(results: Results) -> list[Section]:
-    """The section of pictures, none if no cell has any."""
+    """Sections of pictures, none if no cell has any."""
+    own = {p.name: section for p in probes() if (section := p.gallery(results)) is not None}
+    shared = _shared(results, set(own))
+    return [*own.values(), *shared]
+
+
+def _shared(results: Results, apart: set[str]) -> list[Section]:
+    """The pictures of all probes but those that stand apart."""
     by_view: dict[tuple[str, str], list[tuple[str, PictureFile]]] = {}
     for cell in results.cells:
+        if cell.probe in apart:
+            continue
         for picture in cell.record.pictures if cell.record else ():
             label = probe(cell.probe).picture_label or cell.variants[0]
             by_view.setdefault((cell.scene, picture.view), []).append((label, picture))

@@ -110,6 +110,12 @@ def jpeg(image: Image) -> bytes:
     return encode_picture(pixels, ".jpg")
 
 
+def enlarged(image: Image) -> Image:
+    """A picture smaller than :data:`WIDTH` with each pixel as a block, for looking at."""
+    block = max(1, WIDTH // image.shape[1])
+    return np.kron(image, np.ones((block, block, 1), dtype=np.float32))
+
+
 def rgb(color: str) -> npt.NDArray[np.float32]:
     """(3,) of a '#rrggbb' colour."""
     return np.array([int(color[i : i + 2], 16) / 255 for i in (1, 3, 5)], dtype=np.float32)

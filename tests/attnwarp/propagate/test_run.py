@@ -16,6 +16,7 @@ from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate.pictures import to_bytes
+from attnwarp.warp import Surface, warp_surfaces
 from attnwarp.warp import preset as warp_preset
 
 QUICK = preset("corrected", stages=2, views_per_stage=2, steps=2, iterations=3)
@@ -54,6 +55,29 @@ def test_a_view_at_the_sources_place_gets_the_sources_edit(scene, editor):
     settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
     result = propagate(model, [views[0], twin], [images[0], images[0]], editor, "a bear", settings)
     assert np.array_equal(result.edited[0], result.edited[1])
+
+
+def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tmp_path):
+    model, views, images = scene
+    # The identity, which no geometry gives for two cameras apart.
+    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    identity = warp_surfaces(views[0], views[0], flat, flat)
+    pair = (model, views[:2], [images[0], images[0]])
+    settings = replace(QUICK, stages=1, iterations=0, a0=1.0, decay="constant")
+    given = run(pair, editor, tmp_path, settings, warps=lambda source, target: identity)
+    own = run(pair, editor, settings=settings)
+    assert np.array_equal(given.edited[0], given.edited[1])
+    assert not np.array_equal(own.edited[0], own.edited[1])
+    with pytest.raises(InputError, match=r"inputs\.warps"):
+        run(pair, editor, tmp_path, settings)
+    small = warp_surfaces(
+        views[0],
+        views[0].resize(16, 16),
+        Surface(flat.depth[:16, :16], flat.normal[:16, :16]),
+        flat,
+    )
+    with pytest.raises(ValueError, match=r"warps\(0, 1\)\.mask: got shape \(16, 16\)"):
+        run(pair, editor, settings=settings, warps=lambda source, target: small)
 
 
 def test_weight_zero_is_each_view_alone_bit_for_bit(scene, editor, tmp_path):

@@ -9,7 +9,7 @@ from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
-from attnwarp_eval.report.claims import Claim, judge
+from attnwarp_eval.report.claims import Claim, Finding, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probes import probe
@@ -166,6 +166,30 @@ def test_a_claim_that_only_some_scenes_show_is_mixed_and_cannot_be_told():
         results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]}), [SLIP_CLAIM]
     )
     assert (finding.here, finding.verdict, finding.agreement) == ("mixed", "can't tell", (2, 3))
+
+
+def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
+    claim = Claim(
+        "decay", "Decay helps", "editing", "fidelity.psnr.edit_inside",
+        {"options": {"decay": "constant"}}, "higher", b={}, editors=("small", "small-plain"),
+    )  # fmt: skip
+    sides = [(one.a["editor"]["name"], one.b) for one in claim.of_each_editor()]
+    assert sides == [(name, {"editor": {"name": name}}) for name in ("small", "small-plain")]
+
+    def finding(here, verdict):
+        return Finding(claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict)
+
+    holds, fails = finding("seen", "holds"), finding("not seen", "does not hold")
+    assert together([holds, holds], claim.editors) == ("seen", "holds")
+    assert together([holds, fails], claim.editors) == ("depends on the editor",) * 2
+    assert together([holds], claim.editors) == ("seen", "can't tell")
+
+
+def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
+    declared = load_claims()
+    assert len({claim.id for claim in declared}) == len(declared)
+    for claim in declared:
+        assert probe(claim.probe).metric(claim.metric.replace("{layer}", "64")), claim.id
 
 
 def test_an_undefined_scene_neither_agrees_nor_disagrees():

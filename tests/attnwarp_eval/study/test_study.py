@@ -8,7 +8,7 @@ import yaml
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
-from attnwarp_eval.study.probes import sensitivity
+from attnwarp_eval.study.probes import editing, sensitivity
 from attnwarp_eval.study.study import shipped_studies
 
 SMALL = {
@@ -43,9 +43,10 @@ def cells(study):
 
 @pytest.mark.parametrize("name", list(shipped_studies()))
 def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch):
-    # Which weights an encoder has is part of a cell's id; that they are there is tested where they
-    # are.
+    # Which weights an encoder or an editor has is part of a cell's id; that they are there is tested
+    # where they are.
     monkeypatch.setattr(sensitivity, "identity", lambda name, kind: {"weights_sha256": name})
+    monkeypatch.setattr(editing, "_files_digest", lambda name: name)
     study = load_study(name)
     assert study.title
     assert len({c.id for c in cells(study)}) == len(cells(study)) > 0

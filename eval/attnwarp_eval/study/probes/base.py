@@ -149,6 +149,8 @@ class Probe(ABC, Generic[E]):
         contrasts: metrics in which a variant is tested against a baseline.
         times_in_turn: whether its records have seconds of :class:`InTurn`.
         stage: of :class:`InTurn`, the one whose seconds its figures cost.
+        cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
+            taken in turn, what they are seconds of, and what is in them.
         picture_label: title of its pictures; the variant's name if empty.
     """
 
@@ -165,6 +167,13 @@ class Probe(ABC, Generic[E]):
     contrasts: ClassVar[Sequence[str]] = ()
     times_in_turn: ClassVar[bool] = False
     stage: ClassVar[str] = ""
+    cost: ClassVar[str] = "steady"
+    cost_of: ClassVar[str] = "a view"
+    cost_text: ClassVar[str] = (
+        "Seconds are those of the method alone: a render of the target for depth; render,"
+        " correspondence, mask and feature grids for a warp. The source's render serves all targets"
+        " and is not in them, nor are set-up and checks."
+    )
     picture_label: ClassVar[str] = ""
 
     # From a study to cells
@@ -255,6 +264,10 @@ class Probe(ABC, Generic[E]):
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """Sections of the report; none where the run has no record of this probe."""
         return iter(())
+
+    def gallery(self, results: Results) -> Section | None:
+        """A section of its own for its pictures; None where they stand with those of others."""
+        return None
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Folded tables below a table of variants.

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+import attnwarp.fit
 from attnwarp.fit import FitSettings
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
@@ -153,10 +154,9 @@ class Fit(Probe[Curve]):
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The fit, and how depth is read off it."""
         settings = variant.settings()
-        fits = study.part(StudyPart).fit
         return {
             "spp": study.spp,
-            "fit": {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()},
+            "fit": fit_spec(study, variant, seed),
             "depth": settings.depth,
             "depth_statistic": settings.depth_statistic,
         }
@@ -172,34 +172,16 @@ class Fit(Probe[Curve]):
         fit in other ways share it, and one that was cut short is resumed.
         """
         spec, world, meter = work.spec, work.world, work.meter
-        data = spec["fit"]
-        decisive = {
-            **data,
-            "scene": spec["scene"],
-            "size": spec["size"],
-            "spp": spec["spp"],
-            "seed": spec["seed"],
-        }
         with meter.stage("truth"):
             cameras = {
                 camera.name: camera
-                for camera in export.orbit(world.scene, data["views"])
+                for camera in export.orbit(world.scene, spec["fit"]["views"])
                 if camera.name in spec["views"]
             }
         for camera in cameras.values():
             world.add(camera)
         # The fit's seconds go into the curve, which holds them for earlier sittings as well.
-        result = fitted.fit_scene(
-            world.scene,
-            FitSettings.from_dict(data["settings"]),
-            work.root / "fits" / digest(decisive)[:16],
-            views=data["views"],
-            spp=spec["spp"],
-            points=data["points"],
-            noise=data["noise"],
-            seed=spec["seed"],
-            geometry=world.geometry,
-        )
+        result = fit_of(work)
         meter.count(iterations=result.iteration, splats=len(result.gaussians))
         settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
         for name, camera in cameras.items():
@@ -338,6 +320,34 @@ def settings_of(study: Study, variant: Variant, seed: int) -> FitSettings:
     """The study's fit settings with the variant's own fields."""
     shared, own = study.part(StudyPart).fit.settings, variant.part(VariantPart).fit
     return FitSettings.from_dict({**shared, **own, "seed": seed})
+
+
+def fit_spec(study: Study, variant: Variant, seed: int) -> Json:
+    """What decides a fit of one scene."""
+    fits = study.part(StudyPart).fit
+    return {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()}
+
+
+def fit_of(work: Work) -> attnwarp.fit.Fit:
+    """The fit that a cell's spec names under ``fit``.
+
+    It lies below the run's folder, named by what decides it: cells that want the same fit share
+    it, and one that was cut short is resumed.
+    """
+    spec, world = work.spec, work.world
+    data = spec["fit"]
+    decisive = {**data, **{key: spec[key] for key in ("scene", "size", "spp", "seed")}}
+    return fitted.fit_scene(
+        world.scene,
+        FitSettings.from_dict(data["settings"]),
+        work.root / "fits" / digest(decisive)[:16],
+        views=data["views"],
+        spp=spec["spp"],
+        points=data["points"],
+        noise=data["noise"],
+        seed=spec["seed"],
+        geometry=world.geometry,
+    )
 
 
 def _measure(point: Point, name: str) -> float:

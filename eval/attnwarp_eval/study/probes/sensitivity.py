@@ -180,7 +180,7 @@ class Sensitivity(Probe[Seconds]):
     ) -> Iterator[Cell]:
         """One for each scene and seed."""
         part = study.part(StudyPart)
-        identities = _identities(part)
+        identities = encoder_identities(part)
         available = dict.fromkeys(edit.name for scene in scenes.values() for edit in scene.edits)
         for edit in part.edits:
             if edit not in available:
@@ -286,7 +286,7 @@ class Sensitivity(Probe[Seconds]):
             yield Place.INSTRUMENT, _costs(records, rows, shares, layout)
 
 
-def _identities(part: StudyPart) -> dict[str, dict[str, Any]]:
+def encoder_identities(part: StudyPart) -> dict[str, dict[str, Any]]:
     """Encoders by their weights: other weights give other cells, another folder does not."""
     identities = {}
     for kind, name in part.encoders.items():

@@ -1,0 +1,157 @@
+"""The true pictures of one edit in all views of a cell, and which answer an edited view shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval import metrics
+from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.scene.edits import pick
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth import appearance, two_view
+from attnwarp_eval.truth.edits import edit_mask
+from attnwarp_eval.twoview import TwoView
+from attnwarp_eval.world import World, world
+
+Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+ONLY = "edited"
+"""Name of the answer of an edit that has one alone."""
+
+
+@dataclass(frozen=True, eq=False)
+class EditTruth:
+    """An edit's truth.
+
+    Attributes:
+        originals: (H, W, 3) sRGB in [0, 1] by view, before the edit.
+        answers: the same after the edit, by answer and view.
+        masks: (H, W) bool by answer and view, the edited object; all True for an edit of the light.
+        union: by view, the union of the answers' masks.
+    """
+
+    originals: Mapping[str, Image]
+    answers: Mapping[str, Mapping[str, Image]]
+    masks: Mapping[str, Mapping[str, Mask]]
+    union: Mapping[str, Mask]
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether there is more than one right answer."""
+        return len(self.answers) > 1
+
+    def of(self, views: Sequence[str]) -> EditTruth:
+        """The same for some of the views."""
+        return EditTruth(
+            {v: self.originals[v] for v in views},
+            {name: {v: pictures[v] for v in views} for name, pictures in self.answers.items()},
+            {name: {v: masks[v] for v in views} for name, masks in self.masks.items()},
+            {v: self.union[v] for v in views},
+        )
+
+    def judge(self, pictures: Mapping[str, Any]) -> Judgement:
+        """Whether pictures of some views show an edit that was done, and which answer.
+
+        Args:
+            pictures: (H, W, 3) sRGB in [0, 1] by view.
+        """
+        part = self.of(list(pictures))
+        name, scores = metrics.nearest_answer(pictures, part.answers, part.union)
+        if name is None:
+            return Judgement(None, False, math.nan, math.nan, math.nan)
+        unedited = metrics.edit_psnr(part.originals, part.answers[name], part.union).pooled
+        unchanged = metrics.edit_psnr(pictures, part.originals, part.union).pooled
+        psnr = scores[name]
+        done = psnr > max(unchanged, unedited)
+        return Judgement(name, done, psnr, unedited, unchanged)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What edited views show.
+
+    Attributes:
+        answer: the nearest; None where nothing of the object is in the pictures.
+        done: whether the pictures are nearer to it than to the unedited ones, and than those are.
+        psnr: dB to it inside the edited object, pooled over the views.
+        unedited: dB of the unedited pictures to it.
+        unchanged: dB of the pictures to the unedited ones.
+    """
+
+    answer: str | None
+    done: bool
+    psnr: float
+    unedited: float
+    unchanged: float
+
+
+def answers_of(scene: Scene, edit: str) -> list[tuple[str, str | None]]:
+    """(name, answer as the scene has it) of an edit's right answers.
+
+    Args:
+        edit: its name, or ``name=answer`` for one answer of an ambiguous edit alone.
+
+    Raises:
+        ValueError: there is no such answer.
+    """
+    title, _, answer = edit.partition("=")
+    if answer:
+        pick(scene.edit(title), answer)  # refuses an answer that is not there
+        return [(answer, answer)]
+    answers = scene.edit(title).answers
+    return [(one.name, one.name) for one in answers] or [(ONLY, None)]
+
+
+@lru_cache(maxsize=8)
+def edit_truth(scene: str, size: int, spp: int, edit: str, views: tuple[str, ...]) -> EditTruth:
+    """The truth of an edit; cached, since all variants of a scene share it.
+
+    Args:
+        scene, size: of :func:`attnwarp_eval.world.world`.
+        spp: samples a pixel.
+        edit: as for :func:`answers_of`.
+        views: names, the source among them.
+    """
+    of = world(scene, size)
+    answers = answers_of(of.scene, edit)
+    title = edit.partition("=")[0]
+    # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
+    originals = {view: of.image(view, spp) for view in views}
+    pictures = {}
+    for name, answer in answers:
+        edited = of.scene.edited(title, answer)
+        pictures[name] = {
+            view: to_srgb(appearance(edited, of.camera(view), spp=spp, seed=0)) for view in views
+        }
+    hits = {view: of.geometry.trace(of.camera(view)) for view in views}
+    masks = {
+        name: {view: edit_mask(of.scene, title, hits[view], answer) for view in views}
+        for name, answer in answers
+    }
+    union = {
+        view: np.logical_or.reduce([masks[name][view] for name, _ in answers]) for view in views
+    }
+    return EditTruth(originals, pictures, masks, union)
+
+
+def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
+    """For each target the view before it by yaw, the source before the first."""
+    ordered = [of.source.name, *sorted(views, key=lambda view: of.yaw[view])]
+    return dict(zip(ordered[1:], ordered, strict=False))
+
+
+@lru_cache(maxsize=64)
+def pair_of(scene: str, size: int, first: str, second: str) -> TwoView:
+    """The exact relation of any two views of a scene."""
+    of = world(scene, size)
+    if first == of.source.name:
+        return of.pair(second, size)
+    return two_view(of.geometry, of.camera(first), of.camera(second))

@@ -1,0 +1,325 @@
+"""The report's sections about edited scenes: what the editor can do, agreement by yaw and by scene,
+seconds by part, and which variant to choose for a given time.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from attnwarp_eval.document import charts
+from attnwarp_eval.document.model import Gallery, Picture, Section, Table
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.results import Results
+
+BY_YAW = {
+    "multiview.same_answer.edit": "views with the source's answer",
+    "multiview.delta_e_above.edit_inside": "disagreement with the source above its floor, dE00",
+    "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
+}
+"""Figures that are shown by yaw, with what they are."""
+
+BY_SCENE = {
+    "multiview.same_answer.edit_seen": "Views with the source's answer where the source saw it",
+    "multiview.same_answer.edit": "Views with the source's answer",
+    "multiview.delta_e_above.edit_inside": "Disagreement with the source above its floor, dE00",
+    "multiview.delta_e_above.edit_next": "Disagreement of neighbouring views above its floor, dE00",
+    "multiview.delta_e_above.render_inside": "Disagreement of renders above its floor, dE00",
+    "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
+    "depth.abs_rel.before": "AbsRel of the splats' depth before the edit",
+    "depth.abs_rel.after": "AbsRel of the splats' depth after tuning",
+}
+
+DISAGREEMENT = "multiview.delta_e_above.edit_inside"
+
+PARTS = ("source", "warp", "edit", "tune")
+
+OWN = "each view alone"
+"""The method of settings that edits every view by itself: the control."""
+
+
+def abilities(results: Results, probe: str) -> Section:
+    """What the editor does in the source view, and in every view by itself."""
+    names = controls(results, probe)
+    section = Section("What the editor can do")
+    section.text = [
+        (
+            "An edit counts as done where the picture, inside the edited object, is nearer to a"
+            " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
+            " inside the object, dB; in brackets that of the unedited picture."
+            " **Agreement between views is judged only where the source's edit is done**; the"
+            " other edits have undefined figures, and stand here by name."
+        ),
+    ]
+    rows = []
+    for name in names:
+        for scene, seed, record in results.records(probe, name):
+            edit = record.extra
+            rows.append(
+                [
+                    scene,
+                    edit.name,
+                    edit.instruction,
+                    name,
+                    str(seed),
+                    edit.source.answer or "–",
+                    _against(edit.source),
+                    "yes" if edit.source.done else "**no**",
+                    _against(edit.alone),
+                    "yes" if edit.alone.done else "no",
+                ]
+            )
+    columns = [
+        "scene",
+        "edit",
+        "instruction",
+        "variant",
+        "seed",
+        "nearest answer of the source",
+        "source, dB",
+        "source done",
+        "all views, dB",
+        "all views done",
+    ]
+    section.tables = [Table(columns, rows)]
+    return section
+
+
+def controls(results: Results, probe: str) -> list[str]:
+    """The measured variants that edit each view by itself; the first measured one without any."""
+    measured = [
+        (name, records[0][2])
+        for name in results.study.variants
+        if (records := results.records(probe, name))
+    ]
+    alone = [name for name, record in measured if record.spec["settings"].get("method") == OWN]
+    return alone or [name for name, _ in measured[:1]]
+
+
+def _against(judgement: Any) -> str:
+    return f"{number(judgement.psnr)} ({number(judgement.unedited)})"
+
+
+def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -> Section:
+    """Means over scenes at each yaw from the source."""
+    measured = [name for name in names if results.records(probe, name)]
+    yaws = sorted(
+        {
+            view.yaw
+            for name in measured
+            for _, _, record in results.records(probe, name)
+            for view in record.views
+        }
+    )
+    curves = {
+        (metric, name): [
+            interval(_lists(results.views(probe, name, metric, (yaw, yaw)))) for yaw in yaws
+        ]
+        for metric in BY_YAW
+        for name in measured
+    }
+    path = layout.figure("editing-by-yaw.svg")
+    with charts.drawing(path, columns=len(BY_YAW)) as panels:
+        for axes, (metric, title) in zip(panels, BY_YAW.items(), strict=True):
+            series = [charts.Line(name, yaws, curves[metric, name]) for name in measured]
+            charts.lines(
+                axes,
+                series,
+                x="yaw from the source, degrees",
+                y=_unit(metric),
+                title=title,
+                share="same_answer" in metric,
+                legend=metric == list(BY_YAW)[-1],
+            )
+    tables = [
+        Table(
+            ["variant", *(f"{yaw:g}°" for yaw in yaws)],
+            [[name, *(number(v.mean) for v in curves[metric, name])] for name in measured],
+            title,
+            folded=True,
+        )
+        for metric, title in BY_YAW.items()
+    ]
+    text = ["Means over the scenes whose source edit was done, with 95 % intervals over scenes."]
+    figure = Picture(f"figures/{path.name}", "Agreement and fidelity by yaw from the source.")
+    return Section("Edited views by yaw", text, tables, [figure])
+
+
+def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
+    """A table for each figure: variants by scenes."""
+    measured = [name for name in names if results.records(probe, name)]
+    scenes = results.study.scenes
+    tables = []
+    for metric, title in BY_SCENE.items():
+        rows = []
+        for name in measured:
+            table = _lists(results.views(probe, name, metric))
+            means = [interval({s: table.get(s, [])}).mean for s in scenes]
+            rows.append([name, *(number(value) for value in means), spread(interval(table))])
+        tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
+    tables.insert(0, _ratios(results, probe, measured))
+    text = ["A dash: the editor did none of the scene's edits in its source view, or one answer."]
+    return Section("Edited views by scene", text, tables)
+
+
+def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
+    """Disagreement above its floor as a part of the control's with the same editor."""
+    control = {
+        results.records(probe, name)[0][2].spec["editor"]["sha256"]: name
+        for name in reversed(controls(results, probe))
+    }
+    rows = []
+    for name in names:
+        base = control.get(results.records(probe, name)[0][2].spec["editor"]["sha256"], "")
+        if base in ("", name):
+            continue
+        own, other = (results.views(probe, each, DISAGREEMENT) for each in (name, base))
+        ratios = [
+            _ratio(own.get(scene, {}), other.get(scene, {})) for scene in results.study.scenes
+        ]
+        rows.append([name, base, *(number(ratio) for ratio in ratios)])
+    title = "Disagreement with the source above its floor, as a part of the control's"
+    return Table(["variant", "control", *results.study.scenes], rows, title)
+
+
+def _ratio(own: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """Of the sums over the views that both have."""
+    shared = [v for v in own if v in other and math.isfinite(own[v]) and math.isfinite(other[v])]
+    below = sum(other[view] for view in shared)
+    return sum(own[view] for view in shared) / below if below > 0 else math.nan
+
+
+def side_by_side(results: Results, probe: str) -> Section | None:
+    """A row for each view of an edit: before, the source's edit, each variant, the truth."""
+    rows: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    for cell, record in results.finished(probe):
+        for picture in record.pictures:
+            own = rows.setdefault((cell.scene, picture.view), {})
+            own.setdefault(cell.variants[0], {})[picture.content] = picture.path
+    if not rows:
+        return None
+    gallery = []
+    for (scene, view), variants in rows.items():
+        first = next(iter(variants.values()))
+        shown = [Picture(first[key], key.replace("-", " ")) for key in ("before", "source-edit")]
+        shown += [Picture(own["edited"], name) for name, own in variants.items() if "edited" in own]
+        if "truth" in first:
+            shown.append(Picture(first["truth"], "truth of the source's answer"))
+        gallery.append((f"**{scene}, {view}**", shown))
+    text = ["The view before the edit, the source's edit, and the edited view by each variant."]
+    return Section("Edited views side by side", text, gallery=Gallery(gallery))
+
+
+def parts_of_time(results: Results, probe: str) -> Section:
+    """Mean seconds of each part, and the ratio of editing to the control's."""
+    control = controls(results, probe)[0]
+    base = _seconds(results, probe, control)
+    rows, columns = [], ["variant", *PARTS, "whole", "editing, ratio to control", "network rows"]
+    for name in results.study.variants:
+        records = results.records(probe, name)
+        if not records:
+            continue
+        own = _seconds(results, probe, name)
+        shared = [cell for cell in own if cell in base and _editing(base[cell]) > 0]
+        ratios = [_editing(own[cell]) / _editing(base[cell]) for cell in shared]
+        counts = [record.cost.counters.get("network_rows", 0) for _, _, record in records]
+        means = [_mean(row[part] for row in own.values()) for part in PARTS]
+        whole = _mean(sum(row.values()) for row in own.values())
+        rows.append(
+            [
+                name,
+                *(number(value) for value in means),
+                number(whole),
+                number(statistics.median(ratios) if ratios else None),
+                number(_mean(counts)),
+            ]
+        )
+    text = [
+        (
+            "Seconds of one edited scene, each cell at another time: for orientation. The ratio is"
+            " the median over scenes, edits and seeds of source, warps and edited views together"
+            f" against {control!r}, tuning apart."
+        ),
+    ]
+    timed = tuple(columns[1:-1])
+    return Section("Seconds by part", text, [Table(columns, rows, timed=timed)])
+
+
+def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence[str]) -> Section:
+    """The best variant for a given time: chosen on every other scene, checked on the rest."""
+    scenes = results.study.scenes
+    chosen_on, checked_on = scenes[::2], scenes[1::2]
+    seconds = {
+        name: _mean(sum(row.values()) for row in _seconds(results, probe, name).values())
+        for name in names
+        if results.records(probe, name)
+    }
+    section = Section("Which variant for a given time")
+    section.text = [
+        (
+            "Of the variants that take at most the seconds of the row, the one with the least mean"
+            f" on {', '.join(chosen_on)}; beside it the same variant on"
+            f" {', '.join(checked_on) or 'no other scene'}, which had no part in the choice."
+        ),
+    ]
+    columns = ["seconds at most", "variant", "where chosen", "elsewhere", "best elsewhere"]
+    for metric in metrics:
+        rows, last = [], ""
+        for limit in sorted(seconds.values()):
+            scores = {
+                name: (
+                    _on(results, probe, name, metric, chosen_on),
+                    _on(results, probe, name, metric, checked_on),
+                )
+                for name, taken in seconds.items()
+                if taken <= limit
+            }
+            defined = {name: pair for name, pair in scores.items() if math.isfinite(pair[0])}
+            best = min(defined, key=lambda name: defined[name][0], default="")
+            if not best or best == last:
+                continue
+            last = best
+            others = {n: pair[1] for n, pair in scores.items() if math.isfinite(pair[1])}
+            least = min(others, key=others.__getitem__, default="–")
+            chosen, checked = defined[best]
+            rows.append([number(limit), best, number(chosen), number(checked), least])
+        section.tables.append(Table(columns, rows, metric, timed=(columns[0],)))
+    return section
+
+
+def _on(results: Results, probe: str, name: str, metric: str, scenes: Sequence[str]) -> float:
+    table = results.views(probe, name, metric)
+    return interval({s: list(table[s].values()) for s in scenes if s in table}).mean
+
+
+def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], dict[str, float]]:
+    """Seconds by part of each cell, by (scene, seed, edit)."""
+    return {
+        (scene, seed, record.extra.name): {
+            part: float(record.cost.seconds.get(f"method: {part}") or 0.0) for part in PARTS
+        }
+        for scene, seed, record in results.records(probe, name)
+    }
+
+
+def _editing(seconds: Mapping[str, float]) -> float:
+    return seconds["source"] + seconds["warp"] + seconds["edit"]
+
+
+def _lists(table: Mapping[str, Mapping[str, float]]) -> dict[str, list[float]]:
+    return {scene: list(values.values()) for scene, values in table.items()}
+
+
+def _mean(values: Iterable[float]) -> float:
+    listed = list(values)
+    return sum(listed) / len(listed) if listed else math.nan
+
+
+def _unit(metric: str) -> str:
+    if "same_answer" in metric:
+        return "share"
+    return "dB" if "psnr" in metric else "dE00"

@@ -1,0 +1,143 @@
+"""Methods that edit a scene, by the name that a study's variant gives as ``method``.
+
+A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one line in
+:data:`METHODS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from attnwarp.camera import Camera
+    from attnwarp.editing.editor import Editor
+    from attnwarp.gaussians import Gaussians
+    from attnwarp.warp import WarpedView
+
+Image = npt.NDArray[np.float32]
+Bytes = npt.NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A scene to edit.
+
+    Attributes:
+        gaussians: the scene before the edit.
+        cameras: of the views, the source first; all of one size (H, W).
+        images: (H, W, 3) sRGB in [0, 1], the views before the edit.
+        editor: of single views.
+        instruction: in words.
+        settings: what the method's ``settings`` returned.
+        folder: for the method's files; removed afterwards.
+        warps: the warp from the source to a target by their numbers, in place of the method's own.
+        truth: the true edited views by answer, in the order of ``cameras``. Only methods that
+            bound others may look at it.
+    """
+
+    gaussians: Gaussians
+    cameras: Sequence[Camera]
+    images: Sequence[Image]
+    editor: Editor
+    instruction: str
+    settings: dict[str, Any]
+    folder: Path
+    warps: Callable[[int, int], WarpedView] | None
+    truth: Mapping[str, Sequence[Image]]
+
+
+@dataclass(frozen=True, eq=False)
+class EditedScene:
+    """The result of a method.
+
+    Attributes:
+        gaussians: the edited splats.
+        edited: (h, w, 3) uint8 sRGB by the view's number, the source among them; views that the
+            method did not edit are left out.
+        seconds: by part. ``edit``, ``source``, ``warp`` and ``tune`` are the method's own work.
+        counters: of work, such as ``network_rows``.
+    """
+
+    gaussians: Gaussians
+    edited: Mapping[int, Bytes]
+    seconds: Mapping[str, float]
+    counters: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Method:
+    """How a method is configured and run.
+
+    Attributes:
+        settings: complete settings as JSON, from a preset's name, the fields of a study and a
+            variant, and the seed. ValueError: an unknown field or a value out of range.
+        run: the method.
+    """
+
+    settings: Callable[[str, dict[str, Any], int], dict[str, Any]]
+    run: Callable[[Job], EditedScene]
+
+
+def _propagate_settings(name: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
+    from attnwarp.propagate import preset
+
+    return preset(name, **fields, seed=seed).to_dict()
+
+
+def _propagate(job: Job) -> EditedScene:
+    """:func:`attnwarp.propagate.propagate`."""
+    from attnwarp.propagate import PropagateSettings, propagate
+
+    result = propagate(
+        job.gaussians,
+        job.cameras,
+        job.images,
+        job.editor,
+        job.instruction,
+        PropagateSettings.from_dict(job.settings),
+        warps=job.warps,
+        folder=job.folder,
+    )
+    return EditedScene(result.gaussians, result.edited, result.seconds, result.counters)
+
+
+def _true_pictures(job: Job) -> EditedScene:
+    """The first answer's true pictures in every view, and splats tuned on them: the ceiling.
+
+    Stages, their views and their tuning are those of ``propagate``.
+    """
+    import time
+
+    from attnwarp.propagate import Plan, PropagateSettings
+    from attnwarp.propagate.pictures import to_bytes
+    from attnwarp.propagate.tune import TrainingView, Tuning
+
+    settings = PropagateSettings.from_dict(job.settings)
+    pictures = next(iter(job.truth.values()))
+    plan = Plan.draw(len(job.cameras), 0, settings)
+    edited = {view: to_bytes(pictures[view]) for view in plan.edited}
+    training = {
+        view: TrainingView(view, job.cameras[view], pixels.astype(np.float32) / np.float32(255))
+        for view, pixels in edited.items()
+    }
+    tuning = Tuning(job.gaussians, job.cameras, settings, len(plan.stages))
+    begin = time.perf_counter()
+    for stage in range(len(plan.stages)):
+        views = [training[view] for view in plan.training(stage, settings.training)]
+        tuning.stage(stage, views, training[0], checkpoint=job.folder / "stage.pt")
+    seconds = {"tune": time.perf_counter() - begin}
+    counters = {"iterations": tuning.iteration, "views": len(edited), "network_rows": 0}
+    return EditedScene(tuning.gaussians(), edited, seconds, counters)
+
+
+METHODS: dict[str, Method] = {
+    "propagate": Method(_propagate_settings, _propagate),
+    "true pictures": Method(_propagate_settings, _true_pictures),
+}
+"""Every method by name. ``propagate`` with ``method: each view alone`` is the control."""

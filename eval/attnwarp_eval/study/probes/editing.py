@@ -1,0 +1,674 @@
+"""A scene edited by a method, against the true pictures of the edit.
+
+Views of a record are named ``edit/view``. Figures end in ``.edit`` for the edited views and in
+``.render`` for renders of the edited splats. Where the editor did not do the edit in the source
+view, figures of agreement between views are undefined: there was nothing to carry.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import Field
+
+from attnwarp import check
+from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
+from attnwarp_eval import metrics
+from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.document.model import Section
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.splats.fitted import surface_error
+from attnwarp_eval.study import editing_sections, pictures
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.edit_truth import (
+    EditTruth,
+    Judgement,
+    answers_of,
+    edit_truth,
+    neighbours,
+    pair_of,
+)
+from attnwarp_eval.study.methods import METHODS, EditedScene, Job
+from attnwarp_eval.study.parts import Part, Study, StudyError, Variant, did_you_mean
+from attnwarp_eval.study.probes import fit, register, sensitivity
+from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.record import Json, with_nan
+from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.warping import warp_truth
+from attnwarp_eval.world import splats
+
+if TYPE_CHECKING:
+    from attnwarp.editing.pix2pix import InstructPix2Pix
+    from attnwarp.gaussians import Gaussians
+    from attnwarp_eval.twoview import Hits
+
+Image = npt.NDArray[np.float32]
+
+OWN_WORK = ("source", "warp", "edit", "tune")
+"""Parts of a method's seconds that are its own; renders and files are for people."""
+
+FIDELITY = ("psnr", "mse", "ssim")
+"""Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has, of the whole picture and
+inside the edited object."""
+
+
+CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
+"""What the variant for a given time is chosen by; less is better."""
+
+
+class EditorPart(Part):
+    """An editor of single views.
+
+    ``name`` is bundled or a folder in diffusers' format. Guidance left out is the editor's own.
+    """
+
+    name: str = "small-plain"
+    text_guidance: float | None = Field(default=None, ge=0)
+    image_guidance: float | None = Field(default=None, ge=0)
+
+
+class Editing(Part):
+    """What all variants share.
+
+    ``edits``: by scene, an edit's name, or ``edit=answer`` for one of its answers alone, with the
+    words that the editor is given; the edit's own words where they are null. Scenes that are left
+    out have all their edits. ``by_yaw``: variants whose figures the report shows by yaw.
+    """
+
+    editor: EditorPart = EditorPart()
+    edits: dict[str, dict[str, str | None]] = Field(default_factory=dict)
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="fields of attnwarp.propagate.PropagateSettings"
+    )
+    by_yaw: list[str] = Field(default_factory=list)
+    choice: list[str] = Field(
+        default_factory=list, description="variants, one of which is chosen for a given time"
+    )
+
+
+class StudyPart(Part):
+    """Keys of a study that only this probe reads; ``encoders`` belong to the probe sensitivity."""
+
+    editing: Editing = Editing()
+
+
+class VariantPart(Part):
+    """Keys of a variant that only this probe reads.
+
+    ``options`` are fields of the method's settings, over the study's; ``preset`` among them names
+    its preset, else the variant's. ``mask: truth`` injects where the source truly sees the
+    surface, ``geometry: truth`` warps by exact depth. ``fitted`` takes splats that are fitted to
+    true pictures (keys ``fit``) in place of sampled ones.
+    """
+
+    method: str = "propagate"
+    options: dict[str, Any] = Field(default_factory=dict)
+    mask: Literal["rules", "truth"] = "rules"
+    fitted: bool = False
+    editor: EditorPart | None = None
+
+
+@dataclass(frozen=True)
+class EditResult:
+    """What a cell's record has beside the figures of its views.
+
+    Attributes:
+        name, instruction: of the edit.
+        source: what the source's edit shows.
+        alone: what all edited views together show, the source's included.
+        answers: by "edit" and "render": by view, the nearest answer; None where nothing of the
+            object shows.
+        overall: by "edit" and "render", the answer nearest to all views together.
+        edit_psnr: dB, edited views against renders, pooled, where a surface shows.
+        edited: number of edited views.
+        injected: mean share of the targets' pixels that got features; 0 without a warp.
+    """
+
+    name: str
+    instruction: str
+    source: Judgement
+    alone: Judgement
+    answers: Mapping[str, Mapping[str, str | None]]
+    overall: Mapping[str, str | None]
+    edit_psnr: float
+    edited: int
+    injected: float
+
+    def to_json(self) -> Json:
+        """The record's entry ``edit``."""
+        return {"edit": dict(without_nan(asdict(self)))}
+
+    @classmethod
+    def from_json(cls, data: Json) -> EditResult:
+        """From :meth:`to_json`."""
+        judgements = {
+            key: Judgement(
+                data[key]["answer"],
+                data[key]["done"],
+                **with_nan({k: data[key][k] for k in ("psnr", "unedited", "unchanged")}),
+            )
+            for key in ("source", "alone")
+        }
+        return cls(**{**data, **judgements, **with_nan({"edit_psnr": data["edit_psnr"]})})
+
+
+@register
+class EditingProbe(Probe[EditResult]):
+    """One edit of one scene by one method."""
+
+    name = "editing"
+    study_part = StudyPart
+    variant_part = VariantPart
+    metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
+    columns: ClassVar[Mapping[str, str]] = {
+        "same answer": "multiview.same_answer.edit",
+        "... where the source saw it": "multiview.same_answer.edit_seen",
+        "disagreement above floor, dE00": "multiview.delta_e_above.edit_inside",
+        "... of neighbours": "multiview.delta_e_above.edit_next",
+        "... in renders": "multiview.delta_e_above.render_inside",
+        "PSNR to truth inside, dB": "fidelity.psnr.edit_inside",
+        "PSNR of renders, dB": "fidelity.psnr.render_inside",
+        "Edit PSNR, dB": "image.psnr.edit_render",
+        "CLIP direction": "embedding.clip_directional.render",
+        "CLIP image": "embedding.clip_image.render",
+        "DINO image": "embedding.dino_image.render",
+        "AbsRel of depth after": "depth.abs_rel.after",
+    }
+    contrasts = (
+        "multiview.same_answer.edit",
+        "multiview.delta_e_above.edit_inside",
+        "multiview.delta_e_above.render_inside",
+        "fidelity.psnr.edit_inside",
+        "fidelity.psnr.render_inside",
+        "embedding.clip_directional.render",
+        "depth.abs_rel.after",
+    )
+    cost = "whole"
+    cost_of = "an edit"
+    cost_text = (
+        "Seconds are those of one whole edit of a scene: source, warps, edited views and tuning."
+    )
+
+    # From a study to cells
+
+    def check(self, study: Study) -> None:
+        """Figures by yaw need their variants measured."""
+        part = study.part(StudyPart).editing
+        study.check_variants(part.by_yaw, "editing.by_yaw", self.name)
+        study.check_variants(part.choice, "editing.choice", self.name)
+
+    def check_variant(self, study: Study, variant: Variant) -> None:
+        """Settings are refused even where nothing is edited."""
+        own = variant.part(VariantPart)
+        check.one_of(own.method, list(METHODS), "method")
+        if self.name in study.probes or own.options or study.part(StudyPart).editing.options:
+            settings_of(study, variant, 0)
+
+    def cells(
+        self, study: Study, names: Sequence[str], scenes: Mapping[str, Scene]
+    ) -> Iterator[Cell]:
+        """One for each scene, edit, variant and seed."""
+        wanted = study.part(sensitivity.StudyPart)
+        encoders = sensitivity.encoder_identities(wanted)
+        sources = {str(kind): name for kind, name in wanted.encoders.items()}
+        for name, scene in scenes.items():
+            edits = list(_edits(study, scene))
+            for label in names:
+                variant = study.variants[label]
+                editor = editor_of(study, variant)
+                for seed, edit in itertools.product(study.seeds, edits):
+                    spec = {
+                        **self.common_spec(study, scene, seed),
+                        **self.variant_spec(study, variant, seed),
+                        "edit": edit,
+                        "encoders": encoders,
+                    }
+                    shown = label in study.pictures.variants
+                    views = study.pictures_of(spec["views"]) if shown else ()
+                    yield Cell(
+                        spec, name, label, self.name, seed, (label,),
+                        tuple(f"{edit['name']}/{view}" for view in views),
+                        {**sources, "editor": editor.name},
+                    )  # fmt: skip
+
+    def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """The method with all its settings, the editor, and where splats and warps come from."""
+        own = variant.part(VariantPart)
+        return {
+            "spp": study.spp,
+            "method": own.method,
+            "settings": settings_of(study, variant, seed),
+            "editor": editor_identity(editor_of(study, variant)),
+            "geometry": variant.geometry,
+            "mask": own.mask,
+            **(
+                {"fit": fit.fit_spec(study, variant, seed)}
+                if own.fitted
+                else {"splats": study.splats_of(variant).model_dump()}
+            ),
+        }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Everything that decides a cell but for its seed."""
+        own = variant.part(VariantPart)
+        splats_from: Any = study.splats_of(variant)
+        if own.fitted:
+            splats_from = fit.fit_spec(study, variant, 0)
+        settings = settings_of(study, variant, 0)
+        return (
+            own.method, settings, variant.geometry, own.mask, splats_from, editor_of(study, variant)
+        )  # fmt: skip
+
+    # From a cell to its record
+
+    def compute(self, work: Work) -> EditResult:
+        """Edit the scene, then measure every target."""
+        spec, world, meter = work.spec, work.world, work.meter
+        names = [world.source.name, *spec["views"]]
+        with meter.stage("truth"):
+            truth = edit_truth(
+                work.cell.scene, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
+            )
+        with meter.stage("splats"):
+            before = self._splats(work)
+        with meter.stage("setup"):
+            encoders = sensitivity.loaded(work.cell.sources, spec["encoders"])
+            editor = load(work.cell.sources["editor"], spec["editor"])
+        with tempfile.TemporaryDirectory() as folder:
+            job = Job(
+                before,
+                [world.camera(name) for name in names],
+                [truth.originals[name] for name in names],
+                editor,
+                spec["edit"]["instruction"],
+                spec["settings"],
+                Path(folder),
+                _warps(work, before, names),
+                {a: [views[n] for n in names] for a, views in truth.answers.items()},
+            )
+            result = METHODS[spec["method"]].run(job)
+        for part, seconds in result.seconds.items():
+            meter.add(f"method: {part}", seconds)
+        meter.add("whole", sum(result.seconds.get(part, 0.0) for part in OWN_WORK))
+        meter.count(**{k: int(v) for k, v in result.counters.items() if k != "injected"})
+        with meter.stage("checks"):
+            return _Measure(work, truth, names, before, result, encoders).record()
+
+    def _splats(self, work: Work) -> Gaussians:
+        if "fit" in work.spec:
+            return fit.fit_of(work).gaussians
+        spec = work.spec
+        return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
+
+    def read_extra(self, data: Json) -> EditResult:
+        """From the record's entry ``edit``."""
+        return EditResult.from_json(data["edit"])
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """What the editor can do, figures by yaw, time by part."""
+        if not results.finished(self.name):
+            return
+        yield Place.INSTRUMENT, editing_sections.abilities(results, self.name)
+        part = results.study.part(StudyPart).editing
+        if part.by_yaw:
+            yield Place.RESULT, editing_sections.by_yaw(results, self.name, part.by_yaw, layout)
+            yield Place.RESULT, editing_sections.by_scene(results, self.name, part.by_yaw)
+        if layout.timings:
+            yield Place.RESULT, editing_sections.parts_of_time(results, self.name)
+        if layout.timings and part.choice:
+            yield (
+                Place.RESULT,
+                editing_sections.choice(results, self.name, part.choice, CHOSEN_BY),
+            )
+
+    def gallery(self, results: Results) -> Section | None:
+        """Edited views side by side."""
+        return editing_sections.side_by_side(results, self.name)
+
+
+class _Measure:
+    """The figures of one edited scene.
+
+    Args:
+        work: the cell.
+        truth: of the edit.
+        names: of the views, the source first.
+        before: the splats before the edit.
+        result: of the method.
+        encoders: by kind.
+    """
+
+    def __init__(
+        self,
+        work: Work,
+        truth: EditTruth,
+        names: list[str],
+        before: Gaussians,
+        result: EditedScene,
+        encoders: Mapping[str, Any],
+    ) -> None:
+        self.work, self.truth, self.names = work, truth, names
+        self.injected = float(result.counters.get("injected", 0.0))
+        self.before, self.after, self.encoders = before, result.gaussians, encoders
+        self.source = names[0]
+        edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
+        self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
+        self.judged = truth.judge({self.source: edited[self.source]})
+        self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
+        self.neighbours = neighbours(work.world, work.spec["views"])
+
+    def record(self) -> EditResult:
+        """Add the figures of every target to the work; return the rest."""
+        work, truth = self.work, self.truth
+        figures: dict[str, dict[str, float]] = {name: {} for name in self.names[1:]}
+        overall: dict[str, str | None] = {}
+        for kind, images in self.pictures.items():
+            part = truth.of(list(images))
+            overall[kind], fidelity = metrics.edit_fidelity(
+                images, part.answers, part.masks, originals=part.originals
+            )
+            for name, row in figures.items():
+                row |= self._fidelity(kind, fidelity.get(name))
+                row |= self._agreement(kind, name, overall[kind])
+        embedded = self._embedded()
+        both = [name for name in self.pictures["edit"] if name != self.source]
+        psnr = metrics.edit_psnr(
+            {name: self.pictures["edit"][name] for name in both},
+            {name: self.pictures["render"][name] for name in both},
+            # Sampled splats lie on surfaces: the sky has none.
+            {name: self._hits(name).valid for name in both},
+        )
+        errors = dict(zip(psnr.views, psnr.psnr, strict=True))
+        for name, row in figures.items():
+            row["image.psnr.edit_render"] = errors.get(name, math.nan)
+            row |= embedded[name]
+            row |= self._depth(name)
+            edit = work.spec["edit"]["name"]
+            work.add(f"{edit}/{name}", row, partial(self._draw, name))
+        return EditResult(
+            work.spec["edit"]["name"],
+            work.spec["edit"]["instruction"],
+            self.judged,
+            truth.judge(self.pictures["edit"]),
+            self.nearest,
+            overall,
+            psnr.pooled,
+            len(self.pictures["edit"]),
+            self.injected,
+        )
+
+    def _nearest(self, images: Mapping[str, Image]) -> dict[str, str | None]:
+        part = self.truth.of(list(images))
+        return metrics.answers_by_view(images, part.answers, part.union)
+
+    def _pair(self, first: str, second: str) -> Any:
+        return pair_of(self.work.cell.scene, self.work.spec["size"], first, second)
+
+    def _fidelity(self, kind: str, figures: Mapping[str, float] | None) -> dict[str, float]:
+        if figures is None:
+            figures = {}
+        return {
+            f"fidelity.{key}.{kind}{place}": figures.get(
+                f"fidelity.{key}{'.inside' if place else ''}", math.nan
+            )
+            for key in FIDELITY
+            for place in ("", "_inside")
+        } | {f"fidelity.preserved_psnr.{kind}": figures.get("fidelity.preserved_psnr", math.nan)}
+
+    def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
+        """Of a target with the source, and with its neighbour; NaN where it was not edited or the
+        source's edit is not one."""
+        keys = ("same_answer", "delta_e", "delta_e_floor", "delta_e_above")
+        row = dict.fromkeys(
+            [
+                *(f"multiview.same_answer.{kind}{end}" for end in ("", "_seen")),
+                *(f"multiview.{k}.{kind}{end}" for k in keys[1:] for end in ("", "_inside")),
+                f"multiview.delta_e_above.{kind}_next",
+            ],
+            math.nan,
+        )
+        images, truth = self.pictures[kind], self.truth
+        if not self.judged.done or answer is None or name not in images:
+            return row
+        pair = self._pair(self.source, name)
+        own = self.nearest[kind][name]
+        if truth.ambiguous:
+            row[f"multiview.same_answer.{kind}"] = _equal(own, self.judged.answer)
+            part = truth.of([name])
+            seen = {name: truth.union[name] & pair.visible}
+            there = metrics.answers_by_view({name: images[name]}, part.answers, seen)[name]
+            row[f"multiview.same_answer.{kind}_seen"] = _equal(there, self.judged.answer)
+        for end, mask in (("", None), ("_inside", truth.masks[answer][name])):
+            figures = self._above(images, answer, self.source, name, mask)
+            for key in keys[1:]:
+                row[f"multiview.{key}.{kind}{end}"] = figures[f"multiview.{key}"]
+        other = self.neighbours[name]
+        if other in images:
+            mask = truth.masks[answer][name]
+            figures = self._above(images, answer, other, name, mask)
+            row[f"multiview.delta_e_above.{kind}_next"] = figures["multiview.delta_e_above"]
+        return row
+
+    def _above(
+        self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
+    ) -> dict[str, float]:
+        true = self.truth.answers[answer]
+        return metrics.above_floor(
+            (images[first], images[second]),
+            (true[first], true[second]),
+            self._pair(first, second),
+            mask=mask,
+        )
+
+    def _embedded(self) -> dict[str, dict[str, float]]:
+        """The paper's similarities of renders; none without encoders."""
+        targets = self.names[1:]
+        rows: dict[str, dict[str, float]] = {name: {} for name in targets}
+        renders = [self.pictures["render"][name] for name in targets]
+        source = self.pictures["edit"][self.source]
+        values: dict[str, Any] = {}
+        if (clip := self.encoders.get("clip")) is not None:
+            words = clip.texts([self.work.spec["edit"][key] for key in ("source", "target")])
+            images = clip.images(renders)
+            befores = clip.images([self.truth.originals[name] for name in targets])
+            values["clip_similarity"] = metrics.clip_similarity(images, words[1])
+            values["clip_directional"] = metrics.directional_similarity(
+                befores, images, words[0], words[1]
+            )
+            values["clip_image"] = metrics.image_similarity(clip.images([source]), images)
+        if (dino := self.encoders.get("dino")) is not None:
+            values["dino_image"] = metrics.image_similarity(
+                dino.images([source]), dino.images(renders)
+            )
+        for key, similarity in values.items():
+            for name, value in zip(targets, similarity.values, strict=True):
+                rows[name][f"embedding.{key}.render"] = float(value)
+        return rows
+
+    def _hits(self, name: str) -> Hits:
+        return self.work.world.geometry.trace(self.work.world.camera(name))
+
+    def _depth(self, name: str) -> dict[str, float]:
+        hits = self._hits(name)
+        camera = self.work.world.camera(name)
+        row = {}
+        for when, model in (("before", self.before), ("after", self.after)):
+            _, error = surface_error(model, camera, hits)
+            row[f"depth.abs_rel.{when}"] = error["depth.abs_rel"]
+        return row
+
+    def _renders(self, model: Gaussians) -> dict[str, Image]:
+        from attnwarp.fit import FitSettings, extent_of
+        from attnwarp.render import render
+
+        cameras = [self.work.world.camera(name) for name in self.names]
+        near = FitSettings().near * extent_of(cameras)
+        with torch.no_grad():
+            return {
+                name: np.asarray(render(model, camera, near=near).color.clamp(0, 1).float().numpy())
+                for name, camera in zip(self.names, cameras, strict=True)
+            }
+
+    def _draw(self, name: str) -> dict[str, bytes]:
+        """JPEG files of a view: before, the source's edit, the edited view, its render, and the
+        truth of the source's answer."""
+        answer = self.judged.answer
+        shown = {
+            "before": self.truth.originals[name],
+            "source edit": self.pictures["edit"][self.source],
+            "edited": self.pictures["edit"].get(name),
+            "render": self.pictures["render"][name],
+            "truth": None if answer is None else self.truth.answers[answer][name],
+        }
+        return {
+            content.replace(" ", "-"): pictures.jpeg(pictures.enlarged(image))
+            for content, image in shown.items()
+            if image is not None
+        }
+
+
+def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
+    """The settings of a variant's method: a preset, the study's fields, the variant's, and the
+    fields of its warp.
+
+    Raises:
+        ValueError: an unknown preset or field, or a value out of range.
+    """
+    own = variant.part(VariantPart)
+    fields = {**study.part(StudyPart).editing.options, **own.options}
+    name = fields.pop("preset", variant.preset)
+    warp = {f"warp.{key}": value for key, value in variant.set.items()}
+    return METHODS[own.method].settings(name, {**fields, **warp}, seed)
+
+
+def editor_of(study: Study, variant: Variant) -> EditorPart:
+    """The variant's own editor, else the study's."""
+    return variant.part(VariantPart).editor or study.part(StudyPart).editing.editor
+
+
+def editor_identity(editor: EditorPart) -> Json:
+    """What of an editor decides its pictures: its files and its guidance, not its folder."""
+    guidance = {"text": editor.text_guidance, "image": editor.image_guidance}
+    return {"sha256": _files_digest(editor.name), "guidance": guidance}
+
+
+@lru_cache
+def _files_digest(name: str) -> str:
+    """SHA-256 of an editor's files.
+
+    Raises:
+        StudyError: there is none of that name.
+    """
+    from attnwarp.editing.small import SUMS, WEIGHTS, bundled
+
+    folder = WEIGHTS / name if name in bundled() else Path(name).expanduser()
+    if not folder.is_dir():
+        raise StudyError(f"editor {name!r}: no such folder{did_you_mean(name, bundled())}")
+    files = sorted(p for p in folder.rglob("*") if p.suffix in (".json", ".safetensors"))
+    sums = [
+        [path.relative_to(folder).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
+        for path in files
+        if path.name != SUMS
+    ]
+    return hashlib.sha256(json.dumps(sums).encode()).hexdigest()
+
+
+@lru_cache(maxsize=2)
+def _loaded(name: str, guidance: tuple[tuple[str, float], ...]) -> InstructPix2Pix:
+    from attnwarp.editing.small import load_editor
+
+    return load_editor(name, **{f"{kind}_guidance": value for kind, value in guidance})
+
+
+def load(name: str, planned: Json) -> InstructPix2Pix:
+    """An editor whose identity is the planned one.
+
+    Raises:
+        StudyError: its files have changed since the run was planned.
+    """
+    if _files_digest(name) != planned["sha256"]:
+        raise StudyError(
+            f"editor {name!r}: its files have changed since the run was planned; start the run"
+            " again"
+        )
+    given = planned["guidance"].items()
+    return _loaded(name, tuple((kind, value) for kind, value in given if value is not None))
+
+
+def _edits(study: Study, scene: Scene) -> Iterator[Json]:
+    """What of a scene's edits decides a cell.
+
+    Raises:
+        StudyError: the study names an edit or an answer that the scene lacks.
+    """
+    own = {edit.name: edit for edit in scene.edits}
+    wanted = study.part(StudyPart).editing.edits.get(scene.name) or dict.fromkeys(own)
+    if not wanted:
+        raise StudyError(f"probes.editing: scene {scene.name!r} names no edits; leave it out")
+    for key, words in wanted.items():
+        title, _, answer = key.partition("=")
+        if title not in own:
+            raise StudyError(
+                f"editing.edits.{scene.name}: no edit {title!r}{did_you_mean(title, own)}"
+            )
+        try:
+            answers = answers_of(scene, key)
+        except ValueError as error:
+            raise StudyError(f"editing.edits.{scene.name}: {error}") from None
+        edit = own[title]
+        targets = [one.target for one in edit.answers if one.name == answer]
+        yield {
+            "name": key,
+            "instruction": words or edit.instruction,
+            "source": edit.source,
+            "target": targets[0] if targets else edit.target,
+            "answers": [[one, scene.edited(title, of).content_hash] for one, of in answers],
+        }
+
+
+def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
+    """Warps by exact depth, or with the exact mask; None for the method's own."""
+    spec, world = work.spec, work.world
+    if spec["geometry"] == "splats" and spec["mask"] == "rules":
+        return None
+    warp = spec["settings"].get("warp")
+    settings = PRESETS["corrected"] if warp is None else WarpSettings.from_dict(warp)
+    made: dict[int, WarpedView] = {}
+
+    def of(source: int, target: int) -> WarpedView:
+        if target not in made:
+            pair = pair_of(work.cell.scene, spec["size"], names[source], names[target])
+            if spec["geometry"] == "truth":
+                view = warp_truth(world, pair, settings)
+            else:
+                view = warp_view(model, pair.source, pair.target, settings)
+            if spec["mask"] == "truth":
+                visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
+                view = replace(view, mask=visible & view.correspondence.defined, _at={})
+            made[target] = view
+        return made[target]
+
+    return of
+
+
+def _full(original: Image, edited: npt.NDArray[np.uint8]) -> Image:
+    """An edited view at the size of the original."""
+    from attnwarp.propagate.pictures import enlarged_change
+
+    return enlarged_change(original, edited.astype(np.float32) / np.float32(255))
+
+
+def _equal(answer: str | None, expected: str | None) -> float:
+    return math.nan if answer is None else float(answer == expected)
