@@ -9,7 +9,7 @@ JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m
 
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 
-.PHONY: demo test test-all bench docs lint checks kernels venv clean
+.PHONY: demo test test-all bench docs lint checks kernels kernels-float64 venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
@@ -40,12 +40,16 @@ lint: venv
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself.
+# Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself. Lint ends
+# first, so that some of them follow it.
 checks: venv
-	@$(MAKE) --no-print-directory -j2 lint kernels
+	@$(MAKE) --no-print-directory -j2 kernels-float64 kernels
 
 kernels: venv
 	@$(BIN)/python -m scripts.compile_kernels
+
+kernels-float64: lint
+	@$(BIN)/python -m scripts.compile_kernels float64
 
 venv:
 	@scripts/venv.sh
