@@ -1,6 +1,8 @@
 # Every target makes .venv first, with the extras it needs (scripts/venv.sh); PYTHON=... names the interpreter to make it with.
 SHELL := /bin/bash
 BIN := .venv/bin
+# Modules stay compiled: pip has compiled none (scripts/venv.sh), and every process would do it again.
+unexport PYTHONDONTWRITEBYTECODE
 RUN ?= runs/demo
 # Worker processes of the demo and of the tests; each needs up to 3 GB.
 JOBS ?= $(shell awk -v n=$$(nproc) '/MemAvailable/ { m = int($$2 / 3e6); print m < 1 ? 1 : m < n ? m : n }' /proc/meminfo)
@@ -10,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 # Of the gate: the run, and what it says.
 GATE := build/gate
 
-.PHONY: demo test test-all gate baseline bench docs lint checks kernels measured venv clean
+.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
@@ -56,12 +58,15 @@ lint: venv
 	$(BIN)/lint-imports
 
 # Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself, and the gate
-# uses them. Output comes a target at a time, so that the two do not mix.
+# uses them. Lint ends first, so that some of them follow it. Output comes a target at a time, so that it does not mix.
 checks: venv
-	@$(MAKE) --no-print-directory -j2 --output-sync=target lint gate
+	@$(MAKE) --no-print-directory -j2 --output-sync=target kernels-float64 gate
 
 kernels: venv
 	@$(BIN)/python -m scripts.compile_kernels
+
+kernels-float64: lint
+	@$(BIN)/python -m scripts.compile_kernels float64
 
 venv:
 	@scripts/venv.sh

@@ -56,7 +56,7 @@ class Case:
     wall: dict[str, list[float]] = field(default_factory=dict)
     cpu: dict[str, list[float]] = field(default_factory=dict)
 
-    def round(self) -> None:
+    def time_once(self) -> None:
         """Time every contestant once."""
         for name, work in self.contestants.items():
             start, start_cpu = time.perf_counter(), time.process_time()
@@ -194,7 +194,7 @@ def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
                 work()  # compiled, or read from the cache
         for _ in range(rounds):
             for case in cases:
-                case.round()
+                case.time_once()
     rows = [row for case in cases for row in case.rows()]
     for row in rows:
         if row["contestant"] in ("copy", "tokens", "maps"):

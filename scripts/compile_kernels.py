@@ -1,11 +1,15 @@
 """Compile the numba kernels, which numba caches on disk, so that neither a test nor a user's first
 call waits, and workers of the tests do not compile the same ones at once.
+
+python -m scripts.compile_kernels            all but the renderer's of float64 splats
+python -m scripts.compile_kernels float64    those
 """
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -28,13 +32,14 @@ STUDY = {
 }
 
 
-def main() -> None:
+def main(float64: bool) -> None:
     """Call every kernel once, on a small case."""
     for kind in ("2d", "3d"):
         splats = render.scene(kind, 100, 0.1)
-        for each in (splats, in_double(splats)):
-            render.time_once(each, render.camera(32))
-    warp.pair_case(64).round()
+        render.time_once(in_double(splats) if float64 else splats, render.camera(32))
+    if float64:
+        return
+    warp.pair_case(64).time_once()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["ATTNWARP_CACHE"] = str(Path(folder) / "derived")
         scenes_and_truth(Path(folder))
@@ -62,4 +67,4 @@ def scenes_and_truth(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main("float64" in sys.argv[1:])

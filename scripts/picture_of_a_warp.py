@@ -9,7 +9,7 @@ import argparse
 import json
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+from matplotlib import pyplot
 from matplotlib.image import imread
 
 VARIANTS = ("bounds only", "corrected")
@@ -33,7 +33,7 @@ def draw(run: Path, out: Path, scene: str, view: str) -> None:
         "warped": "source, warped",
         "mask": "mask against truth",
     }
-    figure, axes = plt.subplots(len(VARIANTS), len(columns), figsize=(11, 5.8), dpi=110)
+    figure, axes = pyplot.subplots(len(VARIANTS), len(columns), figsize=(11, 5.8), dpi=110)
     for axis, title in zip(axes[0], columns.values(), strict=True):
         axis.set_title(title)
     for row, variant in zip(axes, VARIANTS, strict=True):

@@ -103,8 +103,10 @@ python=$(find_python)
 install_libraries
 [ -x "$venv/bin/python" ] && "$venv/bin/python" -m pip --version >/dev/null 2>&1 || make_venv
 say "attnwarp: installing the tested versions into $venv, with the extras $extras (a few minutes the first time)"
+# Python compiles a module when it is first imported; pip would compile all 20,000, of which most are never used.
+install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt torch==2.13.0
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[$extras]"
+install torch==2.13.0
+install -e ".[$extras]"
 if [ "$extras" = dev ]; then install_program; fi
 printf '%s' "$hash" >"$stamp"

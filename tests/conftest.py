@@ -1,7 +1,10 @@
 import functools
 import os
+from pathlib import Path
 
 import pytest
+
+ROOT = Path(__file__).parent
 
 _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _WORKERS > 1:
@@ -10,27 +13,54 @@ if _WORKERS > 1:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, len(os.sched_getaffinity(0)) // _WORKERS)))
 
 
+# Files that take a worker 10 s and more, longest first. They begin the run, as one of them at its
+# end would leave the other workers without work.
+LONGEST = [
+    "attnwarp_eval/study/test_run.py",
+    "attnwarp_eval/effects/test_detect.py",
+    "attnwarp_eval/scene/test_suite.py",
+    "attnwarp_eval/effects/test_proof.py",
+    "attnwarp/encoders/test_bundled.py",
+    "attnwarp_eval/study/test_signals.py",
+    "attnwarp_eval/truth/test_mitsuba.py",
+    "attnwarp/test_cli.py",
+    "attnwarp_eval/truth/test_edits.py",
+    "attnwarp_eval/effects/test_table.py",
+    "attnwarp_eval/truth/test_llvm.py",
+]
+
+
+@functools.cache
+def _shares(path):
+    """Whether the tests of a file share a fixture, or scenes and their textures in the memory of a
+    process.
+    """
+    return path.is_relative_to(ROOT / "attnwarp_eval") or 'scope="module"' in path.read_text()
+
+
+def pytest_collection_modifyitems(items):
+    """For workers: the longest files first, then the files that share, then every other test."""
+    if _WORKERS > 1:
+        ranks = {ROOT / name: rank for rank, name in enumerate(LONGEST)}
+        items.sort(key=lambda item: (ranks.get(item.path, len(ranks)), not _shares(item.path)))
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """Files whose tests share a fixture, or scenes and their textures in the memory of a process, run
-    in one worker, so that these are made once, and run first; every other test goes to whichever
-    worker is free.
+    """Files whose tests share something run in one worker, so that it is made once; every other test
+    goes to whichever worker is free.
 
     xdist's own ``--dist loadgroup`` does this with marks, but has no effect with pytest 9.2, where
     a test's id cannot be changed.
     """
     from xdist.scheduler import LoadScopeScheduling
 
-    @functools.cache
-    def shares(path):
-        if path.startswith("tests/attnwarp_eval/"):
-            return True
-        return 'scope="module"' in (config.rootpath / path).read_text()
+    config.option.loadscopereorder = False  # the order is that of pytest_collection_modifyitems
 
     class Scheduler(LoadScopeScheduling):
         def _split_scope(self, nodeid):
             path = nodeid.partition("::")[0]
-            return path if shares(path) else nodeid
+            return path if _shares(config.rootpath / path) else nodeid
 
     return Scheduler(config, log)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -14,9 +14,10 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 import torch
-import torch.nn.functional as F
+from torch.nn import functional
 
 from attnwarp.errors import InputError
+from attnwarp.io.file import write_atomically
 
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)
@@ -63,9 +64,11 @@ def placed_crops(
     x = torch.from_numpy(images).permute(0, 3, 1, 2).float().div_(255)
     shrink = scale[1] * images.shape[1] / out
     if shrink >= 2:  # bilinear taps would alias
-        x = F.avg_pool2d(x, int(shrink))
-    grid = F.affine_grid(torch.from_numpy(theta).float(), [n, 3, out, out], align_corners=False)
-    x = F.grid_sample(x, grid, padding_mode="reflection", align_corners=False)
+        x = functional.avg_pool2d(x, int(shrink))
+    grid = functional.affine_grid(
+        torch.from_numpy(theta).float(), [n, 3, out, out], align_corners=False
+    )
+    x = functional.grid_sample(x, grid, padding_mode="reflection", align_corners=False)
     if tone:
         gain = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
         gamma = torch.from_numpy(np.exp(rng.normal(0, tone, (n, 1, 1, 1)))).float()
@@ -153,13 +156,9 @@ class Run:
             seconds += spent
             words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
             print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
-            temporary = self.path.with_suffix(f".{os.getpid()}.tmp")
             states = {name: thing.state_dict() for name, thing in self.state.items()}
-            torch.save(
-                {**states, "epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)},
-                temporary,
-            )
-            temporary.replace(self.path)
+            about = {"epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)}
+            write_atomically(self.path, functools.partial(torch.save, {**states, **about}))
 
     def _same_recipe(self, stored: str | None, recipe: Mapping[str, Any]) -> None:
         remedy = "remove it to train from the start"

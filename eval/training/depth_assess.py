@@ -14,7 +14,7 @@ from attnwarp.editing.editor import Image, edit
 from training.assess import Figure, figure
 from training.depth_editor import Prompts, attributes_of
 from training.editing_pairs import GROUPS, load_pairs
-from training.editor import Row
+from training.editor import TOKENS, Row
 from training.editor_assess import SEED, nearest
 from training.worlds import sentence
 
@@ -69,7 +69,8 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
             mask = thing if kind in ("color", "material") else ~thing
             if mask.sum() < 12:
                 continue
-            image = draw(editor, prompts, row, _prompt(prompts, row, rng), seed=world)
+            text = _prompt(editor, prompts, row, rng)
+            image = draw(editor, prompts, row, text, seed=world)
             true = [np.clip((prompts.picture(row, k) + 1) / 2, 0, 1) for k in choices]
             answer = choices[nearest(image, true, mask)]
             right.append(answer == target)
@@ -105,12 +106,15 @@ def draw(editor: Any, prompts: Prompts, row: Row, prompt: str, *, seed: int) -> 
     return edit(editor, [depth], prompt, steps=STEPS, seed=seed).images[0]
 
 
-def _prompt(prompts: Prompts, row: Row, rng: np.random.Generator) -> str:
-    """Everything that a look shows, in words."""
+def _prompt(editor: Any, prompts: Prompts, row: Row, rng: np.random.Generator) -> str:
+    """Everything that a look shows, in as many words as the editor takes."""
     thing, finish, color, second, ground, time = (
         int(v) for v in attributes_of(prompts.worlds, row.world)[row.target]
     )
-    return sentence((thing, finish or -1, color, second, ground, time), rng)
+    while True:
+        text = sentence((thing, finish or -1, color, second, ground, time), rng)
+        if len(editor.tokenizer(text).input_ids) <= TOKENS:
+            return text
 
 
 def assess_depth_editor(

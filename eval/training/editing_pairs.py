@@ -8,7 +8,6 @@ is left out.
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from attnwarp.io.file import write_atomically
 from training.assemblies import (
     KINDS,
     PART_NOUNS,
@@ -248,10 +248,8 @@ def _path(folder: Path, name: str, index: int) -> Path:
 
 def _make(folder: Path, name: str, index: int) -> Path:
     path = _path(folder, name, index)
-    temporary = path.with_suffix(f".{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
-        np.savez(file, **render_edit_world(index, PAIR_SPLITS[name]))
-    temporary.replace(path)
+    arrays = render_edit_world(index, PAIR_SPLITS[name])
+    write_atomically(path, lambda stream: np.savez(stream, **arrays))
     return path
 
 

@@ -415,10 +415,10 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
     constants = {key: globals()[key] for key in CONSTANTS}
     if stage.inject != "none":
-        from training import editor_injection as injection
+        from training import editor_injection
 
         names = ("LEAST_WEIGHT", "MOST_ALPHA", "WAYS", "INJECTED_KINDS")
-        constants |= {key: getattr(injection, key) for key in names}
+        constants |= {key: getattr(editor_injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
     fields = asdict(stage)
     if not stage.parts:  # checkpoints from before there were parts name none

@@ -1,6 +1,7 @@
 """Oracles: diffusers' own pipeline, worlds of plain colours, closed forms, a run that was not stopped."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -171,7 +172,8 @@ def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
 
     monkeypatch.setattr("training.depth_assess.draw", knows)
     monkeypatch.setattr("training.depth_assess.SHAPES", 2)
-    results = assess_depth(None, prompts)
+    words = SimpleNamespace(tokenizer=lambda text: SimpleNamespace(input_ids=text.split()))
+    results = assess_depth(words, prompts)
     assert all(own.value == 1 for own, _ in results)
     assert all(control.value == 0 for _, control in results)
     facts = {

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import numba as nb
+import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
@@ -33,9 +33,9 @@ def _compiled(**options: Any) -> Any:
     """
 
     def decorate(function: Any) -> Any:
-        dispatcher = nb.njit(nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options)(
-            function
-        )
+        dispatcher = numba.njit(
+            nogil=True, cache=True, error_model="numpy", fastmath=FAST, **options
+        )(function)
         # There is no cache where numba is told to compile nothing.
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if file is not None:
@@ -70,7 +70,7 @@ def _prefetcher(write: int) -> Any:
             builder.call(call, [pointer, word(write), word(3), word(1)])
             return word(0)
 
-        return nb.int32(array, nb.int64), codegen
+        return numba.int32(array, numba.int64), codegen
 
     return prefetch_item
 

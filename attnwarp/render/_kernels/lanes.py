@@ -15,8 +15,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-import llvmlite.binding as llvm
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
@@ -295,7 +294,7 @@ def reciprocal(typing: Any, x: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x, one = args[0], ir.Constant(args[0].type, [1.0] * args[0].type.count)
-        if not llvm.get_host_cpu_features().get("avx512f"):
+        if not binding.get_host_cpu_features().get("avx512f"):
             return builder.fdiv(one, x)
         r, fused = _approach(builder, x, "rcp14")
         for _ in range(1 if x.type == FLOATS else 2):
@@ -313,7 +312,7 @@ def reciprocal_sqrt(typing: Any, x: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]
         one, half = (ir.Constant(DOUBLES, [value] * 8) for value in (1.0, 0.5))
-        if not llvm.get_host_cpu_features().get("avx512f"):
+        if not binding.get_host_cpu_features().get("avx512f"):
             kind = ir.FunctionType(DOUBLES, [DOUBLES])
             return builder.fdiv(
                 one,
@@ -338,7 +337,7 @@ def approximate_sqrt(typing: Any, x: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]
-        if not llvm.get_host_cpu_features().get("avx512f"):
+        if not binding.get_host_cpu_features().get("avx512f"):
             kind = ir.FunctionType(FLOATS, [FLOATS])
             return builder.call(
                 cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x]

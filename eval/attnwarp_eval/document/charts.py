@@ -52,7 +52,7 @@ def drawing(
     import matplotlib
 
     matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib import pyplot
 
     style: dict[Any, Any] = {
         "svg.hashsalt": "attnwarp",
@@ -65,7 +65,7 @@ def drawing(
         "legend.fontsize": 8,
     }
     with matplotlib.rc_context(style):
-        figure, axes = plt.subplots(
+        figure, axes = pyplot.subplots(
             rows,
             columns,
             figsize=(width or 5.4 * columns, height),
@@ -75,7 +75,7 @@ def drawing(
         yield list(axes.flat)
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        plt.close(figure)
+        pyplot.close(figure)
         write_atomic(path, _titled(buffer.getvalue().decode()).encode())
 
 
@@ -207,11 +207,11 @@ def heatmap(
         ...     names = {"rows": ["bear"], "columns": ["a", "b", "c"], "title": "Wins"}
         ...     heatmap(axes, shares, framed=shares > 0.4, **names)
     """
-    import matplotlib as mpl
+    import matplotlib
     from matplotlib.patches import Rectangle
 
     axes.grid(False)
-    colors = mpl.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
+    colors = matplotlib.colormaps["RdBu"].with_extremes(bad="#d0d0d0")
     axes.pcolormesh(
         np.ma.masked_invalid(values), cmap=colors, vmin=0, vmax=1, edgecolors="white", linewidth=1
     )

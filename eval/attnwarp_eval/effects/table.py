@@ -68,6 +68,13 @@ def measure_entry(
         scene: the scene.
         settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
         progress: told what is at work.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> settings = Settings(prove=False, rounds=0)
+        >>> entry = measure_entry(load_scene("opposed"), settings, lambda step: None)
+        >>> entry["needed"]
+        ['geometry', 'direct', 'shadows', 'environment', 'textures']
     """
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
@@ -129,7 +136,14 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
 
 
 def table(entries: Iterable[Mapping[str, Any]]) -> Table:
-    """The entries as a table: effects, plan, and what was proved and timed of them."""
+    """The entries as a table: effects, plan, and what was proved and timed of them.
+
+    Example:
+        >>> planned = {"integrator": "direct", "sensor": {"type": "perspective"}}
+        >>> entry = {"scene": "a", "needed": ["direct"], "not_simulated": [], "plan": planned}
+        >>> table([entry]).rows[0][:5]
+        ['a', '–', '–', 'direct', 'not asked']
+    """
     from attnwarp_eval.document.model import Table
 
     columns = [
@@ -161,7 +175,12 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
 
 
 def plan_words(planned: Mapping[str, Any]) -> str:
-    """A plan in a few words: integrator, and the camera where it is not a pinhole."""
+    """A plan in a few words: integrator, and the camera where it is not a pinhole.
+
+    Example:
+        >>> plan_words({"integrator": "path", "sensor": {"type": "thinlens"}})
+        'path, thin lens'
+    """
     return str(planned["integrator"]) + (
         ", thin lens" if planned["sensor"]["type"] == "thinlens" else ""
     )
@@ -170,6 +189,10 @@ def plan_words(planned: Mapping[str, Any]) -> str:
 def proof_words(proof: Mapping[str, Any]) -> str:
     """A verdict in a few words, with what the comparison alone came to where something is not
     simulated.
+
+    Example:
+        >>> proof_words({"verdict": "certified", "of_simulated": "certified"})
+        'certified'
     """
     if proof["verdict"] == proof["of_simulated"]:
         return str(proof["verdict"])

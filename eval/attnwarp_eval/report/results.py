@@ -14,7 +14,7 @@ from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.run import check_labels
 from attnwarp_eval.study.store import Store, StoreError
-from attnwarp_eval.study.study import explain, parse_study
+from attnwarp_eval.study.study import explain_errors, parse_study
 
 
 def read_results(store: Store) -> Results:
@@ -37,7 +37,7 @@ def read_results(store: Store) -> Results:
         study = parse_study(stored["study"])
     except ValidationError as error:
         raise StoreError(
-            f"{store.root / 'study.json'}: {explain(error)}; run the study again with --out"
+            f"{store.root / 'study.json'}: {explain_errors(error)}; run the study again with --out"
             f" {store.root}, which writes it anew"
         ) from None
     needs_scenes = {p.name: p.needs_scenes for p in probes()}

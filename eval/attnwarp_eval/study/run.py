@@ -20,7 +20,7 @@ from attnwarp_eval.study.parts import Study, StudyError
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.record import Environment, Failure, Record
 from attnwarp_eval.study.store import Problems, Store, StoreError
-from attnwarp_eval.study.study import cells_of, explain, parse_study
+from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write
 
 
@@ -115,7 +115,7 @@ def verify(store: Store) -> Problems:
         study = parse_study(stored["study"])
         cells = expected(plan(study, store))["cells"]
     except (InputError, ValidationError) as error:
-        text = explain(error) if isinstance(error, ValidationError) else error
+        text = explain_errors(error) if isinstance(error, ValidationError) else error
         problems.damaged.append(f"the study's cells cannot be listed again: {text}")
         return problems
     if {c["id"] for c in stored["cells"]} != {c["id"] for c in cells}:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
-from attnwarp_eval.scene.explain import explain as explain_problem
+from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import YamlError, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
@@ -83,7 +83,9 @@ class _Joined(Study):
                 for p in probes():
                     p.check_variant(self, variant)
             except ValidationError as error:
-                raise ValueError(f"variants.{name}.splats: {explain(error, Splats)}") from None
+                raise ValueError(
+                    f"variants.{name}.splats: {explain_errors(error, Splats)}"
+                ) from None
             except ValueError as error:
                 raise ValueError(f"variants.{name}: {error}") from None
 
@@ -215,7 +217,7 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
     try:
         return parse_study(data)
     except ValidationError as error:
-        raise StudyError(f"{path}: {explain(error)}") from None
+        raise StudyError(f"{path}: {explain_errors(error)}") from None
 
 
 def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -255,7 +257,7 @@ def is_scene_file(name: Any) -> bool:
     return Path(name).suffix in (".yaml", ".yml") or len(Path(name).parts) > 1
 
 
-def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str:
+def explain_errors(error: ValidationError, model: type[BaseModel] | None = None) -> str:
     """Pydantic's errors in one readable text: each key, what came, and what was expected.
 
     Args:
@@ -264,4 +266,4 @@ def explain(error: ValidationError, model: type[BaseModel] | None = None) -> str
     """
     model = model or _models(tuple(probes()))[0]
     problems = error.errors(include_url=False)
-    return "; ".join(explain_problem(problem, model, KEYS) for problem in problems)
+    return "; ".join(explain.explain(problem, model, KEYS) for problem in problems)

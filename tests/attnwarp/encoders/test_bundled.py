@@ -25,7 +25,7 @@ def worlds():
     """Two views and three looks of worlds whose seeds no recipe uses, of shapes that training never
     sees.
     """
-    return _rendered(Split(90_000_000, 25, pairs="any", new_shapes=True))
+    return _rendered(Split(90_000_000, 12, pairs="any", new_shapes=True))
 
 
 def _rendered(split):
@@ -135,7 +135,7 @@ def test_things_colours_and_times_are_named(clip, worlds):
             clip, dict.fromkeys(("test", "test-new-pairs", "test-rendered"), worlds)
         )
     }
-    # 150 pictures of 25 worlds that the cards' figures do not know: what was asked of the encoder
+    # 72 pictures of 12 worlds that the cards' figures do not know: what was asked of the encoder
     # must lie within their interval.
     asked = {
         f.what: f.asked for f in figures.values() if f.asked is not None and "new shapes" in f.what
