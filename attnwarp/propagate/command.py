@@ -18,8 +18,8 @@ from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, random_points
 from attnwarp.fit.progress import progress_display as fit_progress
 from attnwarp.gaussians import Gaussians
-from attnwarp.io import Dataset, read_image
-from attnwarp.propagate.folder import SEGMENTS_FOLDER, Folder
+from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
+from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
@@ -66,7 +66,7 @@ def edit_dataset(
     threads: int | None,
     say: Callable[[str], None],
 ) -> tuple[Propagation, Path]:
-    """Fit where no splats are given, edit, and write the page.
+    """Fit where no splats are given, edit, and write the page and a PLY for other viewers.
 
     Args:
         dataset: cameras and pictures.
@@ -128,6 +128,9 @@ def edit_dataset(
             watch=watch,
             announce=say,
         )
+    if result.gaussians.kind == "2d":
+        # Other programs take no splats of two scales.
+        write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
     return result, write_page(Folder(out, views.cameras))
 
 

@@ -8,6 +8,7 @@ masks/  features/        where features were injected, and the warped features a
 stages/1.ply  1.pt       the splats after each stage, and the state of their optimiser
 renders/before/  after/  the scene from every view
 edited.ply  result.json  the edited splats; Edit PSNR and counters
+edited-3dgs.ply          2D splats as thin 3D ones, for other viewers (attnwarp edit)
 times.json               seconds by part, over all sittings
 """
 
@@ -33,6 +34,9 @@ FORMAT = 1
 
 MANIFEST = "manifest.json"
 SEGMENTS_FOLDER = "segments"
+VIEWER_PLY = "edited-3dgs.ply"
+"""Edited 2D splats as thin 3D ones, for viewers of 3DGS; the command writes it."""
+
 FOLDERS = ("views", "masks", "features", "stages", "renders/before", "renders/after")
 
 

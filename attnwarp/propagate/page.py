@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from attnwarp.io.file import write_atomically
-from attnwarp.propagate.folder import MANIFEST, Folder
+from attnwarp.propagate.folder import MANIFEST, VIEWER_PLY, Folder
 from attnwarp.propagate.pictures import SOURCE_COLORS
 
 PAGE = "index.html"
@@ -45,7 +45,7 @@ def write_page(folder: Folder) -> Path:
     about = {name: folder.read_json(f"views/{name}.json") for name in [*chain, *targets]}
     parts = [
         f"<h1>{escape(manifest['instruction'])}</h1>",
-        _summary(manifest, result),
+        _summary(folder, manifest, result),
         f"<h2>Source view: {escape(source)}</h2>",
         _row(
             folder,
@@ -128,7 +128,7 @@ def _target(folder: Folder, name: str) -> str:
     )
 
 
-def _summary(manifest: dict[str, Any], result: dict[str, Any]) -> str:
+def _summary(folder: Folder, manifest: dict[str, Any], result: dict[str, Any]) -> str:
     psnr, counters = result["edit_psnr"], result["counters"]
     rows = [
         ("stages", len(manifest["stages"])),
@@ -141,8 +141,10 @@ def _summary(manifest: dict[str, Any], result: dict[str, Any]) -> str:
         ("Edit PSNR, pooled over the edited views", _decibels(psnr["pooled"])),
         ("Edit PSNR, mean over them", _decibels(psnr["mean"])),
     ]
-    text = "<p>The edited scene is <code>edited.ply</code> in this folder.</p>"
-    return text + _table(("", ""), rows)
+    text = "<p>The edited scene is <code>edited.ply</code> in this folder"
+    if folder.has(VIEWER_PLY):
+        text += f"; viewers of 3DGS open <code>{VIEWER_PLY}</code>"
+    return f"{text}.</p>" + _table(("", ""), rows)
 
 
 def _decibels(value: float | None) -> str:

@@ -94,6 +94,9 @@ def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_
     assert result.stdout.splitlines()[-1] == str(tmp_path / "index.html")
     edited = read_ply(tmp_path / "edited.ply")
     assert len(edited) == 60
+    other = read_ply(tmp_path / "edited-3dgs.ply", kind="3d")  # as another program reads it
+    assert np.array_equal(other.scales[:, :2], edited.scales)
+    assert np.allclose(other.scales[:, 2], 1e-6)
     assert not np.array_equal(edited.sh, read_ply(place / "splats.ply").sh)
     page = Page((tmp_path / "index.html").read_text())
     assert page.other == []
