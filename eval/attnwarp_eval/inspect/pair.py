@@ -511,11 +511,8 @@ class Pair:
         return parts
 
     def _warped(self, source: Image, layer: Size | None) -> Image:
-        if layer is None:
-            return pictures.warped(source, self.view)
-        warp = self.layer(layer)
-        camera = warp.correspondence.source
-        small = fitted(source, camera)
+        warp = self.layer(layer or self.size)
+        small = fitted(source, warp.correspondence.source)
         image = warp.warp(torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1))))
         large = blocks(image.permute(1, 2, 0).numpy(), self.size)
         mask = self.mask(layer)[..., None]

@@ -75,6 +75,7 @@ async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
             show_connection_info=False,
             disable_logging=True,
             exec_mode="coroutine",
+            thread=True,  # leaves Ctrl-C to this process
         )
     finally:
         sys.argv = arguments
@@ -88,7 +89,7 @@ class _Page:
         from trame.app import get_server
 
         self.window, self.announce, self.left = window, announce, left
-        self.clients = 0
+        self.clients, self.joined = 0, False
         self.url: Callable[[int], str] = str
         self.server: Any = get_server("attnwarp-inspect", client_type="vue3")
         state, controller = self.server.state, self.server.controller
@@ -98,6 +99,7 @@ class _Page:
             self._changed
         )
         controller.on_server_ready.add(self._ready)
+        controller.on_client_connected.add(self._joined)
         self.server.add_protocol_to_configure(self._watch_clients)
         window.enable_picking()
         window.changed = self._drawn
@@ -164,6 +166,10 @@ class _Page:
     def _ready(self, **_: Any) -> None:
         self.announce(self.url(self.server.port))
 
+    def _joined(self, **_: Any) -> None:
+        """A browser that knows the secret has opened the page."""
+        self.joined = True
+
     def _watch_clients(self, root: Any) -> None:
         """Count the browsers, and end when the last has left."""
         from wslink.websocket import LinkProtocol
@@ -176,7 +182,7 @@ class _Page:
 
             def onClose(self, client_id: Any) -> None:  # noqa: N802
                 page.clients -= 1
-                if page.clients == 0:
+                if page.joined and page.clients == 0:
                     asyncio.get_running_loop().call_later(page.left, page._end)
 
         root.registerLinkProtocol(Clients())

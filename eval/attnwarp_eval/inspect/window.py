@@ -86,8 +86,11 @@ class Window:
         self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
+        # Whoever shows the window, or takes its picture, renders it.
+        self.plotter.suppress_rendering = True
         self._draw()
         self.look_from_outside()
+        self.plotter.suppress_rendering = False
 
     @property
     def pair(self) -> Pair:
@@ -303,11 +306,11 @@ class Window:
     @contextmanager
     def _one_render(self) -> Iterator[None]:
         """PyVista renders after every change; what changes inside is rendered once, at the end."""
-        self.plotter.suppress_rendering = True
+        before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True
         try:
             yield
         finally:
-            self.plotter.suppress_rendering = False
+            self.plotter.suppress_rendering = before
         self.plotter.render()
 
     def _draw(self) -> None:
