@@ -107,7 +107,7 @@ class _Page:
     def _describe(self) -> None:
         """Write the window's state into the controls."""
         window, state = self.window, self.server.state
-        shown = window.state
+        current = window.state
         state.targets = [plain(name) for name in window.targets]
         state.variants = [
             {"title": plain(name), "value": k} for k, name in enumerate(window.variants)
@@ -115,12 +115,12 @@ class _Page:
         state.colorings = list(window.pair.colorings)
         state.layers = [layer_name(layer) for layer in window.layers]
         state.steps = list(window.steps)
-        state.target = window.targets.index(shown.target)
-        state.variant = window.variants.index(shown.variant)
-        state.coloring = shown.coloring
-        state.layer = window.layers.index(shown.layer)
-        state.step = window.steps.index(shown.step)
-        state.splats, state.surface = shown.splats, shown.surface
+        state.target = window.targets.index(current.target)
+        state.variant = window.variants.index(current.variant)
+        state.coloring = current.coloring
+        state.layer = window.layers.index(current.layer)
+        state.step = window.steps.index(current.step)
+        state.splats, state.surface = current.splats, current.surface
         state.numbers = "" if window.picked is None else "\n".join(window.picked.lines())
 
     def _changed(self, **_: Any) -> None:
