@@ -9,27 +9,37 @@ import argparse
 import shlex
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 COMMANDS = {
-    "inspect.png": "bear --size 256 --variant released --view yaw030 --pixel 203,152",
-    "inspect-cell.png": "bear --size 256 --view yaw030 --layer 32x32 --color rules --pixel 120,200",
-    "inspect-splats.png": "spheres --size 256 --view yaw060 --color incidence --splats",
+    "inspect.jpg": "bear --size 256 --variant released --view yaw030 --pixel 203,152",
+    "inspect-cell.jpg": "bear --size 256 --view yaw030 --layer 32x32 --color rules --pixel 120,200",
+    "inspect-splats.jpg": "spheres --size 256 --view yaw060 --color incidence --splats",
 }
 """File -> arguments of attnwarp-eval inspect."""
+
+WIDTH = 1200
+"""Of the pictures, in pixels."""
 
 
 def draw(folder: Path, name: str) -> None:
     """Make one picture, reduced to the width of a page."""
+    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "window.png"
+        subprocess.run([*command, *shlex.split(COMMANDS[name]), "--screenshot", path], check=True)
+        reduce(path, folder / name)
+
+
+def reduce(path: Path, out: Path) -> None:
+    """Write a picture as a JPEG of the width of a page."""
     import cv2
 
-    path = folder / name
-    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
-    subprocess.run([*command, *shlex.split(COMMANDS[name]), "--screenshot", path], check=True)
     picture = cv2.imread(str(path))
-    height = round(1200 * picture.shape[0] / picture.shape[1])
-    small = cv2.resize(picture, (1200, height), interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(path), small, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    height = round(WIDTH * picture.shape[0] / picture.shape[1])
+    small = cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(out), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
 
 
 if __name__ == "__main__":
