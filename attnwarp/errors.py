@@ -24,7 +24,7 @@ EXTRAS = {
         "yaml",
     ),
     "inspect": ("pyvista",),
-    "web": ("trame", "trame_vtk"),
+    "web": ("trame", "trame_vtk", "trame_vuetify"),
     "gpu": ("gsplat",),
 }
 """The extras of pyproject.toml -> the modules that each brings and the plain package lacks."""

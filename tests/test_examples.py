@@ -37,6 +37,8 @@ DOORS = [
     "attnwarp_eval.effects.detect",
     "attnwarp_eval.effects.proof",
     "attnwarp_eval.effects.saving",
+    "attnwarp_eval.inspect.cell",
+    "attnwarp_eval.inspect.command",
     "attnwarp_eval.inspect.pixel",
     "attnwarp_eval.inspect.subject",
     "attnwarp_eval.metrics",

@@ -10,7 +10,12 @@ import pytest
 from attnwarp.errors import EXTRAS, InputError, MissingExtraError, missing_extra, optional_imports
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {"pyyaml": "yaml", "scikit-image": "skimage"}
+PACKAGES = {
+    "pyyaml": "yaml",
+    "scikit-image": "skimage",
+    "trame-vtk": "trame_vtk",
+    "trame-vuetify": "trame_vuetify",
+}
 """Names on the package index that differ from the module's."""
 BROUGHT_ALONG = {"dask": "distributed", "drjit": "mitsuba", "markupsafe": "jinja2"}
 """Modules that come with another package of the extra."""

@@ -42,7 +42,7 @@ class Tab:
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    async def until(self, script, seconds=120):
+    async def until(self, script, seconds=600):
         """Wait until an expression is true, and return its value."""
         end = time.monotonic() + seconds
         while not (value := await self.run(script)):
@@ -93,7 +93,7 @@ async def opened(url, size=(900, 600)):
         )  # fmt: skip
         try:
             port = Path(folder, "DevToolsActivePort")
-            end = time.monotonic() + 60
+            end = time.monotonic() + 300
             while not (port.is_file() and port.read_text().count("\n")):
                 assert time.monotonic() < end and process.poll() is None
                 await asyncio.sleep(0.1)

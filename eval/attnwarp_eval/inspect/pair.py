@@ -491,19 +491,16 @@ class Pair:
         source, target = self.images
         parts = {"source": source, "target": target}
         if self.edit is not None:
-            edited = self._edited(self.views.source.name), self._edited(self.target)
-            parts = {
-                "source, edited": source if edited[0] is None else edited[0],
-                "target, not edited yet" if edited[1] is None else "target, edited": target
-                if edited[1] is None
-                else edited[1],
-                f"scene, {step or self.edit.steps[0]}": self.picture(step),
-            }
-        shown = parts["source, edited"] if self.edit is not None else source
-        parts["source, warped"] = self._warped(shown, layer)
-        parts["mask against truth" if self.truth is not None else "mask"] = self.colors(
-            "mask", layer
-        )
+            names = {"source": self.views.source.name, "target": self.target}
+            for part, name in names.items():
+                edited = self._edited(name)
+                before = parts.pop(part)
+                title = f"{part}, not edited" if edited is None else f"{part}, edited"
+                parts[title] = before if edited is None else edited
+            parts[f"scene, {step or self.edit.steps[0]}"] = self.picture(step)
+        parts["source, warped"] = self._warped(next(iter(parts.values())), layer)
+        title = "mask" if self.truth is None else "mask against truth"
+        parts[title] = self.colors("mask", layer)
         if self.edit is not None:
             features = self.edit.picture(f"features/{self.target}.png")
             if features is not None:
@@ -511,11 +508,8 @@ class Pair:
         return parts
 
     def _warped(self, source: Image, layer: Size | None) -> Image:
-        if layer is None:
-            return pictures.warped(source, self.view)
-        warp = self.layer(layer)
-        camera = warp.correspondence.source
-        small = fitted(source, camera)
+        warp = self.layer(layer or self.size)
+        small = fitted(source, warp.correspondence.source)
         image = warp.warp(torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1))))
         large = blocks(image.permute(1, 2, 0).numpy(), self.size)
         mask = self.mask(layer)[..., None]

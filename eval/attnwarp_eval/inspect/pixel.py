@@ -123,8 +123,8 @@ class PixelReport:
         text.append(f"  source depth {self.source_depth:.5g}, tolerance {self.tolerance:.3g}")
         for verdict in self.verdicts:
             word = "pass" if verdict.passed else "FAIL"
-            margin = "" if np.isnan(verdict.margin) else f": margin {verdict.margin:.3g}"
-            text.append(f"{word} {verdict.rule}{margin} {verdict.unit}")
+            margin = f": margin {verdict.margin:.3g} {verdict.unit}"
+            text.append(f"{word} {verdict.rule}{'' if np.isnan(verdict.margin) else margin}")
         text.append("accepted" if self.accepted else "rejected")
         if self.seen_instead is not None:
             name = self.exact.blocked_by if self.exact is not None else "something nearer"

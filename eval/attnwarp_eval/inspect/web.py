@@ -75,6 +75,7 @@ async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
             show_connection_info=False,
             disable_logging=True,
             exec_mode="coroutine",
+            thread=True,  # leaves Ctrl-C to this process
         )
     finally:
         sys.argv = arguments
@@ -88,7 +89,7 @@ class _Page:
         from trame.app import get_server
 
         self.window, self.announce, self.left = window, announce, left
-        self.clients = 0
+        self.clients, self.joined = 0, False
         self.url: Callable[[int], str] = str
         self.server: Any = get_server("attnwarp-inspect", client_type="vue3")
         state, controller = self.server.state, self.server.controller
@@ -98,6 +99,7 @@ class _Page:
             self._changed
         )
         controller.on_server_ready.add(self._ready)
+        controller.on_client_connected.add(self._joined)
         self.server.add_protocol_to_configure(self._watch_clients)
         window.enable_picking()
         window.changed = self._drawn
@@ -105,7 +107,7 @@ class _Page:
     def _describe(self) -> None:
         """Write the window's state into the controls."""
         window, state = self.window, self.server.state
-        shown = window.state
+        current = window.state
         state.targets = [plain(name) for name in window.targets]
         state.variants = [
             {"title": plain(name), "value": k} for k, name in enumerate(window.variants)
@@ -113,12 +115,12 @@ class _Page:
         state.colorings = list(window.pair.colorings)
         state.layers = [layer_name(layer) for layer in window.layers]
         state.steps = list(window.steps)
-        state.target = window.targets.index(shown.target)
-        state.variant = window.variants.index(shown.variant)
-        state.coloring = shown.coloring
-        state.layer = window.layers.index(shown.layer)
-        state.step = window.steps.index(shown.step)
-        state.splats, state.surface = shown.splats, shown.surface
+        state.target = window.targets.index(current.target)
+        state.variant = window.variants.index(current.variant)
+        state.coloring = current.coloring
+        state.layer = window.layers.index(current.layer)
+        state.step = window.steps.index(current.step)
+        state.splats, state.surface = current.splats, current.surface
         state.numbers = "" if window.picked is None else "\n".join(window.picked.lines())
 
     def _changed(self, **_: Any) -> None:
@@ -164,6 +166,10 @@ class _Page:
     def _ready(self, **_: Any) -> None:
         self.announce(self.url(self.server.port))
 
+    def _joined(self, **_: Any) -> None:
+        """A browser that knows the secret has opened the page."""
+        self.joined = True
+
     def _watch_clients(self, root: Any) -> None:
         """Count the browsers, and end when the last has left."""
         from wslink.websocket import LinkProtocol
@@ -176,7 +182,7 @@ class _Page:
 
             def onClose(self, client_id: Any) -> None:  # noqa: N802
                 page.clients -= 1
-                if page.clients == 0:
+                if page.joined and page.clients == 0:
                     asyncio.get_running_loop().call_later(page.left, page._end)
 
         root.registerLinkProtocol(Clients())

@@ -36,6 +36,8 @@ KEYS = {
 
 SIZE = (1500, 900)
 
+INSET_ROWS = 4
+
 FLIGHT = 40
 """Pictures of a flight from the source to the target."""
 
@@ -86,8 +88,11 @@ class Window:
         self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
+        # Whoever shows the window, or takes its picture, renders it.
+        self.plotter.suppress_rendering = True
         self._draw()
         self.look_from_outside()
+        self.plotter.suppress_rendering = False
 
     @property
     def pair(self) -> Pair:
@@ -287,7 +292,7 @@ class Window:
         self._inset_columns = 1 if self.subject.edit is None else 2
         columns = self._inset_columns
         plotter = pyvista.Plotter(
-            shape=(4, columns + 1),
+            shape=(INSET_ROWS, columns + 1),
             groups=[(slice(None), columns)],
             col_weights=[*[0.2 / columns if columns == 1 else 0.13] * columns, 0.8],
             off_screen=off_screen,
@@ -303,11 +308,11 @@ class Window:
     @contextmanager
     def _one_render(self) -> Iterator[None]:
         """PyVista renders after every change; what changes inside is rendered once, at the end."""
-        self.plotter.suppress_rendering = True
+        before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True
         try:
             yield
         finally:
-            self.plotter.suppress_rendering = False
+            self.plotter.suppress_rendering = before
         self.plotter.render()
 
     def _draw(self) -> None:
@@ -331,6 +336,10 @@ class Window:
         for index, (title, image) in enumerate(insets.items()):
             self.plotter.subplot(*divmod(index, self._inset_columns))
             self._draw_inset(title, image)
+        for index in range(len(insets), INSET_ROWS * self._inset_columns):
+            self.plotter.subplot(*divmod(index, self._inset_columns))
+            for name in ("picture", "title"):
+                self.plotter.remove_actor(name)
 
     def _draw_inset(self, title: str, image: Image) -> None:
         height, width = image.shape[:2]
@@ -426,9 +435,9 @@ class Window:
 
 def plain(text: str, most: int = 120) -> str:
     """Text that VTK draws as it stands: no control characters, no formulas, and not endless."""
-    shown = "".join(c if c == "\n" or c.isprintable() else "?" for c in text)
-    shown = shown if len(shown) <= most else f"{shown[: most - 3]}..."
-    return shown.replace("$", "\\$")
+    text = "".join(c if c == "\n" or c.isprintable() else "?" for c in text)
+    text = text if len(text) <= most else f"{text[: most - 3]}..."
+    return text.replace("$", "\\$")
 
 
 def _next(names: Sequence[Any], current: Any, by: int = 1) -> Any:

@@ -23,8 +23,8 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.fixture(scope="session")
-def folders(tmp_path_factory):
+@pytest.fixture(scope="package")
+def folders(tmp_path_factory, one_thread):
     """A user's scene: splats, a data set with pictures, and the folder of an edit of them."""
     from dataclasses import replace
 
@@ -51,7 +51,7 @@ def folders(tmp_path_factory):
     write_transforms(
         folder / "transforms.json", Dataset(views, [folder / camera.name for camera in views])
     )
-    settings = preset("corrected", stages=2, views_per_stage=1, steps=1, iterations=1)
+    settings = preset("corrected", stages=2, views_per_stage=1, steps=1, iterations=0)
     pipe = pix2pix()
     editor = InstructPix2Pix(
         pipe.unet, pipe.vae, pipe.text_encoder, pipe.tokenizer, pipe.scheduler, text_guidance=3.0
