@@ -84,7 +84,7 @@ def _page(
     changes = largest_changes(trusted, run, before, after)
     lacking = [name for name, files in (("baseline", before), ("run", after)) if not files]
     if lacking:
-        why_none = f"The {' and the '.join(lacking)} has no pictures; its study names none."
+        why_none = f"The {' and the '.join(lacking)} has no pictures."
     else:
         why_none = "No pictured view changed by more than the tolerance of a figure."
     return page(result, changes, why_none)

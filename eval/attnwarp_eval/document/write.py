@@ -52,7 +52,9 @@ def inline(text: str) -> Markup:
 def _css(cell: str) -> Markup:
     if cell in _CLASSES:
         return Markup(f' class="{_CLASSES[cell]}"')
-    return Markup(' class="wide"') if len(cell) > 40 else Markup("")
+    if len(cell) > 40:
+        return Markup(' class="wide"')
+    return Markup(' class="text"') if len(cell) > 12 and cell[0].isalpha() else Markup("")
 
 
 LARGEST = 5_400_000

@@ -1,10 +1,25 @@
-"""Names from elsewhere in documents. Oracle: an HTML parser on what Python-Markdown makes of them."""
+"""Names from elsewhere in documents, and pictures in pages. Oracles: an HTML parser on what
+Python-Markdown makes of them, and on the page; OpenCV's decoder.
+"""
 
+import base64
+import re
 from html.parser import HTMLParser
 
+import cv2
 import markdown as python_markdown
+import numpy as np
 
-from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.document import charts
+from attnwarp_eval.document.model import (
+    Finding,
+    Gallery,
+    Picture,
+    Report,
+    Section,
+    Slider,
+    Table,
+)
 from attnwarp_eval.document.write import markdown, page
 
 NAMES = ("|x|", "<b>", "<script>alert(1)</script>", "</td>", "<!--x", "a < b")
@@ -44,3 +59,50 @@ def test_names_are_text_and_never_markup_or_columns(tmp_path):
             Parsed(page(report(name), tmp_path)).tags
             == Parsed(page(report("plain"), tmp_path)).tags
         )
+
+
+def test_a_page_holds_every_picture_and_nothing_from_elsewhere_in_8_mb(tmp_path):
+    generator = np.random.default_rng(0)
+    names = [f"{i}.jpg" for i in range(9)]
+    for name in names:  # noise, which no format makes small
+        noise = generator.integers(0, 256, (1024, 1024, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / name), noise, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    assert sum((tmp_path / name).stat().st_size for name in names) > 8_000_000
+    with charts.drawing(tmp_path / "figure.svg") as (axes,):
+        charts.hover(axes, 0.5, 0.5, "here")
+    slider = Slider(Picture(names[0], "before"), Picture(names[1], "after"))
+    rows = [("**bear, yaw030**", [Picture(name, name) for name in names[2:]])]
+    text = page(
+        Report(
+            "title",
+            [],
+            [
+                Section("a", figures=[Picture("figure.svg", "one"), Picture("figure.svg", "two")]),
+                Section("b", gallery=Gallery(rows, picker=True)),
+            ],
+            [Finding("It is so.", "1 ± 0 px", "about", "holds", slider)],
+        ),
+        tmp_path,
+    )
+    assert len(text.encode()) < 8_000_000
+    images = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', text)
+    assert len(images) == len(names)
+    for data in images:
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape[0] == picture.shape[1] > 500
+    assert not re.search(r'(?:src|href)="(?:https?:)?//', text)
+    assert text.count("<title>here</title>") == 2
+    identities = re.findall(r'\bid="([^"]*)"', text)
+    assert len(identities) == len(set(identities))
+    assert set(re.findall(r'(?:href="|url\()#([^")]*)', text)) <= set(identities)
+
+
+def test_names_of_metrics_link_to_their_meaning(tmp_path):
+    meanings = Table(["metric"], [["warp.epe"], ["depth.bias"]], glossary=True)
+    used = Table(["metric"], [["warp.epe.64"], ["warp.other"], ["depth.bias"]])
+    text = page(Report("title", [], [Section("a", [], [used, meanings])]), tmp_path)
+    assert re.findall(r'<a href="#m-([^"]*)">([^<]*)<', text) == [
+        ("warp.epe", "warp.epe.64"),
+        ("depth.bias", "depth.bias"),
+    ]
+    assert '<tr id="m-warp.epe">' in text
