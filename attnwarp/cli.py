@@ -88,6 +88,15 @@ class Preset(StrEnum):
     released_controlnet = "released-controlnet"
 
 
+class BaselineMethod(StrEnum):
+    """What a person may type for a method that edits are compared with."""
+
+    by_view = "by_view"
+    igs2gs = "igs2gs"
+    dge = "dge"
+    gaussctrl = "gaussctrl"
+
+
 class Store(StrEnum):
     """What a person may type for the place of recorded features."""
 
@@ -760,6 +769,83 @@ def inspect(
     # The library does not import the instrument: this process becomes its command.
     command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", str(splats)]
     os.execv(sys.executable, [*command, "--data", str(data), *context.args])
+
+
+@app.command()
+def baseline(
+    method: Annotated[BaselineMethod, typer.Argument(help="Of docs/baselines.md.")],
+    data: Annotated[
+        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+    ],
+    ply: Annotated[Path, typer.Option(help="Splats of the scene, such as attnwarp fit makes.")],
+    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    out: Annotated[Path, typer.Option(help="Folder for the result; a run in it is resumed.")],
+    editor: Annotated[
+        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
+    ] = "small-plain",
+    preset: Annotated[
+        str, typer.Option(help="The method's choices; see docs/baselines.md.")
+    ] = "default",
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Begin no edit and no iteration after so many.")
+    ] = None,
+    network_rows: Annotated[
+        int | None, typer.Option(min=0, help="Rows through the network at most.")
+    ] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the method."),
+    ] = None,
+    max_size: Annotated[
+        int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
+    threads: Annotated[
+        int | None,
+        typer.Option(min=1, help="CPU threads; all cores if left out, one for a bundled editor."),
+    ] = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Edit a scene by another method, for comparison with attnwarp edit."""
+    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+        changes = _assignments(change or [], {})
+        _check_out(out)
+        from attnwarp.baselines.settings import Budget
+        from attnwarp.baselines.settings import preset as choices
+
+        settings = choices(method.value, preset, **changes)
+        budget = Budget(seconds, network_rows)
+        _use_threads(threads)
+        import torch
+
+        from attnwarp.baselines.command import edit_dataset
+        from attnwarp.editing.small import bundled
+
+        small = editor in bundled()
+        torch.set_num_threads(threads or (1 if small else len(os.sched_getaffinity(0))))
+        dataset = _read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            points=False,
+        )
+        result = edit_dataset(
+            method.value, dataset, _read_splats(ply, None, None), editor, instruction, settings,
+            out, budget=budget, max_size=max_size, device=device,
+        )  # fmt: skip
+        ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
+        typer.echo(
+            f"{out / 'edited.ply'}: {result.counters['edits']} edits of"
+            f" {result.counters['views']} views in {sum(result.seconds.values()):.0f} s{ended}"
+        )
+        typer.echo(out / "sheet.png")
 
 
 def _read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaussians:

@@ -21,6 +21,7 @@ PACKAGES = {"attnwarp": ROOT / "attnwarp", "attnwarp_eval": ROOT / "eval" / "att
 
 DOORS = [
     "attnwarp",
+    "attnwarp.baselines",
     "attnwarp.encoders",
     "attnwarp.fit",
     "attnwarp.io",

@@ -29,7 +29,7 @@ def fundamental(view: Camera, key: Camera) -> Array:
         >>> left = Camera.look_at((0, 0, 3), (0, 0, 0), **view)
         >>> right = Camera.look_at((1, 0, 3), (1, 0, 0), **view)
         >>> line = fundamental(left, right) @ [2.5, 3.5, 1.0]  # a row of pixels
-        >>> bool(abs(line[0]) < 1e-12), float(-line[2] / line[1])
+        >>> bool(abs(line[0]) < 1e-12), round(float(-line[2] / line[1]), 9)
         (True, 3.5)
     """
     pose = key.relative_to(view)

@@ -18,7 +18,7 @@ from attnwarp.baselines.run import Baseline, Kind, Options, run
 from attnwarp.baselines.settings import GaussCtrlSettings
 from attnwarp.baselines.work import VIEWS, Round, ViewEdit, Work, chunks
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.editor import Editor, edit, shared_noise
 from attnwarp.editing.inversion import ddim_invert
 from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.editing import Guide, guided
@@ -41,8 +41,9 @@ def gaussctrl(
     Args:
         gaussians, cameras, images, options: see :func:`by_view`. ``images`` serve the segments and
             the detail that an edit at a smaller size lacks; guides are of the splats.
-        editor: a :class:`~attnwarp.editing.controlnet.DepthControlNet`. Inversion needs one that
-            predicts noise or v.
+        editor: a :class:`~attnwarp.editing.controlnet.DepthControlNet`. Where its network predicts
+            the picture, which says nothing of a clean picture's noise, inversion begins at the
+            lowest timestep, to which all views are noised alike.
         instruction: a prompt.
         settings: :class:`GaussCtrlSettings`, its defaults if left out.
 
@@ -72,11 +73,6 @@ class _GaussCtrl:
     def __init__(self, work: Work, settings: GaussCtrlSettings) -> None:
         work.takes("gaussctrl", "depth")
         work.one_size("gaussctrl")
-        if settings.latents == "inversion" and work.editor.schedule.prediction == "sample":
-            raise ValueError(
-                "latents: this editor predicts the picture, and DDIM inversion needs its noise; use"
-                " latents='random'"
-            )
         self.work, self.settings = work, settings
         generator = work.generator(VIEWS)
         views = _spread_draw(range(len(work.sizes)), settings.references, settings.views, generator)
@@ -92,7 +88,7 @@ class _GaussCtrl:
             return edits
         first = group == self.rounds[0].groups[0]
         inverted = set(group) | set(self.references) if first else set(group) - set(self.references)
-        return edits + len(inverted) * s.steps
+        return edits + len(inverted) * (s.steps - self._predicts_picture)
 
     def edit(
         self, number: int, group: Sequence[int], model: Gaussians, watch: Callable[[], None]
@@ -130,13 +126,21 @@ class _GaussCtrl:
             return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
         if view not in self._latents:
             prompt = work.instruction + s.suffix if s.source_prompt is None else s.source_prompt
+            schedule, timesteps = work.editor.schedule, work.editor.timesteps(s.steps)
+            before = work.editor.encode([work.render(view, work.frozen)])
+            begin = None
+            if self._predicts_picture:
+                *timesteps, begin = timesteps
+                noise = shared_noise((1, *before.shape[1:]), s.seed).to(before)
+                before = schedule.add_noise(before, noise, begin)
             with guided(work.editor, 1.0):
                 task = work.editor.task([depth], prompt)
-                before = work.editor.encode([work.render(view, work.frozen)])
-                self._latents[view] = ddim_invert(
-                    work.editor.schedule, task.predict, before, work.editor.timesteps(s.steps)
-                )
+                self._latents[view] = ddim_invert(schedule, task.predict, before, timesteps, begin)
         return self._latents[view]
+
+    @property
+    def _predicts_picture(self) -> bool:
+        return self.work.editor.schedule.prediction == "sample"
 
 
 @contextmanager

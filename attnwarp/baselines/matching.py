@@ -187,4 +187,6 @@ def key_views(
 
 
 def _unit(tokens: Tensor) -> Tensor:
+    # Half precision would decide between close matches by its rounding.
+    tokens = tokens.to(torch.promote_types(tokens.dtype, torch.float32))
     return tokens / tokens.norm(dim=-1, keepdim=True).clamp_min(1e-12)

@@ -225,8 +225,7 @@ class _Run:
         return cut is not None and cut["round"] <= number
 
     def _cut(self, limit: str, number: int) -> None:
-        if self.cut is None:
-            self.folder.write_json("cut.json", {"limit": limit, "round": number + 1})
+        self.folder.write_json("cut.json", {"limit": limit, "round": number + 1})
 
     def _out_of_seconds(self) -> bool:
         limit = self.budget.seconds
@@ -246,10 +245,11 @@ class _Run:
         for place, group in enumerate(part.groups):
             rows = self.method.rows(number, group)
             if not all(self.folder.has(self._about(number, view)) for view in group):
-                # A run that was cut while it edited this round edits no further.
-                limit = "" if self.cut is not None else self._limit(rows)
+                limit = None if self.cut else self._limit(rows)
                 if limit is not None:
                     self._cut(limit, number)
+                # A run that was cut while it edited this round edits no further.
+                if self.cut is not None:
                     return
                 self._edit_group(number, place, group)
             else:

@@ -22,7 +22,8 @@ class Budget:
 
     Args:
         seconds: of editing and tuning, over all sittings; None for no limit. A run that was cut
-            short by seconds depends on the machine.
+            short by seconds depends on the machine. A method that tunes after all of its edits may
+            end before it has tuned.
         network_rows: rows through the UNet; None for no limit. A batch of edits that would go
             beyond does not begin, and the round's tuning is the last.
 

@@ -20,7 +20,11 @@ Predict = Callable[[Tensor, int], Tensor]
 
 
 def ddim_invert(
-    schedule: Schedule, predict: Predict, latents: Tensor, timesteps: list[int]
+    schedule: Schedule,
+    predict: Predict,
+    latents: Tensor,
+    timesteps: list[int],
+    begin: int | None = None,
 ) -> Tensor:
     """(B, C, h, w) latents at the first of ``timesteps`` that DDIM leads back to the picture.
 
@@ -30,20 +34,22 @@ def ddim_invert(
 
     Args:
         schedule: of the model; its network predicts noise or v. One that predicts the picture
-            itself says nothing of a clean picture's noise.
+            itself says nothing of a clean picture's noise, and needs ``begin``.
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: of the edit, falling.
+        begin: timestep that the latents were noised to; the timesteps are then those above. Left
+            out, the latents are clean.
 
     Raises:
-        ValueError: a network that predicts the picture.
+        ValueError: a network that predicts the picture, of clean latents.
     """
-    if schedule.prediction == "sample":
+    if schedule.prediction == "sample" and begin is None:
         raise ValueError(
             "schedule: this network predicts the picture, and DDIM inversion needs its noise;"
-            " use edit_friendly_invert"
+            " use edit_friendly_invert, or begin at noised latents"
         )
-    x, last = latents, schedule.alpha(None)
+    x, last = latents, schedule.alpha(begin)
     with torch.no_grad():
         for timestep in reversed(timesteps):
             x0, noise = schedule.split(predict(x, timestep), x, last)

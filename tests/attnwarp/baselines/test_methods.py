@@ -22,6 +22,8 @@ from attnwarp.baselines import (
     preset,
 )
 from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.inversion import ddim_invert
+from attnwarp.editing.schedule import Schedule
 from attnwarp.propagate.pictures import to_bytes
 from attnwarp.render import render
 
@@ -235,6 +237,52 @@ def test_gaussctrl_inverts_without_guidance_and_edits_with_references(run, depth
         del depth_editor.embed
     assert texts == [[""]] * 3 + [["red", "a bear, best"]]
     assert (depth_editor.guidance, depth_editor.negative_prompt) == (3.0, "")
+
+
+@pytest.mark.parametrize(("spread", "kind"), [(0.5, "sample"), (2.0, "epsilon")])
+def test_inversion_from_noised_latents_follows_the_exact_flow(spread, kind):
+    """Of latents with a normal distribution of spread s, the network is known and so is the flow:
+    x keeps its ratio to the standard deviation sqrt(a s^2 + 1 - a) (Song et al. 2021, eq. 14)."""
+    alphas = torch.linspace(0.999, 0.001, 1000, dtype=torch.float64)
+    schedule = Schedule(alphas, kind, 1.0)
+
+    def predict(x, timestep):
+        # The inversion's network is asked at the latents that the step starts from.
+        a = alphas[states[len(asked)]]
+        asked.append(timestep)
+        clean = a.sqrt() * spread**2 / (a * spread**2 + 1 - a) * x
+        return clean if kind == "sample" else (x - a.sqrt() * clean) / (1 - a).sqrt()
+
+    asked, states = [], list(range(9, 999))
+    x = torch.randn((1, 2, 4, 4), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    result = ddim_invert(schedule, predict, x, states[:0:-1], begin=9)
+    assert asked == states[1:]
+    variance = alphas * spread**2 + 1 - alphas
+    expected = x * (variance[998] / variance[9]).sqrt()
+    assert (result / expected - 1).abs().max() < 0.01
+    assert (result / x - 1).abs().min() > 0.3
+
+
+def test_gaussctrl_inverts_an_editor_that_predicts_the_picture_from_its_lowest_timestep(
+    run, depth_editor, monkeypatch
+):
+    schedule = depth_editor.schedule
+    monkeypatch.setattr(
+        depth_editor, "schedule", Schedule(schedule.alphas, "sample", schedule.final_alpha)
+    )
+    steps = []
+    handle = depth_editor.unet.register_forward_pre_hook(
+        lambda module, args: steps.append((args[0].shape[0], int(args[1])))
+    )
+    try:
+        result = run("gaussctrl", replace(QUICK["gaussctrl"], steps=3, iterations=0))
+    finally:
+        handle.remove()
+    first, second, third = depth_editor.timesteps(3)
+    inversions = [timestep for rows, timestep in steps if rows == 1]
+    assert inversions == [second, first] * 3
+    assert [timestep for rows, timestep in steps if rows > 1] == [first, second, third] * 2
+    assert result.counters["network_rows"] == sum(rows for rows, _ in steps)
 
 
 def test_the_controlnets_attention_is_aligned_where_the_settings_say(run):

@@ -1,0 +1,65 @@
+"""The work of the command attnwarp baseline: a method on photographs and fitted splats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from attnwarp.baselines import METHODS, Baseline
+from attnwarp.baselines.settings import BaselineSettings, Budget
+from attnwarp.editing.small import load_editor
+from attnwarp.fit import load_views
+from attnwarp.gaussians import Gaussians
+from attnwarp.io import Dataset
+from attnwarp.propagate.progress import progress_display
+
+
+def edit_dataset(
+    method: str,
+    dataset: Dataset,
+    splats: Gaussians,
+    editor_name: str,
+    instruction: str,
+    settings: BaselineSettings,
+    out: Path,
+    *,
+    budget: Budget,
+    max_size: int | None,
+    device: str,
+) -> Baseline:
+    """Run a method on the views of a data set.
+
+    Args:
+        method: see :data:`attnwarp.baselines.METHODS`.
+        dataset: cameras and pictures.
+        splats: the scene before the edit.
+        editor_name: see :func:`attnwarp.editing.small.load_editor`.
+        instruction: in words.
+        settings: of the method. Without a size, the editor's own is taken.
+        out: folder of all results.
+        budget: limits of the run.
+        max_size: larger pictures are averaged down to it.
+        device: of the editor.
+
+    Raises:
+        InputError: no such editor; a folder of another run.
+    """
+    views = load_views(dataset, max_size=max_size)
+    black = torch.zeros(3)
+    images = [views.target(k, black).numpy() for k in range(len(views))]
+    editor = load_editor(editor_name, device=device)
+    if settings.size is None:
+        settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)
+    with progress_display(title=out.name) as progress:
+        return METHODS[method](
+            splats,
+            views.cameras,
+            images,
+            editor,
+            instruction,
+            settings,
+            folder=out,
+            budget=budget,
+            progress=progress,
+        )
