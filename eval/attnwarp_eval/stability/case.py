@@ -233,4 +233,4 @@ def level_name(level: float) -> str:
     >>> level_name(89.9999), level_name(1e6)
     ('89.9999', '1e+06')
     """
-    return f"{level:.10g}"
+    return f"{level:g}" if abs(level) >= 1e6 else f"{level:.10g}"

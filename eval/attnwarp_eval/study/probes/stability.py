@@ -322,6 +322,12 @@ def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
                     _panel(axis, members[index])
                 else:
                     axis.set_visible(False)
+            labelled: list[list[str]] = []
+            for axis in axes[: len(members)]:
+                handles, labels = axis.get_legend_handles_labels()
+                if labels not in labelled:
+                    labelled.append(labels)
+                    axis.legend(handles, labels, fontsize=5, loc="upper left")
         caption = f"Hard cases of {group} that break, or are refused, at some level."
         pictures.append(Picture(f"figures/{path.name}", caption))
     text = [
@@ -367,7 +373,6 @@ def _panel(axes: Any, swept: Sequence[Swept]) -> None:
     axes.set_xticks(range(len(levels)), [level_name(v) for v in levels], rotation=40, ha="right")
     axes.tick_params(labelsize=6)
     axes.set_title(f"{hard.number} {hard.name}: {hard.hardness}", loc="left", fontsize=7)
-    axes.legend(fontsize=5, loc="lower right")
 
 
 def _every_error(swept: Sequence[Swept]) -> Section:
