@@ -158,6 +158,11 @@ class Stability(Probe[Extra]):
         """From the record's entry ``refusals``."""
         return Extra(data["refusals"])
 
+    def read(self, data: Json) -> Record[Extra]:
+        """A record from its JSON. ValueError: today's cases have no such case or level."""
+        _definition(data["spec"])
+        return super().read(data)
+
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The verdicts, the errors against hardness, and every error."""
         swept = read_sweeps(results)
@@ -171,6 +176,9 @@ class Stability(Probe[Extra]):
 def _definition(spec: Json) -> tuple[Case, Way, list[float]]:
     hard = hard_case(spec["case"])
     by_name = {level_name(level): level for level in hard.levels}
+    former = [name for name in spec["levels"] if name not in by_name]
+    if former:
+        raise ValueError(f"hard case {hard.name!r} has no level {former[0]} today")
     way = Way(spec["backend"], spec["precision"], spec["direction"])
     return hard, way, [by_name[name] for name in spec["levels"]]
 
@@ -245,13 +253,13 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
             else "**Required levels that do not hold:** " + "; ".join(failed) + "."
         ),
     ]
-    rows = []
+    ending, whole = [], []
     for name in dict.fromkeys(sweep.case.name for sweep in swept):
         own = [sweep for sweep in swept if sweep.case.name == name]
         for direction in ("forward", "backward"):
             part = [sweep for sweep in own if sweep.way.direction == direction]
             if part:
-                rows.append(_row(part))
+                (ending if any(sweep.end for sweep in part) else whole).append(_row(part))
     columns = [
         "#",
         "case",
@@ -263,7 +271,11 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
         "tolerance",
         "what ends it",
     ]
-    return Section("Where hard inputs break the numerics", text, [Table(columns, rows)])
+    tables = [
+        Table(columns, ending, "Cases that break, or are refused, at some level."),
+        Table(columns[:-1], [row[:-1] for row in whole], "Cases that hold at every level."),
+    ]
+    return Section("Where hard inputs break the numerics", text, [t for t in tables if t.rows])
 
 
 def _row(swept: Sequence[Swept]) -> list[str]:
@@ -291,7 +303,7 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         number(worst.margin, 2),
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
-        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "no level swept",
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()),
     ]
 
 
