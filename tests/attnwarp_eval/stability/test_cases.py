@@ -4,9 +4,11 @@ The oracles of the cases share no code with the library, so that a case that hol
 passes; every sweep to its end is slow.
 """
 
+import ast
 import dataclasses
 import math
 import re
+from pathlib import Path
 
 import mpmath
 import pytest
@@ -70,8 +72,34 @@ def test_gradients_of_hard_splats_are_those_of_50_digits(name):
         assert outcome.verdict == "holds", describe(case, way, outcome)
 
 
-def test_all_forty_cases_are_there_and_those_of_editing():
-    assert {case.number for case in hard_cases().values()} == set(range(1, 47))
+def test_the_document_names_every_case_by_its_number_and_tests_that_there_are():
+    root = Path(__file__).parents[3]
+    text = (root / "docs/hard-cases.md").read_text("utf-8")
+    rows = re.findall(r"^\| (\d+) \| [^|]+ \| ([^|]+) \| (.+) \|$", text, re.MULTILINE)
+    assert [int(number) for number, _, _ in rows] == list(range(1, 47))
+    for number, sweeps, held in rows:
+        named = {case.name for case in hard_cases().values() if case.number == int(number)}
+        assert named and set(re.findall(r"`(\w+)`", sweeps)) == named, number
+        for file, names in (part.split(": ", 1) for part in held.split("; ") if part != "–"):
+            defined = {
+                node.name
+                for node in ast.parse((root / file).read_text("utf-8")).body
+                if isinstance(node, ast.FunctionDef)
+            }
+            tests = set(re.findall(r"`(test_\w+)`", names))
+            assert tests and tests <= defined, f"case {number}: {file} has no {tests - defined}"
+
+
+def test_a_record_of_a_level_that_a_case_no_longer_has_is_a_failure_and_no_crash(
+    tmp_path, monkeypatch
+):
+    _, store, _, _ = run(tmp_path, cases=["masked_psnr"])
+    case = hard_case("masked_psnr")
+    other = dataclasses.replace(case, levels=(4096, 1), quick=(1,))
+    monkeypatch.setitem(hard_cases(), case.name, other)
+    results = read_results(store)
+    assert results.measured == 0
+    assert "hard case 'masked_psnr' has no level 1024 today" in results.failures[0].error
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,8 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
             else "**Required levels that do not hold:** " + "; ".join(failed) + "."
         ),
     ]
-    ending, whole = [], []
+    ending: list[list[str]] = []
+    whole: list[list[str]] = []
     for name in dict.fromkeys(sweep.case.name for sweep in swept):
         own = [sweep for sweep in swept if sweep.case.name == name]
         for direction in ("forward", "backward"):
@@ -270,10 +271,11 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
         "its error",
         "tolerance",
         "what ends it",
+        "why",
     ]
     tables = [
         Table(columns, ending, "Cases that break, or are refused, at some level."),
-        Table(columns[:-1], [row[:-1] for row in whole], "Cases that hold at every level."),
+        Table(columns[:-2], [row[:-2] for row in whole], "Cases that hold at every level."),
     ]
     return Section("Where hard inputs break the numerics", text, [t for t in tables if t.rows])
 
@@ -304,6 +306,7 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
         "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()),
+        hard.limit,
     ]
 
 
