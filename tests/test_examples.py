@@ -49,6 +49,7 @@ DOORS = [
     "attnwarp_eval.splats.export",
     "attnwarp_eval.splats.fitted",
     "attnwarp_eval.splats.surface",
+    "attnwarp_eval.stability",
     "attnwarp_eval.statistics.equivalence",
     "attnwarp_eval.statistics.intervals",
     "attnwarp_eval.study",

@@ -267,8 +267,8 @@ class _Splats:
             return alpha, c[:, 2].clamp(min=near).expand_as(alpha), drawn
         spread = (self.scales[:, 0] * tu[:, 2]) ** 2 + (self.scales[:, 1] * tv[:, 2]) ** 2
         lo, hi = self._extent(spread)
-        # On a disc parallel to the image lo = z = hi, but however little it is tilted, z lies inside:
-        # the slope there is that of z, not the mean of the three that minimum and maximum give.
+        # On a disc parallel to the image lo = z = hi, but however little it is tilted, z lies
+        # inside: the slope is that of z. minimum and maximum would mix it with the bounds'.
         bounded = torch.where(z < lo, lo, torch.where(z > hi, hi, z))
         return alpha, torch.where(ahead, bounded, hi.expand_as(z)), drawn
 

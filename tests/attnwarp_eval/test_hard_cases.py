@@ -2,8 +2,6 @@
 numbers are the cases'.
 """
 
-import ast
-import re
 from pathlib import Path
 
 import mpmath
@@ -263,22 +261,3 @@ def test_somebody_elses_open_mesh_is_hit_where_float64_brute_force_hits_it(tmp_p
     agree = np.isclose(got, expected, rtol=1e-6) | (np.isinf(got) & np.isinf(expected))
     assert (~agree).sum() <= 2
     assert np.isfinite(appearance(scene, scene.source)).all()
-
-
-def test_the_table_of_hard_cases_has_all_forty_and_names_tests_that_there_are():
-    root = Path(__file__).parents[2]
-    rows = re.findall(
-        r"^\| (\d+) \| [^|]+ \| (.+) \|$",
-        (root / "docs/hard-cases.md").read_text("utf-8"),
-        re.MULTILINE,
-    )
-    assert [int(number) for number, _ in rows] == list(range(1, 41))
-    for number, held in rows:
-        for file, names in (part.split(": ", 1) for part in held.split("; ")):
-            defined = {
-                n.name
-                for n in ast.parse((root / file).read_text("utf-8")).body
-                if isinstance(n, ast.FunctionDef)
-            }
-            named = set(re.findall(r"`(test_\w+)`", names))
-            assert named and named <= defined, f"case {number}: {file} has no {named - defined}"

@@ -81,6 +81,10 @@ class Bound:
         unit: of the error.
         tolerance: in that unit; a function of the level where it depends on it.
         reason: for the tolerance.
+
+    Example:
+        >>> Bound("px", lambda offset: 1e-3 + 1e-16 * offset, "what float64 holds").at(1e6)
+        0.0010000001
     """
 
     unit: str
@@ -117,8 +121,28 @@ class Case:
             input is refused.
         must_refuse: whether a way must refuse a level.
         required_backward: the last level whose gradients must hold, ``required`` if left out.
+        limit: why it ends where it does; empty where it holds at every level.
         group: which figure shows it.
         version: raise it when the errors change meaning.
+
+    Example:
+        >>> import numpy as np
+        >>> sums = Case(
+        ...     99,
+        ...     "sum",
+        ...     "A small number beside a large one",
+        ...     input="1 beside a power of two",
+        ...     oracle="integers",
+        ...     hardness="log2 of the large one",
+        ...     levels=(10, 20, 30),
+        ...     required=20,
+        ...     quick=(20,),
+        ...     bounds={"forward": Bound("of 1", 1e-3, "the small number counts")},
+        ...     ways=(Way("numpy", "float32"),),
+        ...     measure=lambda level, way: abs(float(np.float32(2**level + 1)) - 2**level - 1),
+        ... )
+        >>> [sums.outcome(level, sums.ways[0]).verdict for level in sums.levels]
+        ['holds', 'holds', 'breaks']
     """
 
     number: int
@@ -135,6 +159,7 @@ class Case:
     measure: Callable[[float, Way], float] = field(repr=False)
     must_refuse: Callable[[float, Way], bool] = field(default=lambda level, way: False, repr=False)
     required_backward: float | None = None
+    limit: str = ""
     group: str = ""
     version: int = 1
 
@@ -230,7 +255,8 @@ class Outcome:
 def level_name(level: float) -> str:
     """A level as records and tables name it.
 
-    >>> level_name(89.9999), level_name(1e6)
-    ('89.9999', '1e+06')
+    Example:
+        >>> level_name(89.9999), level_name(1e6)
+        ('89.9999', '1e+06')
     """
-    return f"{level:.10g}"
+    return f"{level:g}" if abs(level) >= 1e6 else f"{level:.10g}"

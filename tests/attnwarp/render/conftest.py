@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
+from attnwarp_eval.stability.rendered import front_camera, quaternion_to, splats
 
 OUTPUTS = (
     "color",
@@ -80,13 +80,6 @@ def edge_on(mean: np.ndarray, camera: Camera, roll: float, tilt: float) -> np.nd
     return quaternion_to(normal)
 
 
-def quaternion_to(normal: np.ndarray) -> np.ndarray:
-    """Shortest rotation (wxyz) from the z axis to a unit vector."""
-    x, y, z = normal
-    q = np.array([1 + z, -y, x, 0.0])
-    return np.array([0.0, 1, 0, 0]) if np.linalg.norm(q) < 1e-9 else q / np.linalg.norm(q)
-
-
 @pytest.fixture
 def one_thread() -> Iterator[None]:
     """The reference's tensors are small here: torch's threads would only wait for each other."""
@@ -109,46 +102,10 @@ def make_splats() -> Callable[..., Gaussians]:
 @pytest.fixture
 def facing() -> Callable[..., Gaussians]:
     """Discs or balls at chosen points, facing a camera at the origin that looks along +z."""
-
-    def make(
-        means: Any,
-        scales: Any = 0.1,
-        opacities: Any = 0.5,
-        colors: Any = 1.0,
-        kind: str = "2d",
-        normals: Any = None,
-    ) -> Gaussians:
-        points = torch.as_tensor(np.asarray(means), dtype=torch.float64).reshape(-1, 3)
-        n = len(points)
-        quats = torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1)
-        if normals is not None:
-            quats = torch.tensor(
-                np.stack([quaternion_to(v) for v in np.asarray(normals).reshape(-1, 3)])
-            )
-        size = (
-            torch.as_tensor(scales, dtype=torch.float64).expand(n, 2 if kind == "2d" else 3).clone()
-        )
-        opacity = torch.as_tensor(opacities, dtype=torch.float64).expand(n).clone()
-        color = torch.as_tensor(colors, dtype=torch.float64).expand(n, 3)
-        return Gaussians(
-            "2d" if kind == "2d" else "3d",
-            points,
-            quats,
-            size,
-            opacity,
-            Gaussians.sh_from_rgb(color),
-        )
-
-    return make
+    return splats
 
 
-@pytest.fixture
-def front_camera() -> Callable[..., Camera]:
+@pytest.fixture(name="front_camera")
+def front_camera_fixture() -> Callable[..., Camera]:
     """Camera at the origin looking along +z, principal point at the middle."""
-
-    def make(size: int = 33, focal: float = 40.0) -> Camera:
-        return Camera(
-            np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]]), np.eye(4), size, size
-        )
-
-    return make
+    return front_camera

@@ -198,6 +198,7 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_edge_on, ("alpha",)),
+        limit="the disc is thinner than 0.01 px; pixels' positions are float32",
         group="splats",
     ),
     Case(
@@ -216,6 +217,7 @@ CASES = [
         ),
         ways=RENDERERS,
         measure=against_exact(_edge_on, ("depth",)),
+        limit="depth changes by its whole extent within 0.01 px, and pixels' positions are float32",
         group="splats",
     ),
     Case(
@@ -231,6 +233,7 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_far_world),
+        limit="the camera's translation is rounded: 1e11 is stored to 1.5e-5",
         group="splats",
     ),
     Case(
@@ -247,6 +250,7 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_quaternion),
         must_refuse=lambda level, way: level == 0,
+        limit="the squares of a float32 below 1e-23 underflow, so its length is 0",
         group="splats",
     ),
     *(
@@ -330,6 +334,7 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_scale),
+        limit="gradients grow as 1 / scale and leave float32",
         group="splats",
     ),
     Case(
@@ -372,8 +377,8 @@ CASES = [
         input="discs that face the camera at one depth, three times shuffled",
         oracle="the picture of the first order",
         hardness="number of splats",
-        levels=(2, 8, 64, 512, 2048),
-        required=512,
+        levels=(2, 8, 64, 512),
+        required=64,
         quick=(2, 64),
         bounds={"forward": exact("changed values", "the order has a definition: the content")},
         ways=tuple(way for way in FORWARD if way.backend != "cuda"),
@@ -408,6 +413,7 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_ratio),
+        limit="pixels' positions are float32: 1e-6 px count once the disc is thinner than 1e-3 px",
         group="splats",
     ),
     Case(

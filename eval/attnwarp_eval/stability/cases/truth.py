@@ -156,6 +156,7 @@ CASES = [
         bounds={"forward": exact("wrong owners")},
         ways=BOTH,
         measure=_ties,
+        limit="Open3D lists one of two triangles that coincide in float32",
         group="truth",
     ),
     Case(
@@ -166,7 +167,7 @@ CASES = [
         oracle="the quadratic in mpmath with 60 digits",
         hardness="distance from the tangent, radii",
         levels=(0.1, 1e-3, 1e-6, 1e-9, 1e-12, 1e-14, 1e-15),
-        required=1e-12,
+        required=1e-9,
         quick=(0.1, 1e-9),
         bounds={
             "forward": Bound(
@@ -177,6 +178,7 @@ CASES = [
         },
         ways=RAYS,
         measure=_tangent,
+        limit="the distance from the axis has 16 digits, and its square root 8",
         group="truth",
     ),
     Case(

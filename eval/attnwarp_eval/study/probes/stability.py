@@ -158,6 +158,11 @@ class Stability(Probe[Extra]):
         """From the record's entry ``refusals``."""
         return Extra(data["refusals"])
 
+    def read(self, data: Json) -> Record[Extra]:
+        """A record from its JSON. ValueError: today's cases have no such case or level."""
+        _definition(data["spec"])
+        return super().read(data)
+
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
         """The verdicts, the errors against hardness, and every error."""
         swept = read_sweeps(results)
@@ -171,6 +176,9 @@ class Stability(Probe[Extra]):
 def _definition(spec: Json) -> tuple[Case, Way, list[float]]:
     hard = hard_case(spec["case"])
     by_name = {level_name(level): level for level in hard.levels}
+    former = [name for name in spec["levels"] if name not in by_name]
+    if former:
+        raise ValueError(f"hard case {hard.name!r} has no level {former[0]} today")
     way = Way(spec["backend"], spec["precision"], spec["direction"])
     return hard, way, [by_name[name] for name in spec["levels"]]
 
@@ -245,13 +253,14 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
             else "**Required levels that do not hold:** " + "; ".join(failed) + "."
         ),
     ]
-    rows = []
+    ending: list[list[str]] = []
+    whole: list[list[str]] = []
     for name in dict.fromkeys(sweep.case.name for sweep in swept):
         own = [sweep for sweep in swept if sweep.case.name == name]
         for direction in ("forward", "backward"):
             part = [sweep for sweep in own if sweep.way.direction == direction]
             if part:
-                rows.append(_row(part))
+                (ending if any(sweep.end for sweep in part) else whole).append(_row(part))
     columns = [
         "#",
         "case",
@@ -262,8 +271,13 @@ def _verdicts(swept: Sequence[Swept]) -> Section:
         "its error",
         "tolerance",
         "what ends it",
+        "why",
     ]
-    return Section("Where hard inputs break the numerics", text, [Table(columns, rows)])
+    tables = [
+        Table(columns, ending, "Cases that break, or are refused, at some level."),
+        Table(columns[:-2], [row[:-2] for row in whole], "Cases that hold at every level."),
+    ]
+    return Section("Where hard inputs break the numerics", text, [t for t in tables if t.rows])
 
 
 def _row(swept: Sequence[Swept]) -> list[str]:
@@ -291,7 +305,8 @@ def _row(swept: Sequence[Swept]) -> list[str]:
         number(worst.margin, 2),
         "refused, as it must be" if worst.must_refuse else _error(worst.error),
         _tolerance(bound.unit, worst.tolerance),
-        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()) or "no level swept",
+        "; ".join(f"{level}: {', '.join(who)}" for level, who in ends.items()),
+        hard.limit,
     ]
 
 
@@ -322,6 +337,12 @@ def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
                     _panel(axis, members[index])
                 else:
                     axis.set_visible(False)
+            labelled: list[list[str]] = []
+            for axis in axes[: len(members)]:
+                handles, labels = axis.get_legend_handles_labels()
+                if labels not in labelled:
+                    labelled.append(labels)
+                    axis.legend(handles, labels, fontsize=5, loc="upper left")
         caption = f"Hard cases of {group} that break, or are refused, at some level."
         pictures.append(Picture(f"figures/{path.name}", caption))
     text = [
@@ -367,7 +388,6 @@ def _panel(axes: Any, swept: Sequence[Swept]) -> None:
     axes.set_xticks(range(len(levels)), [level_name(v) for v in levels], rotation=40, ha="right")
     axes.tick_params(labelsize=6)
     axes.set_title(f"{hard.number} {hard.name}: {hard.hardness}", loc="left", fontsize=7)
-    axes.legend(fontsize=5, loc="lower right")
 
 
 def _every_error(swept: Sequence[Swept]) -> Section:
