@@ -7,12 +7,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.results import Results
 
@@ -37,6 +38,9 @@ BY_SCENE = {
 DISAGREEMENT = "multiview.delta_e_above.edit_inside"
 
 PARTS = ("source", "warp", "edit", "tune")
+
+FEWEST = 3
+"""Scenes from which on intervals are drawn."""
 
 OWN = "each view alone"
 """The method of settings that edits every view by itself: the control."""
@@ -125,7 +129,10 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
     path = layout.figure("editing-by-yaw.svg")
     with charts.drawing(path, columns=len(BY_YAW)) as panels:
         for axes, (metric, title) in zip(panels, BY_YAW.items(), strict=True):
-            series = [charts.Line(name, yaws, curves[metric, name]) for name in measured]
+            series = [
+                charts.Line(name, yaws, [_drawn(value) for value in curves[metric, name]])
+                for name in measured
+            ]
             charts.lines(
                 axes,
                 series,
@@ -144,7 +151,16 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
         )
         for metric, title in BY_YAW.items()
     ]
-    text = ["Means over the scenes whose source edit was done, with 95 % intervals over scenes."]
+    text = [
+        (
+            "Means over the scenes whose source edit was done, with 95 % intervals over scenes from"
+            f" {FEWEST} scenes on."
+        ),
+    ]
+    for name in measured:
+        scenes = dict.fromkeys(scene for scene, _, _ in results.records(probe, name))
+        if len(scenes) < len(results.study.scenes):
+            text.append(f"**Of {', '.join(scenes)} alone, not to be compared: {name}.**")
     figure = Picture(f"figures/{path.name}", "Agreement and fidelity by yaw from the source.")
     return Section("Edited views by yaw", text, tables, [figure])
 
@@ -308,6 +324,13 @@ def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], d
 
 def _editing(seconds: Mapping[str, float]) -> float:
     return seconds["source"] + seconds["warp"] + seconds["edit"]
+
+
+def _drawn(value: Interval) -> Interval:
+    """Without bounds that would hide the means: of two scenes an interval spans the figure."""
+    if value.scenes >= FEWEST:
+        return value
+    return replace(value, low=math.nan, high=math.nan)
 
 
 def _lists(table: Mapping[str, Mapping[str, float]]) -> dict[str, list[float]]:
