@@ -71,7 +71,9 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
                 continue
             text = _prompt(editor, prompts, row, rng)
             image = draw(editor, prompts, row, text, seed=world)
-            true = [np.clip((prompts.picture(row, k) + 1) / 2, 0, 1) for k in choices]
+            true = [
+                np.clip((prompts.picture(row, k) + 1) / 2, 0, 1).astype(np.float32) for k in choices
+            ]
             answer = choices[nearest(image, true, mask)]
             right.append(answer == target)
             others = [k for k in choices if k != target]
@@ -87,8 +89,8 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
     right, wrong = [], []
     for index, image in enumerate(pictures):
         rng = np.random.default_rng([SEED, index, 98])
-        others = rng.permutation([k for k in range(len(masks)) if k != index])[: SHAPES - 1]
-        among = [index, *others.tolist()]
+        strange = rng.permutation([k for k in range(len(masks)) if k != index])
+        among = [index, *strange[: SHAPES - 1].tolist()]
         best = among[int(np.argmax([separation(image, masks[k]) for k in among]))]
         right.append(best == index)
         wrong.append(best == among[1])

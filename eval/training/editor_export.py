@@ -42,7 +42,7 @@ def _load(net: torch.nn.Module, checkpoint: Path) -> tuple[int, float]:
 def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
     net, tokenizer, _, _ = averaged(stage, out)
-    parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"], "image_encoder": [None, None]}
+    parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
     return _write(folder, net, tokenizer, "StableDiffusionInstructPix2PixPipeline", parts)
 
 
@@ -53,13 +53,12 @@ def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     net.controlnet.save_pretrained(folder / "controlnet")
     parts = {
         "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
-        "image_encoder": [None, None],
     }  # fmt: skip
     return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts)
 
 
 def _write(
-    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str | None]]
+    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]]
 ) -> Path:
     """Write what both kinds have, the list of all parts and their checksums."""
     from transformers import PreTrainedTokenizerFast
@@ -74,11 +73,11 @@ def _write(
     )
     words.save_pretrained(folder / "tokenizer")
     index = {
-        "_class_name": pipeline, "requires_safety_checker": False,
+        "_class_name": pipeline, "requires_safety_checker": False, **parts,
         "vae": ["attnwarp.editing.latents", "HaarLatents"],
         "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "PreTrainedTokenizerFast"],
         "scheduler": ["diffusers", "DDIMScheduler"], "safety_checker": [None, None], "feature_extractor": [None, None],
-        **parts,
+        "image_encoder": [None, None],
     }  # fmt: skip
     (folder / "model_index.json").write_text(json.dumps(index, indent=1) + "\n")
     write_sums(folder)

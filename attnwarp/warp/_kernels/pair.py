@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba as nb
+import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
@@ -20,7 +20,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 _options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-jit = nb.njit(**_options)
+jit = numba.njit(**_options)
 
 INVERSE, BILINEAR, NEAREST = range(3)
 """How depth is interpolated."""

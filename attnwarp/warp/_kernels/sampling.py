@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
+import numba
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
@@ -21,7 +21,7 @@ from numba.extending import intrinsic
 # Without numba's reference counts: two threads that count the same array up and down for every
 # token spend more on that than on the token. Such kernels allocate nothing.
 _options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-jit = nb.njit(**_options)
+jit = numba.njit(**_options)
 PLANES = 8
 """Planes of a feature map that are sampled together."""
 HALF, BRAIN = types.uint16, types.int16

@@ -249,7 +249,7 @@ class Window:
         self.pick(column, row)
 
     def _add_sliders(self) -> None:
-        choices = {
+        choices: dict[str, tuple[Sequence[Any], Callable[[], Any], Callable[[Any], None]]] = {
             "view": (self.targets, lambda: self.state.target, lambda v: self.show(target=v)),
             "variant": (self.variants, lambda: self.state.variant, lambda v: self.show(variant=v)),
             "layer": (self.layers, lambda: self.state.layer, lambda v: self.show(layer=v)),

@@ -50,6 +50,7 @@ from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.world import splats
 
 if TYPE_CHECKING:
+    from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.gaussians import Gaussians
     from attnwarp_eval.twoview import Hits
@@ -586,13 +587,15 @@ def _files_digest(name: str) -> str:
 
 
 @lru_cache(maxsize=2)
-def _loaded(name: str, guidance: tuple[tuple[str, float], ...]) -> InstructPix2Pix:
+def _loaded(
+    name: str, guidance: tuple[tuple[str, float], ...]
+) -> InstructPix2Pix | DepthControlNet:
     from attnwarp.editing.small import load_editor
 
     return load_editor(name, **{f"{kind}_guidance": value for kind, value in guidance})
 
 
-def load(name: str, planned: Json) -> InstructPix2Pix:
+def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:
     """An editor whose identity is the planned one.
 
     Raises:
