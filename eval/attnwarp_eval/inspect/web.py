@@ -176,7 +176,7 @@ class _Page:
 
         page = self
 
-        class Clients(LinkProtocol):  # type: ignore[misc]
+        class Clients(LinkProtocol):
             def onConnect(self, request: Any, client_id: Any) -> None:  # noqa: N802
                 page.clients += 1
 

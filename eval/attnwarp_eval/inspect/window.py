@@ -249,7 +249,7 @@ class Window:
         self.pick(column, row)
 
     def _add_sliders(self) -> None:
-        choices = {
+        choices: dict[str, tuple[Sequence[Any], Callable[[], Any], Callable[[Any], None]]] = {
             "view": (self.targets, lambda: self.state.target, lambda v: self.show(target=v)),
             "variant": (self.variants, lambda: self.state.variant, lambda v: self.show(variant=v)),
             "layer": (self.layers, lambda: self.state.layer, lambda v: self.show(layer=v)),
@@ -291,10 +291,14 @@ class Window:
 
         self._inset_columns = 1 if self.subject.edit is None else 2
         columns = self._inset_columns
-        plotter = pyvista.Plotter(
+        # PyVista's own types name integers for both.
+        layout: dict[str, Any] = {
+            "groups": [(slice(None), columns)],
+            "col_weights": [*[0.2 if columns == 1 else 0.13] * columns, 0.8],
+        }
+        plotter: Any = pyvista.Plotter(
             shape=(INSET_ROWS, columns + 1),
-            groups=[(slice(None), columns)],
-            col_weights=[*[0.2 / columns if columns == 1 else 0.13] * columns, 0.8],
+            **layout,
             off_screen=off_screen,
             window_size=list(size),
         )
