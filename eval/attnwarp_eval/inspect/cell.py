@@ -56,12 +56,10 @@ class CellReport:
 
     Example:
         >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.splats.surface import surface_splats
         >>> from attnwarp_eval.world import world
-        >>> scene = world("spheres", 32)
-        >>> model = surface_splats(scene.scene, count=2000)
-        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
-        >>> cell = cell_report(pair, (8, 8), 4, 6)
+        >>> pair = Pair(world("spheres", 32), "yaw030", PRESETS["corrected"], None)
+        >>> row, column = pair.layer((8, 8)).mask.nonzero()[0].tolist()
+        >>> cell = cell_report(pair, (8, 8), column, row)
         >>> cell.accepted, round(sum(tap.weight for tap in cell.taps), 6)
         (True, 1.0)
     """
@@ -129,13 +127,10 @@ def cell_report(pair: Pair, size: Size, column: int, row: int) -> CellReport:
 
     Example:
         >>> from attnwarp.warp import PRESETS
-        >>> from attnwarp_eval.splats.surface import surface_splats
         >>> from attnwarp_eval.world import world
-        >>> scene = world("spheres", 32)
-        >>> model = surface_splats(scene.scene, count=2000)
-        >>> pair = Pair(scene, "yaw030", PRESETS["corrected"], model)
-        >>> print(cell_report(pair, (8, 8), 4, 6).lines()[0])
-        cell (4, 6) of 8 x 8: visible
+        >>> pair = Pair(world("spheres", 32), "yaw030", PRESETS["corrected"], None)
+        >>> cell_report(pair, (8, 8), 4, 6).lines()[0].startswith("cell (4, 6) of 8 x 8: ")
+        True
     """
     h, w = size
     if not (0 <= column < w and 0 <= row < h):

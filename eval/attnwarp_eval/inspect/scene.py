@@ -68,7 +68,7 @@ def true_surface(geometry: Geometry) -> pyvista.PolyData:
     import pyvista
 
     corners, _ = geometry.flat_patches()
-    faces = np.arange(3 * len(corners)).reshape(-1, 3)
+    faces: npt.NDArray[Any] = np.arange(3 * len(corners)).reshape(-1, 3)
     flat = pyvista.PolyData.from_regular_faces(corners.reshape(-1, 3), faces)
     spheres = [
         pyvista.Sphere(radius=radius, center=center, theta_resolution=48, phi_resolution=48)
@@ -94,7 +94,7 @@ def discs(gaussians: Gaussians) -> pyvista.PolyData:
     circle = np.stack([np.cos(angle), np.sin(angle)])
     offsets = np.swapaxes(spans @ circle, 1, 2)
     points = gaussians.world_means()[:, None] + offsets
-    faces = np.arange(count * sides).reshape(count, sides)
+    faces: npt.NDArray[Any] = np.arange(count * sides).reshape(count, sides)
     mesh = pyvista.PolyData.from_regular_faces(points.reshape(-1, 3), faces)
     # Degree 0 of the harmonics is the colour without its dependence on the viewer.
     flat = 0.5 + SH_C0 * gaussians.sh.detach()[:, 0].double().numpy()

@@ -291,10 +291,14 @@ class Window:
 
         self._inset_columns = 1 if self.subject.edit is None else 2
         columns = self._inset_columns
-        plotter = pyvista.Plotter(
+        # PyVista's own types name integers for both.
+        layout: dict[str, Any] = {
+            "groups": [(slice(None), columns)],
+            "col_weights": [*[0.2 if columns == 1 else 0.13] * columns, 0.8],
+        }
+        plotter: Any = pyvista.Plotter(
             shape=(INSET_ROWS, columns + 1),
-            groups=[(slice(None), columns)],
-            col_weights=[*[0.2 / columns if columns == 1 else 0.13] * columns, 0.8],
+            **layout,
             off_screen=off_screen,
             window_size=list(size),
         )

@@ -105,8 +105,8 @@ def test_a_real_window_follows_its_keys_and_closes(display, tmp_path):
         [*COMMAND, "spheres", "--size", "32", "--view", "yaw060"],
         env=environment(DISPLAY=display), stderr=subprocess.PIPE, text=True, cwd=tmp_path,
     )  # fmt: skip
+    screen = Screen(display)
     try:
-        screen = Screen(display)
         empty = screen.picture()
         before = screen.settled(different=empty)
         screen.move(550, 300)
@@ -121,6 +121,7 @@ def test_a_real_window_follows_its_keys_and_closes(display, tmp_path):
         assert process.returncode == 0 and not errors
     finally:
         process.kill()
+        screen.display.close()
 
 
 def children(pid):
