@@ -14,6 +14,7 @@ from attnwarp.errors import InputError, suggest
 
 if TYPE_CHECKING:
     from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.editor import Guide
     from attnwarp.editing.pix2pix import InstructPix2Pix
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -77,6 +78,33 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
     return 1 if small else len(os.sched_getaffinity(0))
 
 
+def guide_of(name_or_folder: str) -> Guide:
+    """What an editor is guided by, without loading it: a folder ``controlnet`` means depth maps.
+
+    Raises:
+        InputError: no such editor or folder.
+
+    Example:
+        >>> guide_of("small-depth"), guide_of("small-plain")
+        ('depth', 'picture')
+    """
+    return "depth" if (_folder(name_or_folder)[0] / "controlnet").is_dir() else "picture"
+
+
+def _folder(name_or_folder: str) -> tuple[Path, bool]:
+    """An editor's folder, and whether it is a bundled one."""
+    names = bundled()
+    if name_or_folder in names:
+        return WEIGHTS / name_or_folder, True
+    folder = Path(name_or_folder).expanduser()
+    if not folder.is_dir():
+        raise InputError(
+            f"editor {name_or_folder!r}: neither bundled ({', '.join(names) or 'none is'}) nor a"
+            f" folder{suggest(name_or_folder, names)}"
+        )
+    return folder, False
+
+
 def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | DepthControlNet:
     """An editor by its name, such as "small-plain", or from a folder in diffusers' format.
 
@@ -98,15 +126,8 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
 
-    names = bundled()
-    ships = name_or_folder in names
-    folder = WEIGHTS / name_or_folder if ships else Path(name_or_folder).expanduser()
-    if not folder.is_dir():
-        raise InputError(
-            f"editor {name_or_folder!r}: neither bundled ({', '.join(names) or 'none is'}) nor a"
-            f" folder{suggest(name_or_folder, names)}"
-        )
-    depth = (folder / "controlnet").is_dir()
+    folder, ships = _folder(name_or_folder)
+    depth = guide_of(name_or_folder) == "depth"
     if ships:
         check_sums(folder)
         guidance = (

@@ -7,7 +7,7 @@ A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +33,7 @@ class Job:
         cameras: of the views, the source first; all of one size (H, W).
         images: (H, W, 3) sRGB in [0, 1], the views before the edit.
         editor: of single views.
-        instruction: in words.
+        instruction: in words; a description of the result for an editor that is guided by depth.
         settings: what the method's ``settings`` returned.
         folder: for the method's files; removed afterwards.
         warps: the warp from the source to a target by their numbers, in place of the method's own.
@@ -136,8 +136,39 @@ def _true_pictures(job: Job) -> EditedScene:
     return EditedScene(tuning.gaussians(), edited, seconds, counters)
 
 
+def _baseline(name: str) -> Method:
+    """A method of :mod:`attnwarp.baselines`."""
+
+    def settings(wanted: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
+        from attnwarp.baselines import preset
+        from attnwarp.warp import PRESETS
+
+        # A variant that names no preset has one of the warp's.
+        chosen = "default" if wanted in PRESETS else wanted
+        return asdict(preset(name, chosen, **fields, seed=seed))
+
+    def run(job: Job) -> EditedScene:
+        from attnwarp import baselines
+
+        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in job.settings.items()}
+        result = baselines.METHODS[name](
+            job.gaussians,
+            job.cameras,
+            job.images,
+            job.editor,
+            job.instruction,
+            baselines.preset(name, **fields),
+            folder=job.folder,
+        )
+        return EditedScene(result.gaussians, result.edited, result.seconds, result.counters)
+
+    return Method(settings, run)
+
+
 METHODS: dict[str, Method] = {
     "propagate": Method(_propagate_settings, _propagate),
     "true pictures": Method(_propagate_settings, _true_pictures),
+    **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
 }
-"""Every method by name. ``propagate`` with ``method: each view alone`` is the control."""
+"""Every method by name. ``propagate`` with ``method: each view alone`` is the control; those of
+:mod:`attnwarp.baselines` keep their names."""

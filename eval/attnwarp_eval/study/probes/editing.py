@@ -293,7 +293,7 @@ class EditingProbe(Probe[EditResult]):
                 [world.camera(name) for name in names],
                 [truth.originals[name] for name in names],
                 editor,
-                spec["edit"]["instruction"],
+                spec["edit"]["target" if editor.guide == "depth" else "instruction"],
                 spec["settings"],
                 Path(folder),
                 _warps(work, before, names),
@@ -590,9 +590,12 @@ def _files_digest(name: str) -> str:
 def _loaded(
     name: str, guidance: tuple[tuple[str, float], ...]
 ) -> InstructPix2Pix | DepthControlNet:
-    from attnwarp.editing.small import load_editor
+    from attnwarp.editing.small import guide_of, load_editor
 
-    return load_editor(name, **{f"{kind}_guidance": value for kind, value in guidance})
+    given = {f"{kind}_guidance": value for kind, value in guidance}
+    if guide_of(name) == "depth" and "text_guidance" in given:
+        given["guidance"] = given.pop("text_guidance")
+    return load_editor(name, **given)
 
 
 def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:

@@ -202,9 +202,36 @@ def test_the_exact_mask_injects_where_the_source_truly_sees(folder, tmp_path):
     )  # one step; image guidance of 1 drops a branch
 
 
+def test_a_compared_method_edits_every_view_with_its_own_settings(folder, tmp_path):
+    own = {"method": "by_view", "options": {"steps": 2, "iterations": 3}}
+    record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
+    counters = record.cost.counters
+    # Four views, two steps; image guidance of 1 drops a branch.
+    assert counters["network_rows"] == 4 * 2 * 2
+    assert (counters["edits"], counters["iterations"], record.extra.edited) == (4, 3, 4)
+
+
+def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction(
+    folder, tmp_path, monkeypatch
+):
+    words = []
+
+    def run(job):
+        words.append((job.editor.guide, job.instruction))
+        return planned(["red"] * 4).run(job)
+
+    monkeypatch.setitem(METHODS, "planned", Method(METHODS["propagate"].settings, run))
+    for name in ("small-depth", "small-plain"):
+        own = {"method": "planned", "editor": {"name": name, "text_guidance": 1.5}}
+        record_of(folder, tmp_path, variants={"planned": own})
+    (edit,) = SCENE["edits"]
+    assert words == [("depth", edit["target"]), ("picture", edit["instruction"])]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"variants": {"planned": {"method": "dge", "options": {"stages": 2}}}}, "stages"),
         ({"variants": {"planned": {"method": "magic"}}}, "method: got 'magic', expected one of"),
         ({"variants": {"planned": {"options": {"stagse": 2}}}}, "stagse"),
         ({"editing": {"edits": {"ball": {"gold": None}}}}, "no edit 'gold'"),
