@@ -150,7 +150,9 @@ def _baseline(name: str) -> Method:
     def run(job: Job) -> EditedScene:
         from attnwarp import baselines
 
-        fields = {k: tuple(v) if isinstance(v, list) else v for k, v in job.settings.items()}
+        fields: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in job.settings.items()
+        }
         result = baselines.METHODS[name](
             job.gaussians,
             job.cameras,
