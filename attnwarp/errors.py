@@ -18,6 +18,7 @@ EXTRAS = {
         "markupsafe",
         "matplotlib",
         "mitsuba",
+        "mpmath",
         "open3d",
         "pydantic",
         "skimage",

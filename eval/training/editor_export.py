@@ -100,8 +100,8 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
         "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
         "injection": {
             "none": "none; what its attention features carry, it learned from editing alone.",
-            "features": "trained with injected features, so its features carry the answer by construction; no claim about"
-            " an editor's own working may rest on it alone.",
+            "features": "trained with injected features, so that its features would carry the answer; the figures of swapped"
+            " features say how far they do. No claim about an editor's own working may rest on it alone.",
             "control": "the same steps as the injection stage without the injection.",
         }[plan.inject],
     }  # fmt: skip

@@ -5,17 +5,20 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from diffusers import StableDiffusionInstructPix2PixPipeline
+from diffusers import StableDiffusionControlNetPipeline, StableDiffusionInstructPix2PixPipeline
 
 import attnwarp.editing.latents
 import attnwarp.editing.small_unet  # noqa: F401  diffusers imports no module that a folder names
+from attnwarp.editing.controlnet import control_image
 from attnwarp.editing.editor import edit
 from attnwarp.editing.small import (
+    DEPTH_GUIDANCE,
     IMAGE_GUIDANCE,
     TEXT_GUIDANCE,
     WEIGHTS,
     bundled,
     check_sums,
+    guide_of,
     load_editor,
 )
 from attnwarp.errors import InputError
@@ -28,20 +31,31 @@ def test_a_bundled_editor_is_small_has_a_card_and_edits_as_diffusers_pipeline_do
     files = [p for p in (WEIGHTS / name).rglob("*") if p.is_file()]
     assert sum(p.stat().st_size for p in files) < 20e6
     assert (WEIGHTS / name / "card.md").read_text().startswith(f"# {name}\n")
-    picture = np.random.default_rng(0).uniform(0.2, 0.8, (48, 64, 3)).astype(np.float32)
+    guide = np.random.default_rng(0).uniform(0.2, 0.8, (48, 64, 3)).astype(np.float32)
+    if guide_of(name) == "depth":
+        guide = guide[..., 0] + 1
     noise = torch.randn((1, 48, 12, 16), generator=torch.Generator().manual_seed(1))
-    pipe = StableDiffusionInstructPix2PixPipeline.from_pretrained(
-        WEIGHTS / name, torch_dtype=torch.float32
-    )
-    pipe.set_progress_bar_config(disable=True)
-    theirs = pipe(
-        "make it red", image=torch.from_numpy(picture).permute(2, 0, 1)[None], num_inference_steps=5, latents=noise,
-        guidance_scale=TEXT_GUIDANCE, image_guidance_scale=IMAGE_GUIDANCE, output_type="np",
-    ).images[0]  # fmt: skip
-    ours = edit(load_editor(name), [picture], "make it red", steps=5, noise=noise).images[0]
+    theirs = drawn_by_diffusers(name, guide, "make it red", noise)
+    ours = edit(load_editor(name), [guide], "make it red", steps=5, noise=noise).images[0]
     assert np.abs(ours - theirs).max() < 1e-5
-    other = edit(load_editor(name), [picture], "make it night", steps=5, noise=noise).images[0]
+    other = edit(load_editor(name), [guide], "make it night", steps=5, noise=noise).images[0]
     assert np.abs(ours - other).mean() > 1e-3  # the words count
+
+
+def drawn_by_diffusers(name, guide, words, noise):
+    """The picture of the pipeline that an editor's folder is written for."""
+    depth = guide_of(name) == "depth"
+    kind = StableDiffusionControlNetPipeline if depth else StableDiffusionInstructPix2PixPipeline
+    pipe = kind.from_pretrained(WEIGHTS / name, torch_dtype=torch.float32)
+    pipe.set_progress_bar_config(disable=True)
+    image = torch.from_numpy(control_image(guide) if depth else guide).permute(2, 0, 1)[None]
+    own = (
+        {"guidance_scale": DEPTH_GUIDANCE, "height": 48, "width": 64}
+        if depth
+        else {"guidance_scale": TEXT_GUIDANCE, "image_guidance_scale": IMAGE_GUIDANCE}
+    )
+    shared = {"num_inference_steps": 5, "latents": noise, "output_type": "np"}
+    return pipe(words, image=image, **own, **shared).images[0]
 
 
 def test_small_plain_is_bundled_and_an_unknown_name_is_refused():
