@@ -41,7 +41,7 @@ def findings(results: Results, problems: list[str], *, pictures: bool = True) ->
         problems: of the instrument, one line each.
         pictures: whether each has its picture.
     """
-    first = [_calibration(results, problems)] if results.finished("calibration") else []
+    first = [_calibration(results, problems)] if results.finished(_instrument()) else []
     clearest = _clearest(results)
     claims = [_claim(results, judged) for judged in clearest]
     effects = _effects(results, [set(judged.sides) for judged in clearest])
@@ -50,11 +50,16 @@ def findings(results: Results, problems: list[str], *, pictures: bool = True) ->
     return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
 
 
+def _instrument() -> str:
+    """The name of the probe that holds the instrument itself to the truth, which every run has."""
+    return next(probe.name for probe in probes() if probe.always)
+
+
 def _calibration(results: Results, problems: list[str]) -> Finding:
     worst = max(
         (
             value
-            for cell, record in results.finished("calibration")
+            for cell, record in results.finished(_instrument())
             for view in record.views
             if math.isfinite(value := view.metrics.get("warp.epe_median", math.nan))
         ),
@@ -136,7 +141,7 @@ def _value(results: Results, name: str, metric: str, difference: Interval) -> st
 
 def _warped_and_true(results: Results) -> Slider | None:
     """The source warped by the truth's own depth over the true target."""
-    pictures = _pictures(results, "calibration", "calibration")
+    pictures = _pictures(results, _instrument(), _instrument())
     for (scene, view, seed, content), file in pictures.items():
         target = pictures.get((scene, view, seed, "target"))
         if content == "warped" and target is not None:

@@ -30,7 +30,7 @@ from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Section
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.fitted import surface_error
-from attnwarp_eval.study import editing_sections, pictures
+from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import (
     EditTruth,
@@ -42,7 +42,7 @@ from attnwarp_eval.study.edit_truth import (
 )
 from attnwarp_eval.study.methods import METHODS, EditedScene, Job
 from attnwarp_eval.study.parts import Part, Study, StudyError, Variant, did_you_mean
-from attnwarp_eval.study.probes import fit, register, sensitivity
+from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.results import Results
