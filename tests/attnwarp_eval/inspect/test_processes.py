@@ -147,6 +147,7 @@ def served(tmp_path):
     yield process, url.strip()
     process.kill()
     process.wait()
+    process.stdout.close()
 
 
 def listening(port):
