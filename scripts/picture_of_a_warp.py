@@ -12,6 +12,8 @@ from pathlib import Path
 from matplotlib import pyplot
 from matplotlib.image import imread
 
+from attnwarp_eval.study import Store
+
 VARIANTS = ("bounds only", "corrected")
 """Rows of the picture: the bounds test of the paper, and the rules that truth supports."""
 
@@ -20,7 +22,7 @@ def pictures_of(run: Path, scene: str, variant: str, view: str) -> dict[str, Pat
     """Files of a view's pictures under one variant, by what they show."""
     for cell in json.loads((run / "study.json").read_text())["cells"]:
         if (cell["scene"], cell["probe"]) == (scene, "warp") and variant in cell["variants"]:
-            record = json.loads((run / "cells" / f"{cell['id']}.json").read_text())
+            record = Store(run).read(cell["id"])
             return {p["what"]: run / p["path"] for p in record["pictures"] if p["view"] == view}
     raise SystemExit(f"{run}: no warp of {scene!r} under {variant!r}; make the run with: make demo")
 

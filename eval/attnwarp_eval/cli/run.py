@@ -29,6 +29,13 @@ def run(
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=1, help="Worker processes; 1 stays in this one.")
     ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS|FILE",
+            help="A dask scheduler, tcp://HOST:PORT or its file, whose workers compute.",
+        ),
+    ] = None,
     scenes: Annotated[
         str | None, typer.Option(help="Only these scenes (comma-separated names or paths).")
     ] = None,
@@ -45,11 +52,19 @@ def run(
     """
     from attnwarp_eval.study.study import load_study
 
-    run_study(lambda: load_study(study, scenes=names(scenes), size=size), out, jobs, keep_going)
+    if scheduler is not None and jobs > 1:
+        raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
+    run_study(
+        lambda: load_study(study, scenes=names(scenes), size=size), out, jobs, scheduler, keep_going
+    )
 
 
 def run_study(
-    load: Callable[[], Study], out: Path | None, jobs: int = 1, keep_going: bool = True
+    load: Callable[[], Study],
+    out: Path | None,
+    jobs: int = 1,
+    scheduler: str | None = None,
+    keep_going: bool = True,
 ) -> Results:
     """Run a study and write its report; return what was measured.
 
@@ -57,10 +72,12 @@ def run_study(
         load: reads the study, and says in one line what is wrong with it.
         out: the run's folder; ``runs/<study>`` if None.
         jobs: worker processes.
+        scheduler: address or file of a dask scheduler, whose workers compute instead.
         keep_going: after a failed cell.
     """
     from attnwarp_eval.cache import limit_bytes
     from attnwarp_eval.report import problems, read_results
+    from attnwarp_eval.study.cluster import ClusterLost
     from attnwarp_eval.study.run import plan
     from attnwarp_eval.study.store import Store
 
@@ -78,7 +95,14 @@ def run_study(
                         " so. Name another folder with --out to start afresh.",
                         err=True,
                     )
-                summary = _watch(planned, store, jobs, keep_going)
+                try:
+                    summary = _watch(planned, store, jobs, scheduler, keep_going)
+                except ClusterLost:
+                    raise fail(
+                        f"the connection to the scheduler {scheduler} broke;"
+                        f" {len(store.done())} cells are kept, the same command goes on from here",
+                        TOO_LITTLE,
+                    ) from None
                 _write_report(store)
                 results = read_results(store)
                 uncalibrated = problems(results)
@@ -94,7 +118,9 @@ def run_study(
     return results
 
 
-def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
+def _watch(
+    planned: Plan, store: Store, jobs: int, scheduler: str | None, keep_going: bool
+) -> Summary:
     """Run with a progress bar on a terminal, or a line a cell where there is none."""
     from attnwarp_eval.study.run import execute
 
@@ -114,7 +140,15 @@ def _watch(planned: Plan, store: Store, jobs: int, keep_going: bool) -> Summary:
             if error and show.console.is_terminal:
                 show.line(cell.title + error)
 
-        return execute(planned, store, jobs=jobs, keep_going=keep_going, listen=listen)
+        return execute(
+            planned,
+            store,
+            jobs=jobs,
+            scheduler=scheduler,
+            keep_going=keep_going,
+            listen=listen,
+            notice=show.line,
+        )
 
 
 def _print_failures(summary: Summary) -> None:

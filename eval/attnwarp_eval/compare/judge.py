@@ -221,17 +221,28 @@ def _figures(cells: list[Measured]) -> dict[str, tuple[set[int], set[str]]]:
     return table
 
 
+def _metrics(cells: list[Measured]) -> set[str]:
+    return {key for cell in cells for key in cell.figures}
+
+
 def _rows(
     left: Mapping[Key, list[Measured]], right: Mapping[Key, list[Measured]], exact: bool
 ) -> tuple[Row, ...]:
+    shared: dict[tuple[str, str], list[Key]] = {}
+    for key in sorted(left.keys() & right.keys()):
+        shared.setdefault((key[1], key[2]), []).append(key)
     names = sorted(
         {
-            (key[1], key[2], metric)
-            for key in left.keys() & right.keys()
-            for metric in _figures(left[key]).keys() & _figures(right[key]).keys()
+            (*variant, metric)
+            for variant, keys in shared.items()
+            for key in keys
+            for metric in _metrics(left[key]) & _metrics(right[key])
         }
     )
-    groups = [_Group.of(*name, left, right, exact) for name in names]
+    groups = [
+        _Group.of(probe, variant, metric, shared[probe, variant], left, right, exact)
+        for probe, variant, metric in names
+    ]
     # Without enough scenes a test has no say, so it must not cost the others their power either.
     adjusted = benjamini_hochberg(
         [g.difference.p if g.difference.scenes >= FEWEST_SCENES else math.nan for g in groups]
@@ -264,12 +275,12 @@ class _Group:
         probe: str,
         variant: str,
         key: str,
+        shared: list[Key],
         left: Mapping[Key, list[Measured]],
         right: Mapping[Key, list[Measured]],
         exact: bool,
     ) -> _Group:
         metric = METRICS[key]
-        shared = sorted(k for k in left.keys() & right.keys() if k[1:3] == (probe, variant))
         before, now = (_values(side, shared, key, exact) for side in (left, right))
         size = abs if metric.direction == "zero" else float
         first, second = (

@@ -33,8 +33,10 @@ def _shared(results: Results, apart: set[str]) -> list[Section]:
             next((p for _, p in labelled if p.content == content), None) for content in SHARED
         ]
         rows.append((f"**{scene}, {view}**", [Picture(p.path, p.content) for p in shared if p]))
-        for label in dict.fromkeys(label for label, _ in labelled):
-            own = {p.content: p for other, p in labelled if other == label}
+        by_label: dict[str, dict[str, PictureFile]] = {}
+        for label, picture in labelled:
+            by_label.setdefault(label, {})[picture.content] = picture
+        for label, own in by_label.items():
             others = [content for content in own if content not in (*ORDER, *SHARED)]
             contents = [content for content in (*ORDER, *others) if content in own]
             rows.append((label, [Picture(own[c].path, c.replace("-", " ")) for c in contents]))

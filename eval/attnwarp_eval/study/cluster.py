@@ -1,29 +1,135 @@
-"""Cells on a local cluster of worker processes (dask)."""
+"""Cells on a cluster of worker processes (dask): a local one, or the user's own."""
 
 from __future__ import annotations
 
 import contextlib
+import json
+import logging
 import os
+import queue
 import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from attnwarp.errors import InputError
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.record import Failure
+from attnwarp_eval.study.remote import (
+    Code,
+    Parcel,
+    code_of_worker,
+    compute_and_send,
+    files_of_scene,
+    this_code,
+    unpack,
+)
+from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.work import compute_and_write, failure
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+ATTEMPTS = 2
+"""Workers that a cell may lose. One may die of anything; two that die at the same cell die of it.
+"""
+
+POLL_SECONDS = 0.5
+"""Between two looks at which workers there are."""
+
+CONNECT_SECONDS = 30
+"""Until a scheduler counts as unreachable, at the start and when its connection breaks."""
+
+REFUSED_SECONDS = 60
+"""How long a run waits beside workers that were all refused, as others may be starting."""
+
+MOST_REQUESTS = 1000
+"""Tasks that ask an adaptive cluster for workers; more would only load its scheduler."""
+
+Ended = tuple[Cell, Failure | None]
+"""A cell and what went wrong with it."""
+
+
+class ClusterError(InputError):
+    """A cluster that cannot be used; the message says which and what to do."""
+
+
+class ClusterLost(Exception):  # noqa: N818  the field's word for it
+    """The connection to a cluster broke in the middle of a run."""
+
+
+class Workplace(ABC):
+    """What the runner does with one cluster: hand a cell to a worker, and take its result."""
+
+    adaptive = False
+    """Whether the cluster may start workers when there is work for them."""
+
+    @abstractmethod
+    def submit(self, client: Client, worker: str, cell: Cell) -> Future:
+        """Hand a cell to a worker."""
+
+    @abstractmethod
+    def receive(self, cell: Cell, result: Any) -> Failure | None:
+        """Take what the worker returned; its record is stored after this."""
+
+
+class _Local(Workplace):
+    """Workers on this machine, which write to the run's folder themselves."""
+
+    def __init__(self, root: Path, threads: int) -> None:
+        self.root = str(root.resolve())
+        self.threads = threads
+
+    def submit(self, client: Client, worker: str, cell: Cell) -> Future:
+        # The probe travels with its cell, so that a worker needs no registration.
+        return client.submit(
+            compute_and_write,
+            probe(cell.probe),
+            cell,
+            self.root,
+            self.threads,
+            workers=[worker],
+            pure=False,
+        )
+
+    def receive(self, cell: Cell, result: Any) -> Failure | None:
+        error: Failure | None = result
+        return error
+
+
+class _Remote(Workplace):
+    """Workers anywhere: scenes travel to them, records and pictures come back."""
+
+    adaptive = True
+
+    def __init__(self, store: Store, scenes: Mapping[str, Scene]) -> None:
+        self.store = store
+        self.scenes = scenes
+        self._sent: set[tuple[str, str]] = set()
+
+    def submit(self, client: Client, worker: str, cell: Cell) -> Future:
+        files = None
+        if cell.scene in self.scenes and (worker, cell.scene) not in self._sent:
+            self._sent.add((worker, cell.scene))
+            files = files_of_scene(self.scenes[cell.scene])
+        return client.submit(
+            compute_and_send, probe(cell.probe), cell, files, workers=[worker], pure=False
+        )
+
+    def receive(self, cell: Cell, result: Parcel | Failure) -> Failure | None:
+        return result if isinstance(result, Failure) else unpack(result, self.store)
 
 
 def run_on_workers(
     cells: list[Cell], root: Path, jobs: int, started: Callable[[Cell], None]
-) -> Iterator[tuple[Cell, Failure | None]]:
-    """Compute and write cells, one process a worker, at most one cell in flight per worker.
-
-    A worker that dies takes only the cell it was at: that one is tried once more elsewhere, then
-    reported.
+) -> Generator[Ended]:
+    """Compute and write cells on this machine, one process a worker.
 
     Args:
         cells: what to compute.
@@ -35,7 +141,7 @@ def run_on_workers(
         Each cell as it ends, with what went wrong.
     """
     import dask
-    from distributed import Client, LocalCluster, as_completed
+    from distributed import Client, LocalCluster
 
     threads = max(1, len(os.sched_getaffinity(0)) // jobs)
     # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
@@ -46,56 +152,122 @@ def run_on_workers(
     }
     settings = {
         **memory,
-        "distributed.scheduler.allowed-failures": 1,
         "distributed.worker.memory.terminate": False,
         "distributed.nanny.pre-spawn-environ.OMP_NUM_THREADS": threads,
         "distributed.nanny.pre-spawn-environ.MKL_NUM_THREADS": threads,
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(settings))
-        with _signals_wait():
-            cluster = stack.enter_context(
-                # No memory limit: near one dask pauses a worker for good, since a world's caches
-                # are never given back.
-                LocalCluster(
-                    n_workers=jobs,
-                    processes=True,
-                    threads_per_worker=1,
-                    memory_limit=0,
-                    silence_logs=50,
-                    dashboard_address=None,
-                )
+        with _signals_wait(), _errors_of_dask("the worker processes could not be started"):
+            # No memory limit: near one dask pauses a worker for good, since a world's caches are
+            # never given back.
+            cluster = LocalCluster(
+                n_workers=jobs,
+                processes=True,
+                threads_per_worker=1,
+                memory_limit=0,
+                silence_logs=50,
+                dashboard_address=None,
             )
-        client = stack.enter_context(Client(cluster))
-        queue = _Queue(cells)
-        running: dict[Any, Cell] = {}
-        pool = as_completed()
+            stack.enter_context(_closed(cluster))
+            client = stack.enter_context(_closed(Client(cluster)))
+        yield from _Runner(client, cells, _Local(root, threads), started).run()
 
-        def submit(scene: str | None) -> None:
-            cell = queue.take(scene)
-            if cell is not None:
-                started(cell)
-                # The probe travels with its cell, so that a worker needs no registration.
-                future = client.submit(
-                    compute_and_write,
-                    probe(cell.probe),
-                    cell,
-                    str(root.resolve()),
-                    threads,
-                    pure=False,
-                )
-                running[future.key] = cell
-                pool.add(future)
 
-        for _ in range(jobs):
-            submit(None)
-        for future in pool:
-            cell = running.pop(future.key)
-            if future.status == "error":
-                yield cell, failure(cell, future.exception())
-            else:
-                yield cell, future.result()
-            submit(cell.scene)
+def run_on_scheduler(
+    cells: list[Cell],
+    store: Store,
+    scenes: Mapping[str, Scene],
+    scheduler: str,
+    started: Callable[[Cell], None],
+    notice: Callable[[str], None],
+) -> Generator[Ended]:
+    """Compute cells on the workers of the user's own scheduler, and write them here.
+
+    Args:
+        cells: what to compute.
+        store: the run's folder, which no worker needs to see.
+        scenes: by the names that cells give them.
+        scheduler: its address, such as ``tcp://host:8786``, or its scheduler file.
+        started: called with each cell as it is handed out.
+        notice: called with a line about a worker that joins, is refused or is lost.
+
+    Yields:
+        Each cell as it ends, with what went wrong.
+
+    Raises:
+        ClusterError: the scheduler cannot be reached, or every worker is refused.
+        ClusterLost: the connection to the scheduler broke.
+    """
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_silent())
+        client = stack.enter_context(_closed(_connect(scheduler)))
+        place = _Remote(store, scenes)
+        yield from _Runner(client, cells, place, started, notice, this_code()).run()
+
+
+def _connect(scheduler: str) -> Client:
+    from distributed import Client
+
+    address = scheduler if "://" in scheduler else _address_in(Path(scheduler))
+    try:
+        return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ClusterError(
+            f"--scheduler: no scheduler at {address} ({text}); start one with: dask scheduler"
+        ) from None
+
+
+def _address_in(file: Path) -> str:
+    """The address that a scheduler has written to its file."""
+    try:
+        return str(json.loads(file.read_bytes())["address"])
+    except (OSError, ValueError, LookupError, TypeError):
+        raise ClusterError(
+            f"--scheduler: {str(file)!r} is neither an address such as tcp://host:8786 nor a"
+            f" scheduler file; write one with: dask scheduler --scheduler-file {file}"
+        ) from None
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """dask's log stays away from the command's lines: what matters of it ends in one of these."""
+    import distributed  # makes its loggers
+
+    names = [n for n in logging.root.manager.loggerDict if n.split(".")[0] == distributed.__name__]
+    levels = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+    try:
+        for logger in levels:
+            logger.setLevel(logging.CRITICAL + 1)
+        yield
+    finally:
+        for logger, level in levels.items():
+            logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _closed(resource: Any) -> Iterator[Any]:
+    """Close a client or a cluster at the end.
+
+    What its closing raises is no result: every record is on disk by then, and the error would hide
+    the interrupt that ended the run.
+    """
+    try:
+        yield resource
+    finally:
+        with contextlib.suppress(OSError, RuntimeError):
+            resource.close()
+
+
+@contextlib.contextmanager
+def _errors_of_dask(what: str) -> Iterator[None]:
+    """dask's errors of connections are OSErrors without a file: name what failed instead."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ClusterError(f"{what} ({text}); run again, or with --jobs 1") from None
 
 
 @contextlib.contextmanager
@@ -120,6 +292,208 @@ def _signals_wait() -> Iterator[None]:
             signal.raise_signal(signal.SIGTERM)
 
 
+class _Runner:
+    """Hands cells to the workers of a cluster, one at a time to each.
+
+    A cell is bound to the worker that it is handed to. So a worker stays with the scene whose truth
+    it has computed, a refused one gets nothing, and a worker that is lost takes its own cell alone.
+
+    Args:
+        client: of the cluster.
+        cells: what to compute.
+        place: how a cell travels.
+        started: called with each cell as it is handed out.
+        notice: called with a line about a worker.
+        code: that a worker must have; workers are not asked if None.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        cells: list[Cell],
+        place: Workplace,
+        started: Callable[[Cell], None],
+        notice: Callable[[str], None] = lambda line: None,
+        code: Code | None = None,
+    ) -> None:
+        self.client = client
+        self.place = place
+        self.started = started
+        self.notice = notice
+        self.code = code
+        self.cells = _Queue(cells)
+        self.ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        self.workers: dict[Any, str] = {}  # a task's key -> the address of its worker
+        self.running: dict[str, tuple[Future, Cell]] = {}  # by the worker's address
+        self.asked: dict[str, Future] = {}
+        self.accepted: set[str] = set()
+        self.refused: dict[str, str] = {}
+        self.scene: dict[str, str] = {}
+        self.lost: Counter[str] = Counter()
+        self.requests: list[Future] = []
+
+    def run(self) -> Iterator[Ended]:
+        """Every cell as it ends."""
+        looked = -POLL_SECONDS
+        waiting_since = time.monotonic()
+        while self.cells or self.running:
+            if time.monotonic() - looked >= POLL_SECONDS:
+                yield from self._look_at_workers()
+                looked = time.monotonic()
+                if self.accepted or not self.refused or self.asked:
+                    waiting_since = looked
+                elif looked - waiting_since > REFUSED_SECONDS:
+                    raise ClusterError(
+                        "--scheduler: every worker was refused: "
+                        + "; ".join(sorted(self.refused.values()))
+                    )
+            self._hand_out()
+            with contextlib.suppress(queue.Empty):
+                yield from self._end(self.ended.get(timeout=POLL_SECONDS))
+                while True:
+                    yield from self._end(self.ended.get_nowait())
+
+    def _look_at_workers(self) -> Iterator[Ended]:
+        """Take in new workers, and give up those that are gone."""
+        addresses = self._addresses()
+        for worker in addresses - self.accepted - self.refused.keys() - self.asked.keys():
+            if self.code is None:
+                self.accepted.add(worker)
+            else:
+                question = self.client.submit(code_of_worker, workers=[worker], pure=False)
+                self.asked[worker] = self._watched(worker, question)
+        for worker in (self.accepted | self.refused.keys() | self.asked.keys()) - addresses:
+            yield from self._give_up(worker)
+
+    def _addresses(self) -> set[str]:
+        """Of the workers that the scheduler has."""
+        try:
+            if self.client.status != "running":
+                raise ClusterLost
+            return set(self.client.nthreads())
+        except (OSError, AttributeError, RuntimeError):  # AttributeError: no scheduler any more
+            raise ClusterLost from None
+
+    def _give_up(self, worker: str) -> Iterator[Ended]:
+        """A worker that the scheduler no longer has; the cell that it was at is tried once more."""
+        self.refused.pop(worker, None)
+        self.asked.pop(worker, None)
+        self.accepted.discard(worker)
+        if worker not in self.running:
+            return
+        future, cell = self.running.pop(worker)
+        future.cancel()
+        self.lost[cell.id] += 1
+        if self.lost[cell.id] < ATTEMPTS:
+            self.notice(f"worker {worker} was lost at {cell.title}; the cell is tried once more")
+            self.cells.put_back(cell)
+        else:
+            error = RuntimeError(
+                f"{ATTEMPTS} workers were lost at this cell, the last at {worker}: killed from"
+                " outside, or out of memory"
+            )
+            yield cell, failure(cell, error)
+
+    def _hand_out(self) -> None:
+        """A cell for each worker that has none."""
+        for worker in sorted(self.accepted - self.running.keys()):
+            cell = self.cells.take(self.scene.get(worker))
+            if cell is None:
+                break
+            self.scene[worker] = cell.scene
+            self.started(cell)
+            future = self.place.submit(self.client, worker, cell)
+            self.running[worker] = (self._watched(worker, future), cell)
+        if self.place.adaptive:
+            self._request_workers()
+
+    def _request_workers(self) -> None:
+        """Tell an adaptive cluster how many cells wait.
+
+        Cells that wait here are unknown to the scheduler. So as many tasks wait there, for a
+        resource that no worker has.
+        """
+        wanted = min(len(self.cells), MOST_REQUESTS)
+        missing = wanted - len(self.requests)
+        if missing > 0:
+            self.requests += self.client.map(
+                code_of_worker,
+                [*range(missing)],
+                key="attnwarp-cells-that-wait",
+                resources={"attnwarp: only counted": 1},
+                pure=False,
+            )
+        elif missing < 0:
+            self.client.cancel(self.requests[wanted:])
+            del self.requests[wanted:]
+
+    def _watched(self, worker: str, future: Future) -> Future:
+        self.workers[future.key] = worker
+        future.add_done_callback(self.ended.put)
+        return future
+
+    def _end(self, future: Future) -> Iterator[Ended]:
+        """What a future that is done brings: a cell's result, or a worker's code."""
+        worker = self.workers.pop(future.key)
+        if self.asked.get(worker) is future:
+            self._judge(worker, future)
+            del self.asked[worker]
+            return
+        running, cell = self.running.get(worker, (None, None))
+        if running is not future or cell is None:
+            return  # given up before
+        try:
+            result = self._result(worker, future)
+        except ClusterLost:
+            raise
+        except Exception as error:
+            del self.running[worker]
+            yield cell, failure(cell, error)
+            return
+        if result is not None:
+            del self.running[worker]
+            yield cell, self.place.receive(cell, result[0])
+
+    def _result(self, worker: str, future: Future) -> tuple[Any] | None:
+        """What a future holds; None where its worker is lost before it could be fetched.
+
+        A result stays on its worker until then, and goes with it.
+        """
+        while True:
+            if future.status == "cancelled":
+                raise ClusterLost
+            try:
+                return (future.result(timeout=10),)
+            except TimeoutError:
+                if future.status == "error":
+                    raise
+                if worker not in self._addresses():
+                    return None
+
+    def _judge(self, worker: str, future: Future) -> None:
+        """Accept a worker that has this code, refuse any other."""
+        assert self.code is not None
+        try:
+            result = self._result(worker, future)
+        except ClusterLost:
+            raise
+        except Exception as error:
+            text = f"{type(error).__name__}: {error}"
+            difference = f"it cannot load this version of attnwarp ({text})"
+            name = worker
+        else:
+            if result is None:
+                return
+            code = result[0]
+            difference = code.difference(self.code)
+            name = f"{code.worker} ({worker})" if code.worker != worker else worker
+        if difference:
+            self.refused[worker] = f"worker {name}: {difference}"
+            self.notice(f"worker {name} is refused: {difference}")
+        else:
+            self.accepted.add(worker)
+
+
 class _Queue:
     """Cells by scene. A worker stays with the scene whose truth it has computed, then helps where
     most is left.
@@ -130,15 +504,25 @@ class _Queue:
         for cell in cells:
             self.scenes.setdefault(cell.scene, deque()).append(cell)
         self.started: set[str] = set()
+        self.count = len(cells)
+
+    def __len__(self) -> int:
+        return self.count
+
+    def put_back(self, cell: Cell) -> None:
+        """Put a cell first among those of its scene."""
+        self.scenes.setdefault(cell.scene, deque()).appendleft(cell)
+        self.count += 1
 
     def take(self, scene: str | None) -> Cell | None:
         """The next cell for the worker that last computed one of ``scene``; None when nothing is
         left.
         """
-        left = {name: cells for name, cells in self.scenes.items() if cells}
-        if not left:
+        if not self.count:
             return None
-        if scene not in left:
+        if scene is None or not self.scenes.get(scene):
+            left = {name: cells for name, cells in self.scenes.items() if cells}
             scene = max(left, key=lambda name: (name not in self.started, len(left[name])))
         self.started.add(scene)
-        return left[scene].popleft()
+        self.count -= 1
+        return self.scenes[scene].popleft()

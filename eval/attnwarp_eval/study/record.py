@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
@@ -120,6 +121,10 @@ class Cost:
         return cls(data["seconds"], data["counters"], data["peak_memory_mb"], data["threads"])
 
 
+_environments: dict[tuple[Any, ...], Environment] = {}
+"""Those that were read. A run's records share a few; apart they would fill most of the memory."""
+
+
 @dataclass(frozen=True)
 class Environment:
     """Where a cell was computed.
@@ -146,8 +151,12 @@ class Environment:
 
     @classmethod
     def from_json(cls, data: Json) -> Environment:
-        """From :meth:`to_json`."""
-        return cls(data["versions"], data["machine"], data["git"]["sha"], data["git"]["dirty"])
+        """From :meth:`to_json`; one object for all records of the same environment."""
+        versions, machine, git = data["versions"], data["machine"], data["git"]
+        key = (cls, *versions.items(), *machine.items(), git["sha"], git["dirty"])
+        if key not in _environments:
+            _environments[key] = cls(versions, machine, git["sha"], git["dirty"])
+        return _environments[key]
 
     def same_code(self, other: Environment) -> bool:
         """Whether both were computed by the same state of the source."""
@@ -226,5 +235,7 @@ def finite(figures: Mapping[str, float]) -> dict[str, float | int | None]:
 
 
 def with_nan(figures: Mapping[str, float | int | None]) -> dict[str, float]:
-    """The figures of :func:`finite` again: NaN for null."""
-    return {name: math.nan if value is None else value for name, value in figures.items()}
+    """The figures of :func:`finite` again: NaN for null. The records of a run share the names."""
+    return {
+        sys.intern(name): math.nan if value is None else value for name, value in figures.items()
+    }

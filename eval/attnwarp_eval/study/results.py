@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from attnwarp_eval.statistics.intervals import Interval, interval
@@ -68,19 +69,32 @@ class Results:
 
     def finished(self, probe: str) -> list[tuple[Outcome, Record[Any]]]:
         """The finished cells of a probe with their records, in the study's order."""
-        return [
-            (cell, cell.record)
-            for cell in self.cells
-            if cell.probe == probe and cell.record is not None
-        ]
+        return self._by_probe.get(probe, [])
+
+    @cached_property
+    def _by_probe(self) -> dict[str, list[tuple[Outcome, Record[Any]]]]:
+        table: dict[str, list[tuple[Outcome, Record[Any]]]] = {}
+        for cell in self.cells:
+            if cell.record is not None:
+                table.setdefault(cell.probe, []).append((cell, cell.record))
+        return table
 
     def records(self, probe: str, variant: str) -> list[tuple[str, int, Record[Any]]]:
         """(scene, seed, record) of the finished cells of a variant, in the study's order."""
-        return [
-            (cell.scene, cell.seed, record)
-            for cell, record in self.finished(probe)
-            if variant in cell.variants
-        ]
+        return self._by_variant.get((probe, variant), [])
+
+    @cached_property
+    def _by_variant(self) -> dict[tuple[str, str], list[tuple[str, int, Record[Any]]]]:
+        """A table asks for every variant in turn: a search through all cells each time would take
+        their number squared.
+        """
+        table: dict[tuple[str, str], list[tuple[str, int, Record[Any]]]] = {}
+        for name, cells in self._by_probe.items():
+            for cell, record in cells:
+                for variant in dict.fromkeys(cell.variants):
+                    entry = (cell.scene, cell.seed, record)
+                    table.setdefault((name, variant), []).append(entry)
+        return table
 
     def views(
         self, probe: str, variant: str, metric: str, yaw: tuple[float, float] | None = None

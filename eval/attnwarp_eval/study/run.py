@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from attnwarp_eval.cost import environment
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.cluster import run_on_workers
+from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
 from attnwarp_eval.study.parts import Study, StudyError
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.record import Environment, Failure, Record
@@ -71,16 +71,18 @@ def plan(study: Study, store: Store) -> Plan:
     scenes = _scenes(study)
     cells = cells_of(study, scenes)
     done = store.done()
-    finished: dict[str, Record[Any]] = {}
+    this = Environment.from_json(environment())
+    todo: list[Cell] = []
+    other_code = 0
     for cell in cells:
         if cell.id in done:
             with contextlib.suppress(StoreError):  # a damaged record is computed again
                 record = store.read_as(cell.id, probe(cell.probe).read)
                 if _has_pictures(cell, record, store):
-                    finished[cell.id] = record
-    this = Environment.from_json(environment())
-    other_code = sum(not record.environment.same_code(this) for record in finished.values())
-    return Plan(study, scenes, cells, [c for c in cells if c.id not in finished], other_code)
+                    other_code += not record.environment.same_code(this)
+                    continue
+        todo.append(cell)
+    return Plan(study, scenes, cells, todo, other_code)
 
 
 def _scenes(study: Study) -> dict[str, Scene]:
@@ -113,7 +115,7 @@ def verify(store: Store) -> Problems:
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
-        cells = expected(plan(study, store))["cells"]
+        cells = [_entry(cell) for cell in cells_of(study, _scenes(study))]
     except (InputError, ValidationError) as error:
         text = explain_errors(error) if isinstance(error, ValidationError) else error
         problems.damaged.append(f"the study's cells cannot be listed again: {text}")
@@ -205,8 +207,10 @@ def execute(
     store: Store,
     *,
     jobs: int = 1,
+    scheduler: str | None = None,
     keep_going: bool = True,
     listen: Listener = lambda cell, event, failure: None,
+    notice: Callable[[str], None] = lambda line: None,
 ) -> Summary:
     """Compute the cells that are still to do, writing each as soon as it is finished.
 
@@ -214,8 +218,14 @@ def execute(
         plan: what to do.
         store: the run's folder.
         jobs: worker processes; 1 stays in this process. The numbers do not depend on it.
+        scheduler: address or file of a dask scheduler, whose workers compute instead.
         keep_going: go on after a failed cell; else stop at the first.
         listen: called at every start and end.
+        notice: called with a line about a worker of the scheduler.
+
+    Raises:
+        ClusterError: the scheduler cannot be reached, or every worker is refused.
+        ClusterLost: the connection to the scheduler broke; what had ended is stored.
     """
     start = time.perf_counter()
     store.write_study(expected(plan))
@@ -224,28 +234,31 @@ def execute(
     def started(cell: Cell) -> None:
         listen(cell, "start", None)
 
-    work = (
-        _in_this_process(plan, store, started)
-        if jobs == 1
-        else run_on_workers(plan.todo, store.root, jobs, started)
-    )
-    for cell, failure in work:
-        if failure is None:
-            summary.computed += 1
-            listen(cell, "done", None)
-            continue
-        store.write_failure(cell.id, asdict(failure))
-        summary.failures.append(failure)
-        listen(cell, "failed", failure)
-        if not keep_going:
-            break
+    if scheduler is not None:
+        work = run_on_scheduler(plan.todo, store, plan.scenes, scheduler, started, notice)
+    elif jobs > 1:
+        work = run_on_workers(plan.todo, store.root, jobs, started)
+    else:
+        work = _in_this_process(plan, store, started)
+    # Closed here and now: an interrupt must end the workers before the command ends.
+    with contextlib.closing(work):
+        for cell, failure in work:
+            if failure is None:
+                summary.computed += 1
+                listen(cell, "done", None)
+                continue
+            store.write_failure(cell.id, asdict(failure))
+            summary.failures.append(failure)
+            listen(cell, "failed", failure)
+            if not keep_going:
+                break
     summary.seconds = time.perf_counter() - start
     return summary
 
 
 def _in_this_process(
     plan: Plan, store: Store, started: Callable[[Cell], None]
-) -> Iterator[tuple[Cell, Failure | None]]:
+) -> Generator[tuple[Cell, Failure | None]]:
     for cell in plan.todo:
         started(cell)
         yield cell, compute_and_write(probe(cell.probe), cell, str(store.root))

@@ -1,4 +1,8 @@
-"""A run's folder: one JSON file a cell, written beside its name, flushed to disk, then renamed."""
+"""A run's folder: one JSON file a cell, written beside its name, flushed to disk, then renamed.
+
+Cells lie in folders by the first two digits of their ids, as file systems list folders of 100,000
+files slowly. Former code put them all into one folder; such runs are read and resumed as they are.
+"""
 
 from __future__ import annotations
 
@@ -96,16 +100,20 @@ class Store:
         Raises:
             StoreError: one of its folders is a symbolic link.
         """
-        for name in ("cells", "failed", "pictures", "figures", "fits"):
-            if (self.root / name).is_symlink():
-                raise StoreError(
-                    f"{self.root / name}: is a symbolic link, expected a folder; put the folder"
-                    " in its place"
-                )
+        names = ("cells", "failed", "pictures", "figures", "fits")
+        links = [self.root / name for name in names if (self.root / name).is_symlink()]
+        if not links and self.cells.is_dir():
+            with os.scandir(self.cells) as entries:
+                links = [Path(entry.path) for entry in entries if entry.is_symlink()]
+        if links:
+            raise StoreError(
+                f"{min(links)}: is a symbolic link, expected a folder; put the folder in its place"
+            )
 
     def _sweep(self) -> None:
         """Remove the temporary files of runs that were killed."""
-        for folder in (self.root, self.cells, self.failed, *self.pictures.glob("*/")):
+        folders = (self.root, self.cells, self.failed)
+        for folder in (*folders, *self.cells.glob("*/"), *self.pictures.glob("*/")):
             remove_abandoned(folder)
 
     def write_study(self, study: dict[str, Any]) -> None:
@@ -141,11 +149,22 @@ class Store:
 
     def path(self, cell_id: str) -> Path:
         """The path of a cell's record."""
-        return self.cells / f"{cell_id}.json"
+        name = f"{cell_id}.json"
+        former = self.cells / name
+        return former if former.is_file() else self.cells / cell_id[:2] / name
 
     def done(self) -> set[str]:
         """Ids of the cells that have a record; a record's file is always whole."""
-        return {p.stem for p in self.cells.glob("*.json")} if self.cells.is_dir() else set()
+        ids: set[str] = set()
+        folders = [self.cells] if self.cells.is_dir() else []
+        for folder in folders:
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if entry.name.endswith(".json"):
+                        ids.add(entry.name.removesuffix(".json"))
+                    elif folder == self.cells and entry.is_dir(follow_symlinks=False):
+                        folders.append(self.cells / entry.name)
+        return ids
 
     def write(self, record: dict[str, Any]) -> None:
         """Write the record of a finished cell, and remove a former failure of it.

@@ -79,7 +79,9 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
     entries = collect(["spheres", "glass"], tmp_path, quick)
     # Seconds are among the entry's figures: measured again they would differ.
     assert entries[0] == first and made == ["spheres", "glass", "glass"]
-    (cell,) = (c for c in (tmp_path / "cells").iterdir() if '"name": "glass"' in c.read_text())
+    (cell,) = (
+        c for c in (tmp_path / "cells").rglob("*.json") if '"name": "glass"' in c.read_text()
+    )
     cell.write_bytes(cell.read_bytes()[:-9])
     assert collect(["spheres", "glass"], tmp_path, quick)[0] == first
     assert made[3:] == ["glass"]

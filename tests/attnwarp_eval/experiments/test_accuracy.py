@@ -178,7 +178,7 @@ def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monk
     call = ["scenes", "accuracy", "--rounds", "3", "--out", str(tmp_path)]
     killed = CliRunner().invoke(app, call)
     assert killed.exit_code == 130 and "finished panels are kept" in killed.stderr
-    (record,) = (json.loads(path.read_text()) for path in (tmp_path / "cells").iterdir())
+    (record,) = (json.loads(path.read_text()) for path in (tmp_path / "cells").rglob("*.json"))
     done = CliRunner().invoke(app, call)
     assert done.exit_code == 0 and asked == ["depth", "visibility", "visibility"]
     # Seconds are among a panel's figures: measured again they would differ.

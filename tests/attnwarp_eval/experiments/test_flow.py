@@ -91,7 +91,9 @@ def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_p
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     # A picture that is gone is drawn again; a cell that was changed is measured again.
     (tmp_path / "a" / "bear-5-slip.png").unlink()
-    cell = next(c for c in (tmp_path / "a" / "cells").iterdir() if '"yaw": 20.0' in c.read_text())
+    cell = next(
+        c for c in (tmp_path / "a" / "cells").rglob("*.json") if '"yaw": 20.0' in c.read_text()
+    )
     cell.write_text(cell.read_text().replace("consistency", "consistence", 1))
     assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0
     assert measured == [20, 5, 20, 5, 20] and (tmp_path / "a" / "bear-5-slip.png").is_file()

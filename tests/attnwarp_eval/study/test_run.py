@@ -131,7 +131,7 @@ def test_a_finished_run_has_its_report_numbers_and_pictures_and_verifies(finishe
 def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, undisturbed, folder):
     run = folder / "damaged"
     shutil.copytree(finished, run)
-    victim = next(p for p in (run / "cells").iterdir() if '"depth"' in p.read_text())
+    victim = next(p for p in (run / "cells").rglob("*.json") if '"depth"' in p.read_text())
     victim.write_bytes(victim.read_bytes()[:100])
     assert call("verify", run).exit_code == 3
     assert call("report", run).exit_code == 0
@@ -191,12 +191,12 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     # On a busy machine the run may be over before the signal is sent: then once more.
     for attempt in range(5):
         run = folder / f"interrupted{attempt}"
-        with interrupted(lambda run=run: list((run / "cells").glob("*.json"))):
+        with interrupted(lambda run=run: list((run / "cells").rglob("*.json"))):
             done = call("run", "study.yaml", "--out", run)
         if done.exit_code != 0:
             break
     assert done.exit_code == 130
-    count = len(list((run / "cells").glob("*.json")))
+    count = len(list((run / "cells").rglob("*.json")))
     assert 1 <= count < CELLS
     last = f"interrupted; {count} cells are kept, the same command goes on from here"
     assert done.stderr.splitlines()[-1] == f"attnwarp-eval: {last}"
@@ -219,7 +219,7 @@ def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, fo
 def test_the_instrument_is_calibrated_in_every_run(finished):
     (cell,) = (
         json.loads(p.read_text())
-        for p in (finished / "cells").iterdir()
+        for p in (finished / "cells").rglob("*.json")
         if '"probe": "calibration"' in p.read_text()
     )
     for view in cell["views"]:
@@ -234,11 +234,11 @@ def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, fol
     run = folder / "killed"
     process = start("run", "study.yaml", "--out", run, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
-    while len(list((run / "cells").glob("*.json"))) < 2 and time.monotonic() < deadline:
+    while len(list((run / "cells").rglob("*.json"))) < 2 and time.monotonic() < deadline:
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").glob("*.json")}
+    before = {p.name: p.stat().st_mtime_ns for p in (run / "cells").rglob("*.json")}
     assert 2 <= len(before) < CELLS
     partial = call("verify", run)
     assert partial.exit_code == 3
@@ -246,7 +246,7 @@ def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, fol
     again = call("run", "study.yaml", "--out", run)
     assert again.exit_code == 0, again.stderr
     assert f"{len(before)} already done" in again.stderr
-    assert {name: (run / "cells" / name).stat().st_mtime_ns for name in before} == before
+    assert {name: Store(run).path(name[:-5]).stat().st_mtime_ns for name in before} == before
     assert without_timings(run) == undisturbed
 
 
@@ -255,6 +255,24 @@ def test_two_workers_give_the_same_numbers_as_one_process(undisturbed, folder):
     done = call("run", "study.yaml", "--out", run, "--jobs", "2")
     assert done.exit_code == 0, done.stderr
     assert without_timings(run) == undisturbed
+
+
+def test_the_worker_of_a_scheduler_gives_the_same_numbers_and_pictures(
+    finished, undisturbed, folder
+):
+    from distributed import LocalCluster
+
+    run = folder / "elsewhere"
+    one = {"n_workers": 1, "threads_per_worker": 1, "memory_limit": 0}
+    # The worker is a thread of this process, which costs no start of another.
+    with LocalCluster(processes=False, dashboard_address=None, **one) as cluster:
+        done = call("run", "study.yaml", "--out", run, "--scheduler", cluster.scheduler_address)
+    assert done.exit_code == 0, done.stderr
+    assert done.stderr.count("\n[") == CELLS
+    assert without_timings(run) == undisturbed
+    names = {path.relative_to(finished) for path in finished.glob("pictures/*/*.jpg")}
+    assert names == {path.relative_to(run) for path in run.glob("pictures/*/*.jpg")}
+    assert all((run / name).read_bytes() == (finished / name).read_bytes() for name in names)
 
 
 def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
@@ -266,7 +284,7 @@ def test_a_cell_that_fails_costs_itself_alone_and_exit_code_3(folder):
     done = call("run", "study.yaml", "--out", run)
     assert done.exit_code == 3
     assert "failed cells" in done.stderr
-    assert len(list((run / "cells").iterdir())) == CELLS - 3
+    assert len(list((run / "cells").rglob("*.json"))) == CELLS - 3
     assert len(list((run / "failed").iterdir())) == 3
     assert "Failed cells" in (run / "report.md").read_text()
     assert call("verify", run).exit_code == 3
@@ -284,7 +302,7 @@ def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(undisturbed,
     run = folder / "bereft"
     process = start("run", "study.yaml", "--out", run, "--jobs", "2", stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 300
-    while not list((run / "cells").glob("*.json")) and time.monotonic() < deadline:
+    while not list((run / "cells").rglob("*.json")) and time.monotonic() < deadline:
         time.sleep(0.02)
     workers = [
         pid

@@ -84,16 +84,16 @@ def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_
     deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         started.update(workers(process.pid))
-        if started and (moment == "workers start" or list((run / "cells").glob("*.json"))):
+        if started and (moment == "workers start" or list((run / "cells").rglob("*.json"))):
             break
         time.sleep(0.01)
     process.send_signal(signal.SIGTERM)
     message = process.communicate(timeout=120)[1]
     assert process.returncode == 130
-    kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").glob("*.json")}
+    kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").rglob("*.json")}
     last = f"interrupted; {len(kept)} cells are kept, the same command goes on from here\n"
     assert message.endswith(f"attnwarp-eval: {last}") and "Traceback" not in message
     assert started and not any(map(is_worker, started))
     results = finish(tmp_path, run)
-    assert {name: (run / "cells" / name).stat().st_mtime_ns for name in kept} == kept
+    assert {name: Store(run).path(name[:-5]).stat().st_mtime_ns for name in kept} == kept
     assert results and results == finish(tmp_path, tmp_path / "undisturbed")

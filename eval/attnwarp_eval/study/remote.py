@@ -1,0 +1,186 @@
+"""One cell on a worker that shares no disk with the run's folder."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import attnwarp
+from attnwarp_eval.cost import environment
+from attnwarp_eval.files import write_atomic
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.spec import MeshSpec
+from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.probes.base import Probe
+from attnwarp_eval.study.record import Failure, Json
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.work import compute, failure
+
+
+@dataclass(frozen=True)
+class Code:
+    """What a process computes with.
+
+    Attributes:
+        source: SHA-256 of the source files of both packages.
+        versions: of Python (major and minor) and of the packages that results depend on.
+        worker: its name in the cluster; empty outside one.
+    """
+
+    source: str
+    versions: Mapping[str, str]
+    worker: str = ""
+
+    def difference(self, expected: Code) -> str:
+        """In what a worker's code is another than expected; empty where it is the same."""
+        names = sorted(self.versions.keys() | expected.versions.keys())
+        parts = [
+            f"{name} {self.versions.get(name, 'missing')}, expected"
+            f" {expected.versions.get(name, 'missing')}"
+            for name in names
+            if self.versions.get(name) != expected.versions.get(name)
+        ]
+        if self.source != expected.source:
+            parts.append(f"source {self.source[:12]}, expected {expected.source[:12]}")
+        return "; ".join(parts)
+
+
+def this_code() -> Code:
+    """The code of this process."""
+    versions = dict(environment()["versions"])
+    versions["python"] = "{}.{}".format(*sys.version_info[:2])
+    return Code(_source(), versions)
+
+
+@functools.cache
+def _source() -> str:
+    """SHA-256 of every source file of both packages.
+
+    A revision would not do: an installed copy has none, and files of a checkout change without one.
+    """
+    total = hashlib.sha256()
+    for package in (Path(attnwarp.__file__).parent, Path(__file__).parents[1]):
+        for path in sorted(package.rglob("*.py")):
+            total.update(f"{package.name}/{path.relative_to(package).as_posix()}\n".encode())
+            total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()
+
+
+def code_of_worker(request: int = 0) -> Code:
+    """The code of the worker that this runs on.
+
+    Args:
+        request: tells calls apart.
+    """
+    from distributed import get_worker
+
+    return replace(this_code(), worker=str(get_worker().name))
+
+
+@dataclass(frozen=True)
+class SceneFiles:
+    """A scene's file and its meshes.
+
+    Attributes:
+        entry: the scene's file among them.
+        files: contents by path, all below one folder.
+    """
+
+    entry: str
+    files: Mapping[str, bytes]
+
+
+def files_of_scene(scene: Scene) -> SceneFiles | None:
+    """The files that a scene is read from; None for one made in code.
+
+    A mesh that the scene names by an absolute path stays away: workers must see it there.
+    """
+    if scene.path is None:
+        return None
+    entry = _absolute(scene.path)
+    paths = [entry]
+    for item in scene.spec.objects:
+        if (
+            isinstance(item.shape, MeshSpec)
+            and not Path(item.shape.file).expanduser().is_absolute()
+        ):
+            paths.append(_absolute(scene.mesh_path(item.shape)))
+    base = Path(os.path.commonpath([path.parent for path in paths]))
+    files = {path.relative_to(base).as_posix(): path.read_bytes() for path in paths}
+    return SceneFiles(entry.relative_to(base).as_posix(), files)
+
+
+def _absolute(path: Path) -> Path:
+    """A path without ``..``; links stay, as the files keep their places beside one another."""
+    return Path(os.path.abspath(path))  # noqa: PTH100
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """What a worker sends back of a cell.
+
+    Attributes:
+        record: as :meth:`attnwarp_eval.study.store.Store.write` takes it.
+        pictures: contents by path, relative to the run's folder.
+    """
+
+    record: Json
+    pictures: Mapping[str, bytes]
+
+
+_scenes: dict[str, Path] = {}
+"""Files of the scenes that this worker was sent, by the scene's content."""
+
+
+def compute_and_send(probe: Probe[Any], cell: Cell, scene: SceneFiles | None) -> Parcel | Failure:
+    """Compute one cell on a worker and return what belongs into the run's folder.
+
+    Fits stay on the worker, where later cells want them again.
+
+    Args:
+        probe: of the cell.
+        cell: what to compute.
+        scene: its files; None where this worker has them, or needs none.
+    """
+    from distributed import get_worker
+
+    try:
+        worker = get_worker()
+        root = Path(worker.local_directory) / "attnwarp"
+        content = str(cell.spec.get("scene"))
+        if scene is not None:
+            _scenes[content] = _unpack_scene(scene, root / "scenes" / content[:16])
+        own = replace(cell, scene=str(_scenes[content])) if content in _scenes else cell
+        record = compute(probe, own, root, worker.state.nthreads)
+        names = [picture.path for picture in record.pictures]
+        pictures = {name: (root / name).read_bytes() for name in names}
+        shutil.rmtree(root / "pictures" / cell.id[:16], ignore_errors=True)
+        return Parcel(record.to_json(), pictures)
+    except Exception as error:
+        return failure(cell, error)
+
+
+def _unpack_scene(scene: SceneFiles, folder: Path) -> Path:
+    for name, content in scene.files.items():
+        write_atomic(folder / name, content)
+    return folder / scene.entry
+
+
+def unpack(parcel: Parcel, store: Store) -> Failure | None:
+    """Write a cell that came back into the run's folder: its pictures first, then its record."""
+    for name, content in parcel.pictures.items():
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or path.parts[0] != "pictures":
+            raise ValueError(f"a worker sent a picture outside the run's pictures: {name!r}")
+        write_atomic(store.root / path, content)
+    # The worker's source is this one's, byte for byte; its copy need not know the revision.
+    own = {**parcel.record["environment"], "git": environment()["git"]}
+    store.write({**parcel.record, "environment": own})
+    return None
