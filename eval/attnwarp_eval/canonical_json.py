@@ -47,11 +47,17 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_json(path: Path, value: Any, *, sort_keys: bool = True) -> None:
+def write_json(path: Path, value: Any, *, sort_keys: bool = True, durable: bool = True) -> None:
     """Write ``value`` as JSON that a person can read, atomically.
+
+    Args:
+        path: of the file.
+        value: what JSON has.
+        sort_keys: whether the keys of objects are sorted.
+        durable: see :func:`attnwarp_eval.files.write_atomic`.
 
     Raises:
         ValueError: a number that JSON lacks; see :func:`without_nan`.
     """
     text = json.dumps(value, indent=1, sort_keys=sort_keys, allow_nan=False) + "\n"
-    write_atomic(path, text.encode())
+    write_atomic(path, text.encode(), durable=durable)

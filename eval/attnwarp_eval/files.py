@@ -12,16 +12,24 @@ from attnwarp.io.file import write_atomically
 from attnwarp.io.picture import encode_picture
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes, *, durable: bool = True) -> None:
     """Write so that ``path`` keeps its old content or has all of ``data``, even after a power cut.
 
     Folders that are missing are made.
+
+    Args:
+        path: of the file.
+        data: its content.
+        durable: False does without the flush, which takes milliseconds; after a power cut the file
+            may then be missing or damaged.
 
     Raises:
         OSError: the disk is full, or the folder cannot be written to.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda stream: stream.write(data))
+    write_atomically(path, lambda stream: stream.write(data), durable=durable)
+    if not durable:
+        return
     # The name is the folder's content: it lasts only when the folder is flushed as well.
     folder = os.open(path.parent, os.O_RDONLY)
     try:

@@ -40,17 +40,12 @@ def compare(
     """
     from attnwarp_eval.canonical_json import write_json
     from attnwarp_eval.compare import compare
-    from attnwarp_eval.compare.pictures import pictures_of_run
-    from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.compare.write import as_json, document
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
-    from attnwarp_eval.report import read_results
-    from attnwarp_eval.study.store import Store
 
     with clear_errors():
-        results = read_results(Store(run))
-        measured, pictures = snapshot(results), pictures_of_run(results, run)
+        measured, pictures = _run(run)
         if update:
             _update(baseline, measured, pictures)
             return
@@ -90,18 +85,25 @@ def _page(
     return page(result, changes, why_none)
 
 
-def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
-    """The baseline and its pictures."""
-    from attnwarp.errors import InputError
-    from attnwarp_eval.compare import read_baseline
-    from attnwarp_eval.compare.pictures import pictures_of_baseline, pictures_of_run
+def _run(folder: Path) -> tuple[Snapshot, Pictures]:
+    """A run and its pictures; its records, which are many times as large, are given back."""
+    from attnwarp_eval.compare.pictures import pictures_of_run
     from attnwarp_eval.compare.snapshot import snapshot
     from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
+    results = read_results(Store(folder))
+    return snapshot(results), pictures_of_run(results, folder)
+
+
+def _baseline(path: Path, run: Snapshot) -> tuple[Snapshot, Pictures]:
+    """The baseline and its pictures."""
+    from attnwarp.errors import InputError
+    from attnwarp_eval.compare import read_baseline
+    from attnwarp_eval.compare.pictures import pictures_of_baseline
+
     if path.is_dir():
-        results = read_results(Store(path))
-        trusted, pictures = snapshot(results), pictures_of_run(results, path)
+        trusted, pictures = _run(path)
         if trusted.missing:
             raise InputError(
                 f"{path}: {len(trusted.missing)} cells are missing, so it is no baseline; run its"
