@@ -1,5 +1,6 @@
 """Signals and output that cannot be written. Oracles: exit codes of processes, lines on stderr."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -7,6 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from attnwarp_eval.cli.shell import file_error
 
 PRINTS = [sys.executable, "-m", "attnwarp_eval.cli.main", "cache", "info"]
 
@@ -82,3 +85,11 @@ def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
         )
         os.close(writing)
     assert done.returncode == expected
+
+
+def test_an_error_of_a_connection_does_not_blame_the_disk():
+    assert file_error(TimeoutError()) == (
+        "a connection between processes failed (TimeoutError); run the same command again"
+    )
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/study.json")
+    assert file_error(full).startswith("run/study.json: No space left on device; check the path")

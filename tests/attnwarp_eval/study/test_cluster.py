@@ -18,6 +18,7 @@ import attnwarp
 import attnwarp_eval
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
+from attnwarp_eval.study import cluster as cluster_module
 from attnwarp_eval.study.store import Store
 
 ROOT = pathlib.Path(attnwarp.__file__).parents[1]
@@ -220,6 +221,17 @@ def test_a_run_whose_scheduler_is_lost_says_so_and_goes_on_from_there(home, clus
     again, log = run(home, "lost")
     assert again.wait(300) == 0
     assert f"{count} already done" in log.read_text()
+
+
+def test_a_cluster_that_closes_badly_does_not_hide_the_interrupt():
+    class Stuck:
+        """As dask's cluster on a busy machine."""
+
+        def close(self):
+            raise TimeoutError
+
+    with pytest.raises(KeyboardInterrupt), cluster_module._closed(Stuck()):
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize(

@@ -69,16 +69,22 @@ def finish(folder, run):
 
 
 @pytest.mark.parametrize(
-    "moment", ["a cell is written", pytest.param("workers start", marks=pytest.mark.slow)]
+    ("moment", "send"),
+    [
+        ("a cell is written", os.kill),
+        pytest.param("workers start", os.kill, marks=pytest.mark.slow),
+        # As a batch system does: to the command and to its workers.
+        pytest.param("a cell is written", os.killpg, marks=pytest.mark.slow),
+    ],
 )
 def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_them(
-    tmp_path, moment
+    tmp_path, moment, send
 ):
     (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY))
     run = tmp_path / "killed"
     process = subprocess.Popen(
         command(run), cwd=tmp_path, env=WITHOUT_GIT, text=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
     started = set()
     deadline = time.monotonic() + 300
@@ -87,7 +93,7 @@ def test_a_polite_kill_of_a_run_on_workers_says_what_is_kept_and_leaves_none_of_
         if started and (moment == "workers start" or list((run / "cells").rglob("*.json"))):
             break
         time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
+    send(process.pid, signal.SIGTERM)
     message = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     kept = {path.name: path.stat().st_mtime_ns for path in (run / "cells").rglob("*.json")}
