@@ -208,9 +208,11 @@ def run_on_scheduler(
 
 def _connect(scheduler: str) -> Client:
     from distributed import Client
+    from distributed.comm.registry import get_backend
 
     address = scheduler if "://" in scheduler else _address_in(Path(scheduler))
     try:
+        get_backend(address.partition("://")[0])  # a Client of an unknown one cannot be closed
         return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         text = " ".join(str(error).split()) or type(error).__name__
@@ -423,7 +425,7 @@ class _Runner:
                 resources={"attnwarp: only counted": 1},
                 pure=False,
             )
-        elif missing < 0:
+        elif -missing > wanted // 10:  # seldom, as each time waits for the scheduler
             self.client.cancel(self.requests[wanted:])
             del self.requests[wanted:]
 
@@ -434,6 +436,8 @@ class _Runner:
 
     def _end(self, future: Future) -> Iterator[Ended]:
         """What a future that is done brings: a cell's result, or a worker's code."""
+        from distributed.scheduler import KilledWorker
+
         worker = self.workers.pop(future.key)
         if self.asked.get(worker) is future:
             self._judge(worker, future)
@@ -446,6 +450,9 @@ class _Runner:
             result = self._result(worker, future)
         except ClusterLost:
             raise
+        except KilledWorker:  # of a scheduler that gives a task up at the first lost worker
+            yield from self._give_up(worker)
+            return
         except Exception as error:
             del self.running[worker]
             yield cell, failure(cell, error)

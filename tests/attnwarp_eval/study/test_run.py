@@ -257,15 +257,16 @@ def test_two_workers_give_the_same_numbers_as_one_process(undisturbed, folder):
     assert without_timings(run) == undisturbed
 
 
-def test_the_worker_of_a_scheduler_gives_the_same_numbers_and_pictures(
+def test_an_adaptive_cluster_starts_a_worker_that_gives_the_same_numbers_and_pictures(
     finished, undisturbed, folder
 ):
     from distributed import LocalCluster
 
     run = folder / "elsewhere"
-    one = {"n_workers": 1, "threads_per_worker": 1, "memory_limit": 0}
-    # The worker is a thread of this process, which costs no start of another.
-    with LocalCluster(processes=False, dashboard_address=None, **one) as cluster:
+    none = {"n_workers": 0, "threads_per_worker": 1, "memory_limit": 0}
+    # Workers are threads of this process, which costs no start of another.
+    with LocalCluster(processes=False, dashboard_address=None, **none) as cluster:
+        cluster.adapt(minimum=0, maximum=1, interval="50ms")
         done = call("run", "study.yaml", "--out", run, "--scheduler", cluster.scheduler_address)
     assert done.exit_code == 0, done.stderr
     assert done.stderr.count("\n[") == CELLS

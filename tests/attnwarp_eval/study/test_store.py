@@ -54,6 +54,27 @@ def test_nan_cannot_hide_in_canonical_json():
         canonical_json({"x": float("nan")})
 
 
+def test_a_run_of_former_code_in_one_folder_is_read_and_resumed_where_it_is(tmp_path):
+    store = Store(tmp_path)
+    store.write(record())
+    new = tmp_path / "cells" / record()["id"][:2] / f"{record()['id']}.json"
+    whole, former = new.read_bytes(), tmp_path / "cells" / new.name
+    new.rename(former)
+    assert store.done() == {record()["id"]}
+    assert store.read(record()["id"])["summary"] == {"x": 1.5}
+    former.write_bytes(whole[:20])
+    store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})
+    assert former.read_bytes() == whole and not new.exists()
+
+
+def test_a_folder_of_cells_that_is_a_link_is_refused(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run" / "cells").mkdir(parents=True)
+    (tmp_path / "run" / "cells" / record()["id"][:2]).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(StoreError, match="is a symbolic link"), Store(tmp_path / "run").lock():
+        pass
+
+
 def test_a_record_reads_back_as_written(tmp_path):
     store = Store(tmp_path)
     store.write(record())

@@ -300,8 +300,9 @@ CASES = [
         bounds={
             "forward": Bound(
                 "steps of the type",
-                4,
-                "five sums of the layer, four taps and two products, each rounded by half a step",
+                16,
+                "a place of up to 16 px is rounded by 8 steps of float64; times 0.6, and 2 from tap"
+                " to tap; a dozen sums and products, each rounded by half a step",
             )
         },
         ways=ways("reference", "cpu"),
