@@ -256,7 +256,7 @@ class EditingProbe(Probe[EditResult]):
         encoders = sensitivity.encoder_identities(wanted)
         sources = {str(kind): name for kind, name in wanted.encoders.items()}
         for name, scene in scenes.items():
-            edits = list(_edits(study, scene))
+            edits = list(edits_of(study, scene))
             for label in names:
                 variant = study.variants[label]
                 names_of = {"editor": editor_of(study, variant).name}
@@ -333,11 +333,11 @@ class EditingProbe(Probe[EditResult]):
                 work.cell.scene, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
             )
         with meter.stage("splats"):
-            before = self._splats(work)
+            before = splats_of(work)
         with meter.stage("setup"):
             encoders = sensitivity.loaded(work.cell.sources, spec["encoders"])
         budget = self._budget(work, truth, names)
-        result = self._run(work, truth, names, before, budget)
+        result = run_method(work, truth, names, before, budget)
         STOPWATCH.note(_decisive(spec), _own_seconds(result))
         for part, seconds in result.seconds.items():
             meter.add(f"method: {part}", seconds)
@@ -349,33 +349,6 @@ class EditingProbe(Probe[EditResult]):
             return extra
         given = work.cell.sources.get("reference")
         return replace(extra, budget=Spent(budget.seconds, given, budget.network_rows, result.cut))
-
-    def _run(
-        self,
-        work: Work,
-        truth: EditTruth,
-        names: Sequence[str],
-        before: Gaussians,
-        budget: Budget | None,
-    ) -> EditedScene:
-        """The method of the work's cell."""
-        spec, world = work.spec, work.world
-        with work.meter.stage("setup"):
-            editor = load(work.cell.sources["editor"], spec["editor"])
-        with tempfile.TemporaryDirectory() as folder:
-            job = Job(
-                before,
-                [world.camera(name) for name in names],
-                [truth.originals[name] for name in names],
-                editor,
-                spec["edit"]["target" if editor.guide == "depth" else "instruction"],
-                spec["settings"],
-                Path(folder),
-                _warps(work, before, names),
-                {a: [views[n] for n in names] for a, views in truth.answers.items()},
-                budget,
-            )
-            return METHODS[spec["method"]].run(job)
 
     def _budget(self, work: Work, truth: EditTruth, names: Sequence[str]) -> Budget | None:
         """Limits of the work's method; a variant whose seconds are the limit is run if need be."""
@@ -393,17 +366,11 @@ class EditingProbe(Probe[EditResult]):
 
             def run() -> float:
                 limits = self._budget(other, truth, names)
-                return _own_seconds(self._run(other, truth, names, self._splats(other), limits))
+                return _own_seconds(run_method(other, truth, names, splats_of(other), limits))
 
             with work.meter.stage("budget"):
                 seconds = STOPWATCH.seconds(_decisive(cell.spec), run)
         return Budget(seconds, given.get("network_rows"))
-
-    def _splats(self, work: Work) -> Gaussians:
-        if "fit" in work.spec:
-            return fit.fit_of(work).gaussians
-        spec = work.spec
-        return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
 
     def read_extra(self, data: Json) -> EditResult:
         """From the record's entry ``edit``."""
@@ -435,6 +402,49 @@ class EditingProbe(Probe[EditResult]):
     def gallery(self, results: Results) -> Section | None:
         """Edited views side by side."""
         return editing_sections.side_by_side(results, self.name)
+
+
+def run_method(
+    work: Work,
+    truth: EditTruth,
+    names: Sequence[str],
+    before: Gaussians,
+    budget: Budget | None = None,
+) -> EditedScene:
+    """Edit a scene by the method of a cell.
+
+    Args:
+        work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
+        truth: of the edit.
+        names: of the views, the source first.
+        before: the splats to edit.
+        budget: limits of the method.
+    """
+    spec, world = work.spec, work.world
+    with work.meter.stage("setup"):
+        editor = load(work.cell.sources["editor"], spec["editor"])
+    with tempfile.TemporaryDirectory() as folder:
+        job = Job(
+            before,
+            [world.camera(name) for name in names],
+            [truth.originals[name] for name in names],
+            editor,
+            spec["edit"]["target" if editor.guide == "depth" else "instruction"],
+            spec["settings"],
+            Path(folder),
+            _warps(work, before, names),
+            {a: [views[n] for n in names] for a, views in truth.answers.items()},
+            budget,
+        )
+        return METHODS[spec["method"]].run(job)
+
+
+def splats_of(work: Work) -> Gaussians:
+    """The splats that a cell's spec names: fitted, or sampled."""
+    if "fit" in work.spec:
+        return fit.fit_of(work).gaussians
+    spec = work.spec
+    return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
 
 
 class _Measure:
@@ -737,7 +747,7 @@ def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:
     return _loaded(name, tuple((kind, value) for kind, value in given if value is not None))
 
 
-def _edits(study: Study, scene: Scene) -> Iterator[Json]:
+def edits_of(study: Study, scene: Scene) -> Iterator[Json]:
     """What of a scene's edits decides a cell.
 
     Raises:
