@@ -6,7 +6,17 @@ import sys
 
 import typer
 
-from attnwarp_eval.cli import cache, compare, doctor, inspect, metrics, run, scenes, stability
+from attnwarp_eval.cli import (
+    cache,
+    compare,
+    doctor,
+    inspect,
+    metrics,
+    run,
+    scenes,
+    stability,
+    userstudy,
+)
 from attnwarp_eval.cli.shell import (
     CLOSED_PIPE,
     CRASH,
@@ -45,6 +55,7 @@ for command in (
 ):
     app.command()(command)
 app.add_typer(scenes.app, name="scenes")
+app.add_typer(userstudy.app, name="userstudy")
 app.add_typer(cache.app, name="cache")
 
 

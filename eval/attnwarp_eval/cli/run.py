@@ -45,6 +45,9 @@ def run(
     keep_going: Annotated[
         bool, typer.Option("--keep-going/--fail-fast", help="After a failed cell.")
     ] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Count what would be measured, and run nothing.")
+    ] = False,
 ) -> None:
     """Run a study and write its report.
 
@@ -52,10 +55,45 @@ def run(
     """
     from attnwarp_eval.study.study import load_study
 
+    def load() -> Study:
+        return load_study(study, scenes=names(scenes), size=size)
+
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
-    run_study(
-        lambda: load_study(study, scenes=names(scenes), size=size), out, jobs, scheduler, keep_going
+    if dry_run:
+        _print_plan(load, out)
+    else:
+        run_study(load, out, jobs, scheduler, keep_going)
+
+
+def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
+    """The cells of a study by probe and variant, and how many of them are done."""
+    from rich.console import Console
+
+    from attnwarp_eval.document.model import Table
+    from attnwarp_eval.document.write import terminal
+    from attnwarp_eval.study.run import plan
+    from attnwarp_eval.study.store import Store
+
+    with clear_errors():
+        loaded = load()
+        store = Store(out or Path("runs") / loaded.name)
+        planned = plan(loaded, store)
+    todo = {cell.id for cell in planned.todo}
+    rows: dict[tuple[str, str], list[bool]] = {}
+    for cell in planned.cells:
+        rows.setdefault((cell.probe, " = ".join(cell.labels) or cell.variant), []).append(
+            cell.id not in todo
+        )
+    table = Table(
+        ["probe", "variant", "cells", "done"],
+        [[*key, str(len(done)), str(sum(done))] for key, done in rows.items()],
+    )
+    Console().print(terminal(table))
+    scenes = f"scenes {', '.join(loaded.scenes)}; " if loaded.scenes else ""
+    typer.echo(
+        f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
+        f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
 
 

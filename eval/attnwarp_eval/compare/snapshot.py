@@ -39,6 +39,8 @@ class Measured:
         definition: hash of all that decides its figures but the seed.
         counters: of work.
         figures: gated metrics by key.
+
+    A cell whose figures depend on the machine has neither counters nor figures.
     """
 
     scene: str
@@ -120,7 +122,9 @@ def snapshot(results: Results) -> Snapshot:
 
 
 def _measured(cell: Outcome, record: Record[Any]) -> Measured:
-    keys = sorted({key for view in record.views for key in view.metrics if gated(key)})
+    repeatable = probe(cell.probe).repeatable(record)
+    names = {key for view in record.views for key in view.metrics} if repeatable else set()
+    keys = sorted(filter(gated, names))
     figures = {
         key: Figure(
             probe(cell.probe).metric(key).version,
@@ -138,7 +142,7 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
         cell.variants,
         cell.seed,
         definition(record.spec),
-        dict(record.cost.counters),
+        dict(record.cost.counters) if repeatable else {},
         figures,
     )
 

@@ -76,22 +76,42 @@ def _pictures(report: Report) -> set[str]:
 def _embedder(report: Report, root: Path) -> Callable[[str], str]:
     """What writes a file into the page; pictures are made smaller where all are too large."""
     pictures = _pictures(report)
-    total = sum((root / path).stat().st_size for path in pictures)
-    scale = min(1.0, 0.9 * math.sqrt(LARGEST / total)) if total > LARGEST else 1.0
+    scale = reduction(sum((root / path).stat().st_size for path in pictures))
 
     @functools.cache
     def embed(path: str) -> str:
         kind = mimetypes.guess_type(path)[0] or "application/octet-stream"
         data = (root / path).read_bytes()
         if path in pictures and scale < 1:
-            kind, data = "image/jpeg", _reduced(data, scale)
+            kind, data = "image/jpeg", reduced(data, scale)
         return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
     return embed
 
 
-def _reduced(data: bytes, scale: float) -> bytes:
-    """A picture's file with its sides scaled, as JPEG."""
+def reduction(total: int) -> float:
+    """Scale of the sides of a page's pictures, 1 where they may stay as they are.
+
+    Args:
+        total: bytes of all pictures.
+
+    Example:
+        >>> reduction(LARGEST), reduction(4 * LARGEST)
+        (1.0, 0.45)
+    """
+    return min(1.0, 0.9 * math.sqrt(LARGEST / total)) if total > LARGEST else 1.0
+
+
+def reduced(data: bytes, scale: float) -> bytes:
+    """A picture's file with its sides scaled, as JPEG.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.io.picture import encode_picture
+        >>> data = encode_picture(np.zeros((32, 32, 3), np.uint8), ".png")
+        >>> reduced(data, 0.5)[:2].hex()  # where every JPEG begins
+        'ffd8'
+    """
     from PIL import Image
 
     with Image.open(io.BytesIO(data)) as picture:

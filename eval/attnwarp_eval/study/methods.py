@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from attnwarp.baselines import Budget
     from attnwarp.camera import Camera
     from attnwarp.editing.editor import Editor
     from attnwarp.gaussians import Gaussians
@@ -39,6 +40,7 @@ class Job:
         warps: the warp from the source to a target by their numbers, in place of the method's own.
         truth: the true edited views by answer, in the order of ``cameras``. Only methods that
             bound others may look at it.
+        budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
     """
 
     gaussians: Gaussians
@@ -50,6 +52,7 @@ class Job:
     folder: Path
     warps: Callable[[int, int], WarpedView] | None
     truth: Mapping[str, Sequence[Image]]
+    budget: Budget | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +65,14 @@ class EditedScene:
             method did not edit are left out.
         seconds: by part. ``edit``, ``source``, ``warp`` and ``tune`` are the method's own work.
         counters: of work, such as ``network_rows``.
+        cut: the limit of the budget that ended the method; None for a whole run.
     """
 
     gaussians: Gaussians
     edited: Mapping[int, Bytes]
     seconds: Mapping[str, float]
     counters: Mapping[str, float]
+    cut: str | None = None
 
 
 @dataclass(frozen=True)
@@ -78,10 +83,12 @@ class Method:
         settings: complete settings as JSON, from a preset's name, the fields of a study and a
             variant, and the seed. ValueError: an unknown field or a value out of range.
         run: the method.
+        takes_budget: whether it can be cut short by a budget.
     """
 
     settings: Callable[[str, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
+    takes_budget: bool = False
 
 
 def _propagate_settings(name: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -161,10 +168,13 @@ def _baseline(name: str) -> Method:
             job.instruction,
             baselines.preset(name, **fields),
             folder=job.folder,
+            budget=job.budget or baselines.Budget(),
         )
-        return EditedScene(result.gaussians, result.edited, result.seconds, result.counters)
+        return EditedScene(
+            result.gaussians, result.edited, result.seconds, result.counters, result.cut
+        )
 
-    return Method(settings, run)
+    return Method(settings, run, takes_budget=True)
 
 
 METHODS: dict[str, Method] = {

@@ -1,7 +1,8 @@
 """The probes, one file each; other code finds them here by name.
 
 >>> [probe.name for probe in probes()]
-['calibration', 'depth', 'editing', 'fit', 'sensitivity', 'stability', 'timing', 'warp']
+['calibration', 'depth', 'editing', 'fit', 'sensitivity', 'stability', 'timing', 'variability',
+ 'warp']
 >>> probe("depth").columns["AbsRel"]
 'depth.abs_rel'
 """

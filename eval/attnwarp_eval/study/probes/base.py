@@ -251,6 +251,10 @@ class Probe(ABC, Generic[E]):
         """The specification of a figure. KeyError: this probe gives no such figure."""
         return self.metrics[key]
 
+    def repeatable(self, record: Record[E]) -> bool:
+        """Whether another machine gives the same figures; else no comparison of runs reads them."""
+        return True
+
     # From records to the report
 
     def problems(self, results: Results) -> list[str]:

@@ -27,10 +27,12 @@ from attnwarp import check
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.cost import Meter
 from attnwarp_eval.document.model import Section
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.fitted import surface_error
 from attnwarp_eval.study import pictures
+from attnwarp_eval.study.budgets import BudgetPart, Spent, Stopwatch, timed
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import (
     EditTruth,
@@ -44,12 +46,13 @@ from attnwarp_eval.study.methods import METHODS, EditedScene, Job
 from attnwarp_eval.study.parts import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
-from attnwarp_eval.study.record import Json, with_nan
+from attnwarp_eval.study.record import Json, Record, with_nan
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.world import splats
 
 if TYPE_CHECKING:
+    from attnwarp.baselines import Budget
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.gaussians import Gaussians
@@ -64,6 +67,9 @@ FIDELITY = ("psnr", "mse", "ssim")
 """Figures of :func:`attnwarp_eval.metrics.fidelity` that a record has, of the whole picture and
 inside the edited object."""
 
+
+STOPWATCH = Stopwatch()
+"""Seconds of the methods that this process has run."""
 
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
 """What the variant for a given time is chosen by; less is better."""
@@ -111,7 +117,7 @@ class VariantPart(Part):
     ``options`` are fields of the method's settings, over the study's; ``preset`` among them names
     its preset, else the variant's. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``fitted`` takes splats that are fitted to
-    true pictures (keys ``fit``) in place of sampled ones.
+    true pictures (keys ``fit``) in place of sampled ones. ``budget`` cuts the method short.
     """
 
     method: str = "propagate"
@@ -119,6 +125,7 @@ class VariantPart(Part):
     mask: Literal["rules", "truth"] = "rules"
     fitted: bool = False
     editor: EditorPart | None = None
+    budget: BudgetPart | None = None
 
 
 @dataclass(frozen=True)
@@ -135,6 +142,7 @@ class EditResult:
         edit_psnr: dB, edited views against renders, pooled, where a surface shows.
         edited: number of edited views.
         injected: mean share of the targets' pixels that got features; 0 without a warp.
+        budget: of the method; None for none.
     """
 
     name: str
@@ -146,10 +154,14 @@ class EditResult:
     edit_psnr: float
     edited: int
     injected: float
+    budget: Spent | None = None
 
     def to_json(self) -> Json:
         """The record's entry ``edit``."""
-        return {"edit": dict(without_nan(asdict(self)))}
+        data = dict(without_nan(asdict(self)))
+        if self.budget is None:
+            del data["budget"]
+        return {"edit": data}
 
     @classmethod
     def from_json(cls, data: Json) -> EditResult:
@@ -162,7 +174,9 @@ class EditResult:
             )
             for key in ("source", "alone")
         }
-        return cls(**{**data, **judgements, **with_nan({"edit_psnr": data["edit_psnr"]})})
+        own = with_nan({"edit_psnr": data["edit_psnr"]})
+        budget = {"budget": Spent(**data["budget"])} if data.get("budget") else {}
+        return cls(**{**data, **judgements, **own, **budget})
 
 
 @register
@@ -209,11 +223,28 @@ class EditingProbe(Probe[EditResult]):
         part = study.part(StudyPart).editing
         study.check_variants(part.by_yaw, "editing.by_yaw", self.name)
         study.check_variants(part.choice, "editing.choice", self.name)
+        for name, variant in study.variants.items():
+            budget = variant.part(VariantPart).budget
+            if budget is None or budget.seconds_of is None:
+                continue
+            key = f"variants.{name}.budget.seconds_of"
+            study.check_variants([budget.seconds_of], key)
+            other = study.variants[budget.seconds_of].part(VariantPart).budget
+            if other is not None and other.seconds_of is not None:
+                raise ValueError(
+                    f"{key}: {budget.seconds_of!r} has seconds_of itself; name a variant that has"
+                    " none"
+                )
 
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Settings are refused even where nothing is edited."""
         own = variant.part(VariantPart)
         check.one_of(own.method, list(METHODS), "method")
+        if own.budget is not None and not METHODS[own.method].takes_budget:
+            able = ", ".join(repr(name) for name, method in METHODS.items() if method.takes_budget)
+            raise ValueError(
+                f"budget: method {own.method!r} runs to its end; methods with a budget are {able}"
+            )
         if self.name in study.probes or own.options or study.part(StudyPart).editing.options:
             settings_of(study, variant, 0)
 
@@ -225,10 +256,15 @@ class EditingProbe(Probe[EditResult]):
         encoders = sensitivity.encoder_identities(wanted)
         sources = {str(kind): name for kind, name in wanted.encoders.items()}
         for name, scene in scenes.items():
-            edits = list(_edits(study, scene))
+            edits = list(edits_of(study, scene))
             for label in names:
                 variant = study.variants[label]
-                editor = editor_of(study, variant)
+                names_of = {"editor": editor_of(study, variant).name}
+                reference = _reference(variant)
+                if reference is not None:
+                    names_of["reference"] = reference
+                    other = study.variants[reference]
+                    names_of["reference editor"] = editor_of(study, other).name
                 for seed, edit in itertools.product(study.seeds, edits):
                     spec = {
                         **self.common_spec(study, scene, seed),
@@ -241,7 +277,7 @@ class EditingProbe(Probe[EditResult]):
                     yield Cell(
                         spec, name, label, self.name, seed, (label,),
                         tuple(f"{edit['name']}/{view}" for view in views),
-                        {**sources, "editor": editor.name},
+                        {**sources, **names_of},
                     )  # fmt: skip
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
@@ -259,7 +295,20 @@ class EditingProbe(Probe[EditResult]):
                 if own.fitted
                 else {"splats": study.splats_of(variant).model_dump()}
             ),
+            **self._budget_spec(study, variant, seed),
         }
+
+    def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
+        """Limits of the method; for the seconds of another variant, all that decides its run."""
+        part = variant.part(VariantPart).budget
+        if part is None:
+            return {}
+        budget = part.model_dump(exclude_none=True)
+        reference = _reference(variant)
+        if reference is not None:
+            other = study.variants[reference]
+            budget["seconds_of"] = self.variant_spec(study, other, seed)
+        return {"budget": budget}
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Everything that decides a cell but for its seed."""
@@ -269,7 +318,8 @@ class EditingProbe(Probe[EditResult]):
             splats_from = fit.fit_spec(study, variant, 0)
         settings = settings_of(study, variant, 0)
         return (
-            own.method, settings, variant.geometry, own.mask, splats_from, editor_of(study, variant)
+            own.method, settings, variant.geometry, own.mask, splats_from,
+            editor_of(study, variant), own.budget,
         )  # fmt: skip
 
     # From a cell to its record
@@ -283,46 +333,61 @@ class EditingProbe(Probe[EditResult]):
                 work.cell.scene, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
             )
         with meter.stage("splats"):
-            before = self._splats(work)
+            before = splats_of(work)
         with meter.stage("setup"):
             encoders = sensitivity.loaded(work.cell.sources, spec["encoders"])
-            editor = load(work.cell.sources["editor"], spec["editor"])
-        with tempfile.TemporaryDirectory() as folder:
-            job = Job(
-                before,
-                [world.camera(name) for name in names],
-                [truth.originals[name] for name in names],
-                editor,
-                spec["edit"]["target" if editor.guide == "depth" else "instruction"],
-                spec["settings"],
-                Path(folder),
-                _warps(work, before, names),
-                {a: [views[n] for n in names] for a, views in truth.answers.items()},
-            )
-            result = METHODS[spec["method"]].run(job)
+        budget = self._budget(work, truth, names)
+        result = run_method(work, truth, names, before, budget)
+        STOPWATCH.note(_decisive(spec), _own_seconds(result))
         for part, seconds in result.seconds.items():
             meter.add(f"method: {part}", seconds)
-        meter.add("whole", sum(result.seconds.get(part, 0.0) for part in OWN_WORK))
+        meter.add("whole", _own_seconds(result))
         meter.count(**{k: int(v) for k, v in result.counters.items() if k != "injected"})
         with meter.stage("checks"):
-            return _Measure(work, truth, names, before, result, encoders).record()
+            extra = _Measure(work, truth, names, before, result, encoders).record()
+        if budget is None:
+            return extra
+        given = work.cell.sources.get("reference")
+        return replace(extra, budget=Spent(budget.seconds, given, budget.network_rows, result.cut))
 
-    def _splats(self, work: Work) -> Gaussians:
-        if "fit" in work.spec:
-            return fit.fit_of(work).gaussians
-        spec = work.spec
-        return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
+    def _budget(self, work: Work, truth: EditTruth, names: Sequence[str]) -> Budget | None:
+        """Limits of the work's method; a variant whose seconds are the limit is run if need be."""
+        from attnwarp.baselines import Budget
+
+        given = work.spec.get("budget")
+        if given is None:
+            return None
+        seconds = given.get("seconds")
+        if "seconds_of" in given:
+            shared = {k: work.spec[k] for k in _SHARED if k in work.spec}
+            sources = {**work.cell.sources, "editor": work.cell.sources["reference editor"]}
+            cell = replace(work.cell, spec={**shared, **given["seconds_of"]}, sources=sources)
+            other = Work(cell, work.root, work.scene_world, Meter())
+
+            def run() -> float:
+                limits = self._budget(other, truth, names)
+                return _own_seconds(run_method(other, truth, names, splats_of(other), limits))
+
+            with work.meter.stage("budget"):
+                seconds = STOPWATCH.seconds(_decisive(cell.spec), run)
+        return Budget(seconds, given.get("network_rows"))
 
     def read_extra(self, data: Json) -> EditResult:
         """From the record's entry ``edit``."""
         return EditResult.from_json(data["edit"])
 
+    def repeatable(self, record: Record[EditResult]) -> bool:
+        """Not where seconds limited the method."""
+        return not timed(record.spec)
+
     def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
-        """What the editor can do, figures by yaw, time by part."""
+        """What the editor can do, budgets, figures by yaw, time by part."""
         if not results.finished(self.name):
             return
         yield Place.INSTRUMENT, editing_sections.abilities(results, self.name)
         part = results.study.part(StudyPart).editing
+        if (section := editing_sections.budgets(results, self.name)) is not None:
+            yield Place.RESULT, section
         if part.by_yaw:
             yield Place.RESULT, editing_sections.by_yaw(results, self.name, part.by_yaw, layout)
             yield Place.RESULT, editing_sections.by_scene(results, self.name, part.by_yaw)
@@ -337,6 +402,49 @@ class EditingProbe(Probe[EditResult]):
     def gallery(self, results: Results) -> Section | None:
         """Edited views side by side."""
         return editing_sections.side_by_side(results, self.name)
+
+
+def run_method(
+    work: Work,
+    truth: EditTruth,
+    names: Sequence[str],
+    before: Gaussians,
+    budget: Budget | None = None,
+) -> EditedScene:
+    """Edit a scene by the method of a cell.
+
+    Args:
+        work: of the cell, whose spec has ``method``, ``settings``, ``editor`` and ``edit``.
+        truth: of the edit.
+        names: of the views, the source first.
+        before: the splats to edit.
+        budget: limits of the method.
+    """
+    spec, world = work.spec, work.world
+    with work.meter.stage("setup"):
+        editor = load(work.cell.sources["editor"], spec["editor"])
+    with tempfile.TemporaryDirectory() as folder:
+        job = Job(
+            before,
+            [world.camera(name) for name in names],
+            [truth.originals[name] for name in names],
+            editor,
+            spec["edit"]["target" if editor.guide == "depth" else "instruction"],
+            spec["settings"],
+            Path(folder),
+            _warps(work, before, names),
+            {a: [views[n] for n in names] for a, views in truth.answers.items()},
+            budget,
+        )
+        return METHODS[spec["method"]].run(job)
+
+
+def splats_of(work: Work) -> Gaussians:
+    """The splats that a cell's spec names: fitted, or sampled."""
+    if "fit" in work.spec:
+        return fit.fit_of(work).gaussians
+    spec = work.spec
+    return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
 
 
 class _Measure:
@@ -364,9 +472,15 @@ class _Measure:
         self.injected = float(result.counters.get("injected", 0.0))
         self.before, self.after, self.encoders = before, result.gaussians, encoders
         self.source = names[0]
+        if not result.edited:
+            raise StudyError(
+                f"budget: it ended method {work.spec['method']!r} before its first edit; give more"
+            )
         edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
-        self.judged = truth.judge({self.source: edited[self.source]})
+        # A method that was cut short may not have edited the source: it shows no edit then.
+        shown = edited.get(self.source, truth.originals[self.source])
+        self.judged = truth.judge({self.source: shown})
         self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
         self.neighbours = neighbours(work.world, work.spec["views"])
 
@@ -478,7 +592,7 @@ class _Measure:
         targets = self.names[1:]
         rows: dict[str, dict[str, float]] = {name: {} for name in targets}
         renders = [self.pictures["render"][name] for name in targets]
-        source = self.pictures["edit"][self.source]
+        source = self.pictures["edit"].get(self.source)
         values: dict[str, Any] = {}
         if (clip := self.encoders.get("clip")) is not None:
             words = clip.texts([self.work.spec["edit"][key] for key in ("source", "target")])
@@ -488,8 +602,9 @@ class _Measure:
             values["clip_directional"] = metrics.directional_similarity(
                 befores, images, words[0], words[1]
             )
-            values["clip_image"] = metrics.image_similarity(clip.images([source]), images)
-        if (dino := self.encoders.get("dino")) is not None:
+            if source is not None:
+                values["clip_image"] = metrics.image_similarity(clip.images([source]), images)
+        if source is not None and (dino := self.encoders.get("dino")) is not None:
             values["dino_image"] = metrics.image_similarity(
                 dino.images([source]), dino.images(renders)
             )
@@ -528,7 +643,7 @@ class _Measure:
         answer = self.judged.answer
         shown = {
             "before": self.truth.originals[name],
-            "source edit": self.pictures["edit"][self.source],
+            "source edit": self.pictures["edit"].get(self.source),
             "edited": self.pictures["edit"].get(name),
             "render": self.pictures["render"][name],
             "truth": None if answer is None else self.truth.answers[answer][name],
@@ -552,6 +667,25 @@ def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     name = fields.pop("preset", variant.preset)
     warp = {f"warp.{key}": value for key, value in variant.set.items()}
     return METHODS[own.method].settings(name, {**fields, **warp}, seed)
+
+
+def _reference(variant: Variant) -> str | None:
+    """The name of the variant whose seconds limit this one."""
+    budget = variant.part(VariantPart).budget
+    return None if budget is None else budget.seconds_of
+
+
+_SHARED = ("probe", "protocol", "scene", "size", "views", "seed", "edit", "encoders")
+"""Entries of a cell's spec that all variants share."""
+
+
+def _decisive(spec: Json) -> Json:
+    """What of a cell's spec decides its method's run; the encoders measure it afterwards."""
+    return {key: value for key, value in spec.items() if key != "encoders"}
+
+
+def _own_seconds(result: EditedScene) -> float:
+    return sum(result.seconds.get(part, 0.0) for part in OWN_WORK)
 
 
 def editor_of(study: Study, variant: Variant) -> EditorPart:
@@ -613,7 +747,7 @@ def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:
     return _loaded(name, tuple((kind, value) for kind, value in given if value is not None))
 
 
-def _edits(study: Study, scene: Scene) -> Iterator[Json]:
+def edits_of(study: Study, scene: Scene) -> Iterator[Json]:
     """What of a scene's edits decides a cell.
 
     Raises:

@@ -307,6 +307,65 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     return section
 
 
+def budgets(results: Results, probe: str) -> Section | None:
+    """What methods with a budget did with it; None where no method has one."""
+    columns = [
+        "variant",
+        "budget, s",
+        "seconds of",
+        "network rows at most",
+        "cells cut short",
+        "taken, s",
+        "network rows",
+        "edited views",
+        "iterations of tuning",
+    ]
+    rows, cut, untuned = [], [], []
+    for name in results.study.variants:
+        records = [record for _, _, record in results.records(probe, name) if record.extra.budget]
+        if not records:
+            continue
+        spent = [record.extra.budget for record in records]
+        ended = [value.cut for value in spent if value.cut is not None]
+        if ended:
+            by = " and ".join(sorted({limit.replace("_", " ") for limit in ended}))
+            cut.append(f"{name} ({len(ended)} of {len(spent)}, by {by})")
+        counters = [record.cost.counters for record in records]
+        idle = sum(own["iterations"] == 0 for own in counters)
+        if idle:
+            untuned.append(f"{name} ({idle} of {len(spent)})")
+        rows.append(
+            [
+                name,
+                number(_mean(value.seconds for value in spent if value.seconds is not None)),
+                spent[0].seconds_of or "–",
+                number(_mean(v.network_rows for v in spent if v.network_rows is not None)),
+                f"{len(ended)} of {len(spent)}",
+                number(_mean(record.cost.seconds["whole"] or 0.0 for record in records)),
+                number(_mean(own["network_rows"] for own in counters)),
+                number(_mean(record.extra.edited for record in records)),
+                number(_mean(own["iterations"] for own in counters)),
+            ]
+        )
+    if not rows:
+        return None
+    text = [
+        (
+            "Means over scenes, edits and seeds. Nothing begins beyond a budget, so a method may"
+            " take a little longer. **A budget in seconds makes a result depend on the machine and"
+            " on what else runs there; no comparison of two runs reads these figures.**"
+        ),
+        f"**Did not finish: {'; '.join(cut) or 'none'}.**",
+    ]
+    if untuned:
+        text.append(
+            "Ended before their first iteration of tuning, so that their renders show the scene"
+            f" before the edit: {'; '.join(untuned)}."
+        )
+    timed = (columns[1], columns[5])
+    return Section("Methods with a budget", text, [Table(columns, rows, timed=timed)])
+
+
 def _on(results: Results, probe: str, name: str, metric: str, scenes: Sequence[str]) -> float:
     table = results.views(probe, name, metric)
     return interval({s: list(table[s].values()) for s in scenes if s in table}).mean

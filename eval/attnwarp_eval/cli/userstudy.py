@@ -1,0 +1,108 @@
+"""Commands about people: a page of two-way choices, and the score of their answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names
+
+app = typer.Typer(
+    help="Ask people which edited scene they prefer, and score their answers.",
+    no_args_is_help=True,
+)
+
+
+@app.command()
+def build(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Folders of runs that edited scenes.")
+    ],
+    out: Annotated[Path, typer.Option(help="The page.")] = Path("userstudy.html"),
+    methods: Annotated[
+        str | None,
+        typer.Option(help="Only these variants (comma-separated); else all with pictures."),
+    ] = None,
+    questions: Annotated[
+        str | None,
+        typer.Option(help="Of instruction, consistency, quality (comma-separated); else all."),
+    ] = None,
+    choices: Annotated[int, typer.Option(min=1, help="Choices of a person.")] = 30,
+    checks: Annotated[int, typer.Option(min=0, help="Attention checks of a person.")] = 3,
+    plans: Annotated[
+        int, typer.Option(min=1, help="Different draws; each person gets one at random.")
+    ] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Of what is drawn.")] = 0,
+    title: Annotated[str, typer.Option(help="Of the page.")] = "Which edit do you prefer?",
+) -> None:
+    """Make one self-contained page of two-way choices between the methods of runs.
+
+    It works offline, on a phone too. Answers are saved as a JSON file; nothing is sent.
+    """
+    from attnwarp.errors import InputError, suggest
+    from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.userstudy.material import read_items
+    from attnwarp_eval.userstudy.page import QUESTIONS, Design, build_page
+
+    with clear_errors():
+        asked = list(QUESTIONS) if questions is None else names(questions) or []
+        for name in asked or [""]:
+            if name not in QUESTIONS or asked.count(name) > 1:
+                raise InputError(
+                    f"--questions: got {questions!r}, expected different ones of"
+                    f" {', '.join(QUESTIONS)}{suggest(name, list(QUESTIONS))}"
+                )
+        items = read_items(runs, names(methods))
+        text = build_page(items, Design(asked, plans, choices, checks, seed), title)
+        write_atomic(out, text.encode())
+    compared = dict.fromkeys(name for item in items for name in item.methods)
+    typer.echo(f"{len(items)} edited scenes, methods {', '.join(compared)}")
+    typer.echo(f"{out}: {len(text) / 1e6:.1f} MB")
+
+
+@app.command()
+def score(
+    answers: Annotated[
+        list[Path], typer.Argument(metavar="ANSWERS...", help="Files that people saved.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for preferences.json, .md and .html.")
+    ] = None,
+) -> None:
+    """Preferences with intervals, agreement between people, and who failed attention checks."""
+    import json
+
+    from rich.console import Console
+
+    from attnwarp_eval.document import write
+    from attnwarp_eval.files import write_atomic
+    from attnwarp_eval.userstudy.answers import read_answers
+    from attnwarp_eval.userstudy.score import report, score
+
+    with clear_errors():
+        people, notes = read_answers(answers)
+        try:
+            result = score(people)
+        except ValueError as error:
+            raise fail(f"{error}", TOO_LITTLE) from None
+        document = report(result)
+        console = Console()
+        for line in document.lead:
+            typer.echo(line.replace("**", ""))
+        for section in document.sections:
+            typer.echo(f"\n{section.title}")
+            for table in section.tables:
+                console.print(write.terminal(table))
+        for note in notes:
+            typer.echo(note, err=True)
+        if out is not None:
+            data = json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
+            for name, text in (
+                ("preferences.json", data),
+                ("preferences.md", write.markdown(document)),
+                ("preferences.html", write.page(document, out)),
+            ):
+                write_atomic(out / name, text.encode())
+                typer.echo(out / name)

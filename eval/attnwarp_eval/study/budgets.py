@@ -1,0 +1,105 @@
+"""Budgets of methods: a study's YAML, seconds that another variant takes, and what came of them.
+
+A budget in seconds makes a cell's result depend on the machine and on what else runs there. Records
+of such cells say so, and no comparison of runs reads their figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import Field, model_validator
+
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.study.parts import Part
+from attnwarp_eval.study.record import Json
+
+
+class BudgetPart(Part):
+    """Limits of a variant's method: no edit and no iteration of tuning begins beyond them.
+
+    ``seconds_of`` names a variant whose own seconds in the same process are the limit;
+    ``network_rows`` counts rows through the editor's network, and does not depend on the machine.
+    """
+
+    seconds: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    seconds_of: str | None = None
+    network_rows: int | None = Field(default=None, gt=0)
+
+    @model_validator(mode="after")
+    def _one_limit_of_time(self) -> BudgetPart:
+        if self.seconds is not None and self.seconds_of is not None:
+            raise ValueError("budget: got seconds and seconds_of, expected one of them")
+        if self.seconds is None and self.seconds_of is None and self.network_rows is None:
+            raise ValueError("budget: got no limit, expected seconds, seconds_of or network_rows")
+        return self
+
+
+@dataclass(frozen=True)
+class Spent:
+    """What came of a budget.
+
+    Attributes:
+        seconds: that the method was given; None for no limit.
+        seconds_of: the variant that took them; None for a number of the study.
+        network_rows: that the method was given; None for no limit.
+        cut: the limit that ended the method; None where it finished.
+    """
+
+    seconds: float | None
+    seconds_of: str | None
+    network_rows: int | None
+    cut: str | None
+
+    @property
+    def by_seconds(self) -> bool:
+        """Whether the result depends on the machine."""
+        return self.seconds is not None
+
+
+def timed(spec: Mapping[str, Any]) -> bool:
+    """Whether a cell's result depends on how fast the machine is.
+
+    Args:
+        spec: of the cell.
+
+    >>> timed({}), timed({"budget": {"network_rows": 9}}), timed({"budget": {"seconds": 2.0}})
+    (False, False, True)
+    """
+    return bool({"seconds", "seconds_of"} & set(spec.get("budget") or ()))
+
+
+class Stopwatch:
+    """Seconds of methods in this process, by what they compute.
+
+    A method's first run in a process pays for compilation; it is not taken.
+    """
+
+    def __init__(self) -> None:
+        self._seconds: dict[str, float] = {}
+        self._warm: set[str] = set()
+
+    def note(self, spec: Json, seconds: float) -> None:
+        """Take the seconds of a run.
+
+        Args:
+            spec: all that decides the run.
+            seconds: that it took.
+        """
+        kind = digest([spec["method"], spec["editor"], spec["size"]])
+        if kind in self._warm:
+            self._seconds.setdefault(digest(spec), seconds)
+        self._warm.add(kind)
+
+    def seconds(self, spec: Json, run: Callable[[], float]) -> float:
+        """Seconds of a run; those taken before, else it is run.
+
+        Args:
+            spec: all that decides the run.
+            run: computes it, and returns its seconds.
+        """
+        while (taken := self._seconds.get(digest(spec))) is None:
+            self.note(spec, run())
+        return taken

@@ -1,0 +1,165 @@
+"""Which choices each person gets, in which order and on which side: drawn by a seed, balanced."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+SCRAMBLED = "(scrambled)"
+"""The side of an attention check that nobody prefers: a method's pictures with their parts moved
+around."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One two-way choice.
+
+    Attributes:
+        item: number of the edited scene.
+        question: its name.
+        left, right: methods; one is :data:`SCRAMBLED` in an attention check.
+    """
+
+    item: int
+    question: str
+    left: str
+    right: str
+
+    @property
+    def is_check(self) -> bool:
+        """Whether it is an attention check."""
+        return SCRAMBLED in (self.left, self.right)
+
+    def mirrored(self) -> Choice:
+        """With its sides exchanged."""
+        return replace(self, left=self.right, right=self.left)
+
+
+def draw(
+    methods: Sequence[Sequence[str]],
+    questions: Sequence[str],
+    *,
+    plans: int,
+    choices: int,
+    checks: int,
+    seed: int,
+) -> list[list[Choice]]:
+    """Plans, one for a person.
+
+    Comparisons go round: every pair of methods under every question comes equally often, and scene
+    after scene. In each plan a method stands on the left as often as on the right, to within one.
+    Every second plan is the one before with its sides exchanged, in another order.
+
+    Args:
+        methods: of each item.
+        questions: by name.
+        plans: how many.
+        choices: of a plan; all comparisons where there are fewer.
+        checks: attention checks of a plan, beside the choices.
+        seed: of everything drawn.
+
+    Raises:
+        ValueError: no item has two methods.
+
+    Example:
+        >>> first, second = draw([["a", "b"]], ["better"], plans=2, choices=1, checks=0, seed=0)
+        >>> (first[0].left, first[0].right) == (second[0].right, second[0].left)
+        True
+    """
+    rng = random.Random(seed)
+    stream = _comparisons(methods, questions, rng)
+    if not stream:
+        raise ValueError("methods: got no item with two methods, expected at least one")
+    count, taken = min(choices, len(stream)), itertools.cycle(stream)
+    result: list[list[Choice]] = []
+    while len(result) < plans:
+        own = _sided(list(itertools.islice(taken, count)))
+        tests = _checks(methods, questions, checks, rng)
+        for half in (own, [choice.mirrored() for choice in own]):
+            result.append(_ordered(half, tests, questions, rng))
+            tests = [choice.mirrored() for choice in tests]
+    return result[:plans]
+
+
+def _comparisons(
+    methods: Sequence[Sequence[str]], questions: Sequence[str], rng: random.Random
+) -> list[Choice]:
+    """All comparisons, each kind (pair and question) once before any comes again."""
+    kinds: dict[tuple[str, str, str], list[int]] = {}
+    items = list(range(len(methods)))
+    rng.shuffle(items)
+    for item in items:
+        for a, b in itertools.combinations(sorted(methods[item]), 2):
+            for question in questions:
+                kinds.setdefault((question, a, b), []).append(item)
+    # Kinds begin at different items, so that a part of the stream has all items.
+    turned = [
+        [(kind, own[(k + r) % len(own)]) for r in range(len(own))]
+        for k, (kind, own) in enumerate(kinds.items())
+    ]
+    stream = []
+    for rank in range(max(map(len, turned), default=0)):
+        block = [own[rank] for own in turned if rank < len(own)]
+        rng.shuffle(block)
+        stream += [Choice(item, question, a, b) for (question, a, b), item in block]
+    return stream
+
+
+def _sided(choices: list[Choice]) -> list[Choice]:
+    """Sides such that each method is on the left as often as on the right, to within one.
+
+    Choices are the edges of a graph of methods. Edges to a node beyond make every degree even; an
+    Eulerian circuit then leaves each node as often as it enters it.
+    """
+    beyond = ""
+    ends = [(choice.left, choice.right) for choice in choices]
+    degree: dict[str, int] = {}
+    for name in itertools.chain.from_iterable(ends):
+        degree[name] = degree.get(name, 0) + 1
+    ends += [(name, beyond) for name, count in degree.items() if count % 2]
+    edges: dict[str, list[int]] = {}
+    for number, pair in enumerate(ends):
+        for name in pair:
+            edges.setdefault(name, []).append(number)
+    left: dict[int, str] = {}
+    for start in edges:
+        node = start
+        # A walk that cannot go on has come back to its start, as all degrees are even.
+        while edges[node]:
+            number = edges[node].pop()
+            if number in left:
+                continue
+            left[number] = node
+            a, b = ends[number]
+            node = b if node == a else a
+    return [c if left[n] == c.left else c.mirrored() for n, c in enumerate(choices)]
+
+
+def _checks(
+    methods: Sequence[Sequence[str]], questions: Sequence[str], count: int, rng: random.Random
+) -> list[Choice]:
+    """Attention checks with the scrambled side on the left and on the right in turn."""
+    first, result = rng.randrange(2), []
+    for number in range(count):
+        item = rng.randrange(len(methods))
+        choice = Choice(item, rng.choice(questions), rng.choice(sorted(methods[item])), SCRAMBLED)
+        result.append(choice if (number + first) % 2 else choice.mirrored())
+    return result
+
+
+def _ordered(
+    choices: list[Choice], checks: list[Choice], questions: Sequence[str], rng: random.Random
+) -> list[Choice]:
+    """Question by question in a drawn order, with the checks spread among the choices."""
+    order = list(questions)
+    rng.shuffle(order)
+    mixed = rng.sample(choices, len(choices))
+    mixed.sort(key=lambda choice: order.index(choice.question))
+    for number, check in enumerate(checks, start=1):
+        place = number * len(mixed) // (len(checks) + 1)
+        # It asks what its neighbours ask.
+        asked = mixed[min(place, len(mixed) - 1)].question
+        mixed.insert(place, replace(check, question=asked))
+    return mixed

@@ -1,0 +1,151 @@
+"""What people are shown: pictures of edited scenes, from the folders of runs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from attnwarp.errors import InputError, suggest
+from attnwarp_eval.report import read_results
+from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.store import Store
+
+BEFORE, AFTER = "before", "render"
+"""Contents of an edited scene's pictures: the view before the edit, and the edited splats."""
+
+
+@dataclass
+class Item:
+    """One scene under one instruction and seed.
+
+    Attributes:
+        scene, edit, seed: of the cells.
+        instruction: in words.
+        content: hash of the scene and of all that decides its views.
+        before: by view, the file of the view before the edit.
+        methods: by method and view, the file of the edited scene.
+    """
+
+    scene: str
+    edit: str
+    seed: int
+    instruction: str
+    content: tuple[object, ...]
+    before: dict[str, Path] = field(default_factory=dict)
+    methods: dict[str, dict[str, Path]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Short text that no other item of a study has."""
+        return f"{self.scene} / {self.edit} / seed {self.seed}"
+
+    @property
+    def views(self) -> list[str]:
+        """Views that every method has, in the order of their names."""
+        return sorted(set(self.before).intersection(*self.methods.values()))
+
+
+def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> list[Item]:
+    """The edited scenes of runs of which at least two methods have pictures.
+
+    Args:
+        runs: folders.
+        methods: variants to compare; all that have pictures if None.
+
+    Raises:
+        InputError: there is none, a method that no run has, or runs that contradict each other.
+    """
+    items: dict[tuple[str, str, int], Item] = {}
+    for run in runs:
+        for key, one, method in _edited(run):
+            item = items.setdefault(key, one)
+            if item.content != one.content:
+                raise InputError(
+                    f"{run}: {item.name}: another scene, size or set of views than in the runs"
+                    " before; build a page from runs of one study"
+                )
+            # A cell that several runs have is the same by its content.
+            item.methods.setdefault(method, one.methods[method])
+    available = list(dict.fromkeys(name for item in items.values() for name in item.methods))
+    for name in methods or ():
+        if name not in available:
+            listed = ", ".join(map(repr, available)) or "none"
+            raise InputError(
+                f"--methods: got {name!r}, expected methods with pictures: {listed}"
+                f"{suggest(name, available)}"
+            )
+    if methods is not None:
+        for item in items.values():
+            item.methods = {name: own for name, own in item.methods.items() if name in methods}
+    usable = [item for item in items.values() if len(item.methods) > 1 and item.views]
+    if not usable:
+        raise InputError(
+            f"{', '.join(map(str, runs))}: no edited scene has pictures of two methods; name"
+            " variants and views under 'pictures' in the study, and run it again"
+        )
+    return usable
+
+
+def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str]]:
+    """(scene, edit and seed; the cell as an item of its own; method) of a run's edited scenes."""
+    for cell in read_results(Store(run)).cells:
+        record = cell.record
+        if record is None or not isinstance(record.extra, EditResult):
+            continue
+        edit, spec = record.extra, record.spec
+        content = tuple(str(spec.get(key)) for key in ("scene", "size", "views", "spp"))
+        item = Item(cell.scene, edit.name, cell.seed, edit.instruction, content)
+        own: dict[str, Path] = {}
+        for picture in record.pictures:
+            view = picture.view.removeprefix(f"{edit.name}/")
+            if picture.content == BEFORE:
+                item.before[view] = run / picture.path
+            elif picture.content == AFTER:
+                own[view] = run / picture.path
+        if not own:
+            continue
+        for method in cell.variants:
+            item.methods = {method: own}
+            yield (cell.scene, edit.name, cell.seed), item, method
+
+
+def read_picture(path: Path) -> bytes:
+    """A picture's file.
+
+    Raises:
+        InputError: it is missing.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: {error.strerror}; run the study again to recompute its pictures"
+        ) from None
+
+
+TILES = 4
+"""Parts of a scrambled picture, along each side."""
+
+
+def scrambled(data: bytes, seed: int) -> bytes:
+    """A picture's file with its parts moved around, as JPEG."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as picture:
+        pixels = np.asarray(picture.convert("RGB"))
+    h, w = (side // TILES for side in pixels.shape[:2])
+    tiles = pixels[: h * TILES, : w * TILES].reshape(TILES, h, TILES, w, 3).swapaxes(1, 2)
+    order = np.random.default_rng(seed).permutation(TILES * TILES)
+    moved = tiles.reshape(-1, h, w, 3)[order].reshape(TILES, TILES, h, w, 3).swapaxes(1, 2)
+    buffer = io.BytesIO()
+    Image.fromarray(moved.reshape(h * TILES, w * TILES, 3)).save(buffer, "JPEG", quality=85)
+    return buffer.getvalue()
+
+
+def of_views(item: Item, files: Mapping[str, Path]) -> list[bytes]:
+    """A method's pictures, or those before the edit, in the order of the item's views."""
+    return [read_picture(files[view]) for view in item.views]

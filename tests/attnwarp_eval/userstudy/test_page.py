@@ -1,0 +1,145 @@
+"""Oracles: the run's own files, and the page as an HTML parser reads it."""
+
+import base64
+import io
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from attnwarp_eval.cli.main import app
+from attnwarp_eval.document.write import LARGEST
+from attnwarp_eval.userstudy import page as page_module
+from attnwarp_eval.userstudy.draw import SCRAMBLED
+
+
+class Reader(HTMLParser):
+    """What a browser would load from elsewhere, and the page's data."""
+
+    def __init__(self):
+        super().__init__()
+        self.loaded, self.data, self.inside = [], "", False
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.inside = values.get("id") == "study"
+        self.loaded += [v for k, v in attributes if k in ("src", "href") and v]
+
+    def handle_data(self, data):
+        if self.inside:
+            self.data += data
+            self.inside = False
+
+
+def build(*arguments):
+    return CliRunner().invoke(app, ["userstudy", "build", *map(str, arguments)])
+
+
+def read(path):
+    reader = Reader()
+    reader.feed(path.read_text())
+    return reader, json.loads(reader.data)
+
+
+def color(data):
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2])))).mean((0, 1))
+
+
+def test_the_page_loads_nothing_and_shows_each_method_its_own_pictures(run, tmp_path):
+    done = build(run.root, "--out", tmp_path / "a.html", "--title", "</script><b>Which?")
+    assert done.exit_code == 0, done.output
+    reader, study = read(tmp_path / "a.html")
+    assert reader.loaded == [] and "http" not in (tmp_path / "a.html").read_text()
+    assert study["title"] == "</script><b>Which?"
+    assert len(study["items"]) == 4  # two edits, two seeds
+    for item in study["items"]:
+        assert item["instruction"] == f"paint it {item['edit']}"
+        for name, rgb in run.colors.items():
+            for picture in item["sides"][name]:
+                assert color(study["pictures"][picture]) == pytest.approx(rgb, abs=4)
+        assert color(study["pictures"][item["before"][0]]) == pytest.approx([128] * 3, abs=4)
+    used = {c[0] for plan in study["plans"] for c in plan if SCRAMBLED in c}
+    assert used and all(SCRAMBLED in study["items"][number]["sides"] for number in used)
+
+
+def test_equal_arguments_give_equal_bytes_and_another_seed_another_study(run, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        assert build(run.root, "--out", tmp_path / name, "--seed", seed).exit_code == 0
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert read(tmp_path / "a")[1]["study"] != read(tmp_path / "c")[1]["study"]
+
+
+def test_methods_and_questions_can_be_chosen(run, tmp_path):
+    done = build(run.root, "--out", tmp_path / "a", "--methods", "alone,third", "--questions", "quality",
+                 "--choices", 3, "--checks", 0, "--plans", 4)  # fmt: skip
+    assert done.exit_code == 0, done.output
+    _, study = read(tmp_path / "a")
+    assert list(study["questions"]) == ["quality"]
+    assert [len(plan) for plan in study["plans"]] == [3] * 4
+    assert {name for plan in study["plans"] for row in plan for name in row[2:]} == {
+        "alone",
+        "third",
+    }
+
+
+def test_a_page_of_many_pictures_stays_within_its_size(run, tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    monkeypatch.setattr(page_module, "of_views", lambda item, files: [noise(rng) for _ in files])
+    assert build(run.root, "--out", tmp_path / "a").exit_code == 0
+    _, study = read(tmp_path / "a")
+    total = sum(len(base64.b64decode(v.partition(",")[2])) for v in study["pictures"].values())
+    assert 0.1 * LARGEST < total <= LARGEST
+
+
+def noise(rng):
+    buffer = io.BytesIO()
+    Image.fromarray(rng.integers(0, 255, (512, 512, 3), np.uint8)).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()
+
+
+def test_scrambling_moves_the_parts_and_keeps_them():
+    from attnwarp_eval.userstudy.material import TILES, scrambled
+
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 255, (TILES, TILES, 3), np.uint8)
+    buffer = io.BytesIO()
+    Image.fromarray(np.kron(colors, np.ones((16, 16, 1), np.uint8))).save(buffer, "PNG")
+    pixels = np.asarray(Image.open(io.BytesIO(scrambled(buffer.getvalue(), 0))))
+    after = pixels.reshape(TILES, 16, TILES, 16, 3).mean((1, 3))
+    assert (np.abs(after - colors).max(-1) > 20).mean() > 0.7
+    nearest = np.abs(after[:, :, None, None] - colors).sum(-1).reshape(-1, TILES * TILES).argmin(1)
+    assert sorted(nearest) == list(range(TILES * TILES))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--methods", "alone"], "no edited scene has pictures of two methods"),
+        (["--methods", "alone,magic"], "--methods: got 'magic'"),
+        (["--questions", "beauty"], "--questions: got 'beauty'"),
+        (["--questions", "quality,quality"], "expected different ones"),
+    ],
+)
+def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
+    done = build(run.root, "--out", tmp_path / "a", *arguments)
+    assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_folder_that_is_no_run_and_a_missing_picture_are_one_line(run, tmp_path):
+    done = build(tmp_path, "--out", tmp_path / "a")
+    assert done.exit_code == 2 and "not a run's folder" in done.stderr
+    path = next(run.root.glob("pictures/*/*/*render.jpg"))
+    data = path.read_bytes()
+    path.unlink()
+    try:
+        done = build(run.root, "--out", tmp_path / "a")
+    finally:
+        path.write_bytes(data)
+    assert done.exit_code == 2 and re.search(
+        r"render\.jpg: No such file.*run the study again", done.stderr
+    )
