@@ -34,10 +34,14 @@ def inspect(
         str | None, typer.Option(help="Source view of your own scene; the first if left out.")
     ] = None,
     scene: Annotated[str | None, typer.Option(help="Of a run; its first if left out.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of a run; its first if left out.")] = None,
     variant: Annotated[
         str | None, typer.Option(help="Of the run, or a preset; corrected if left out.")
     ] = None,
-    view: Annotated[str | None, typer.Option(help="Target view; the first if left out.")] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(help="Target view, or EDIT/VIEW of a run of edits; the first if left out."),
+    ] = None,
     pixel: Annotated[str | None, typer.Option(help="Target pixel COLUMN,ROW to explain.")] = None,
     layer: Annotated[
         str | None, typer.Option(help="Feature grid, such as 64x64; --pixel then picks its cell.")
@@ -77,24 +81,27 @@ def inspect(
             from attnwarp_eval.inspect.web import check_web
 
             check_web()
+        from attnwarp.errors import InputError
         from attnwarp_eval.inspect.capture import one_of
-        from attnwarp_eval.inspect.pair import COLORINGS
+        from attnwarp_eval.inspect.pair import COLORINGS, EDIT_DISAGREEMENT
         from attnwarp_eval.inspect.scene import State
 
         one_of(color, COLORINGS, "--color")
-        chosen = _subject(what, data, ply, images, source, scene, size)
+        chosen = _subject(what, data, ply, images, source, scene, size, seed)
         variant = variant or chosen.preferred
-        pair = chosen.pair(variant, view or chosen.targets[0])
+        view = view or chosen.targets[0]
+        pair = chosen.pair(variant, view)
+        if chosen.elsewhere and pair.edit is None and (color == EDIT_DISAGREEMENT or step):
+            raise InputError(f"{'--step' if step else '--color'}: {chosen.elsewhere}")
         one_of(color, pair.colorings, "--color")
-        steps = [""] if chosen.edit is None else list(chosen.edit.steps)
         if step is not None:
-            one_of(step, steps, "--step")
+            one_of(step, chosen.steps, "--step")
         state = State(
             variant,
-            pair.target,
+            view,
             color,
             _layer(layer, pair),
-            steps[0] if step is None else step,
+            chosen.steps[0] if step is None else step,
             splats,
         )
         picked = None if place is None else _report(pair, state.layer, place)
@@ -133,14 +140,17 @@ def _subject(
     source: str | None,
     scene: str | None,
     size: int | None,
+    seed: int | None,
 ) -> Subject:
     from attnwarp.errors import InputError
     from attnwarp_eval.inspect import subject
     from attnwarp_eval.inspect.capture import is_edit
 
     path = Path(what)
-    if scene is not None and not (path / "study.json").is_file():
-        raise InputError(f"{what}: not a run's folder, so --scene has no meaning; leave it out")
+    of_runs = {"--scene": scene, "--seed": seed}
+    for name in (name for name, value in of_runs.items() if value is not None):
+        if not (path / "study.json").is_file():
+            raise InputError(f"{what}: not a run's folder, so {name} has no meaning; leave it out")
     if data is not None:
         return subject.of_capture(
             path, data, ply=ply, images=images, source=source, size=size or subject.SIZE
@@ -150,7 +160,7 @@ def _subject(
         if value is not None:
             raise InputError(f"{name}: only goes with --data; name the cameras of your scene")
     if (path / "study.json").is_file():
-        return subject.of_run(path, scene, size)
+        return subject.of_run(path, scene, size, seed)
     if path.suffix.lower() in (".ply", ".splat") or is_edit(path):
         raise InputError(f"{what}: needs cameras; name them with --data FOLDER")
     return subject.of_scene(what, size or subject.SIZE)

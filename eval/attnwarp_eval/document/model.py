@@ -39,7 +39,7 @@ class Table:
 
 @dataclass
 class Picture:
-    """An image file of the run's folder, with what it shows.
+    """An image file of the run's folder, with what it shows, and a command that explains it.
 
     Example:
         >>> Picture("pictures/a.png", "the source").caption
@@ -48,6 +48,7 @@ class Picture:
 
     path: str
     caption: str
+    command: str = ""
 
 
 @dataclass
@@ -74,7 +75,8 @@ class Gallery:
     """Pictures in rows: a line of text, then pictures or sliders side by side.
 
     With ``picker``, a row in bold heads the rows of one view, and on a page a reader picks two
-    pictures of a view and lays them over each other.
+    pictures of a view and lays them over each other. ``commands`` stand before the pictures where
+    the text is plain; on a page each picture has its own.
 
     Example:
         >>> gallery = Gallery([("yaw 30", [Picture("a.png", "truth"), Picture("b.png", "warp")])])
@@ -84,6 +86,7 @@ class Gallery:
 
     rows: Sequence[tuple[str, Sequence[Picture | Slider]]]
     picker: bool = False
+    commands: Sequence[str] = ()
 
 
 @dataclass

@@ -74,7 +74,11 @@
         image.src = pictures.get(select.value).src;
         image.alt = select.value;
       }
-      caption.textContent = `${left.value} | ${right.value}`;
+      const entries = [left, right].map(({ value }) => {
+        const command = pictures.get(value).closest("figure").querySelector(".command");
+        return command ? [value, " ", command.cloneNode(true)] : [value];
+      });
+      caption.replaceChildren(...entries[0], " | ", ...entries[1]);
     };
     const change = () => {
       const names = [...views.get(place.value).keys()];
@@ -87,6 +91,23 @@
     for (const select of [left, right]) select.addEventListener("change", show);
     change();
   }
+
+  // Commands name the report's folder as "."; a page that was opened as a file knows it.
+  const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") || "/";
+  const quoted = /^[\w@%+=:,./-]+$/.test(folder) ? folder : `'${folder.replaceAll("'", "'\"'\"'")}'`;
+  if (location.protocol === "file:") {
+    for (const part of all(".command")) {
+      const [summary, code] = part.children;
+      code.textContent = code.textContent.replace(" . ", () => ` ${quoted} `);
+      summary.title = code.textContent;
+    }
+  }
+  document.addEventListener("click", (event) => {
+    const summary = event.target.closest(".command summary");
+    if (!summary || summary.parentNode.open) return;
+    const text = summary.nextElementSibling.textContent;
+    navigator.clipboard?.writeText(text).then(() => (summary.dataset.note = " (copied)"), () => {});
+  });
 
   // Contents: the section in view.
   const links = new Map(all("nav a").map((link) => [link.hash.slice(1), link]));
@@ -109,7 +130,7 @@
   open();
   let closed = [];
   window.addEventListener("beforeprint", () => {
-    closed = all("details:not([open])");
+    closed = all("details:not([open], .command)");
     closed.forEach((part) => (part.open = true));
   });
   window.addEventListener("afterprint", () => closed.forEach((part) => (part.open = false)));

@@ -113,17 +113,29 @@ class Edit:
         number = step.removeprefix("stage ")
         return read_ply(self.path / ("edited.ply" if step == EDITED else f"stages/{number}.ply"))
 
-    def picture(self, name: str) -> Image | None:
-        """(h, w, 3) sRGB of a file of the folder; None where the edit has not made it."""
-        path = self.path / name
-        if not path.is_file():
-            return None
-        pixels = read_image(path)
-        return (pixels[..., :3] / np.iinfo(pixels.dtype).max).astype(np.float32)
-
     def edited(self, view: str) -> Image | None:
         """(h, w, 3) the edited picture of a view."""
-        return self.picture("source.png" if view == self.source else f"views/{view}.png")
+        return self._picture("source.png" if view == self.source else f"views/{view}.png")
+
+    def after(self, view: str, step: str) -> Image | None:
+        """(h, w, 3) render of the scene after a step; None where the edit has not made it."""
+        return self._picture(f"renders/after/{view}.png") if step == EDITED else None
+
+    def details(self, view: str) -> dict[str, Image]:
+        """Further pictures of a view, by title."""
+        features = self._picture(f"features/{view}.png")
+        return {} if features is None else {"features, warped": features}
+
+    def _picture(self, name: str) -> Image | None:
+        """(h, w, 3) sRGB of a file of the folder; None where the edit has not made it."""
+        path = self.path / name
+        return read_picture(path) if path.is_file() else None
+
+
+def read_picture(path: Path) -> Image:
+    """(h, w, 3) sRGB of a file, in [0, 1]."""
+    pixels = read_image(path)
+    return (pixels[..., :3] / np.iinfo(pixels.dtype).max).astype(np.float32)
 
 
 def is_edit(path: Path) -> bool:

@@ -7,13 +7,22 @@ import shlex
 
 
 def inspect_command(
-    run: str | os.PathLike[str], scene: str, variant: str, view: str, *, pixel: str | None = None
+    run: str | os.PathLike[str],
+    scene: str,
+    variant: str,
+    view: str,
+    *,
+    seed: int | None = None,
+    color: str | None = None,
+    pixel: str | None = None,
 ) -> str:
     """What to type to see a view of a run in 3D.
 
     Args:
         run: folder of the run.
         scene, variant, view: as the run names them.
+        seed: one of the run's; its first if None.
+        color: what the surface is coloured by; the command's own choice if None.
         pixel: COLUMN,ROW of a target pixel to explain.
 
     Example:
@@ -22,6 +31,8 @@ def inspect_command(
     """
     words = ["attnwarp-eval", "inspect", os.fspath(run), "--scene", scene]
     words += ["--variant", variant, "--view", view]
-    if pixel is not None:
-        words += ["--pixel", pixel]
+    options = {"--seed": seed, "--color": color, "--pixel": pixel}
+    for option, value in options.items():
+        if value is not None:
+            words += [option, str(value)]
     return shlex.join(words)

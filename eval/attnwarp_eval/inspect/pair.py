@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,6 +27,7 @@ from attnwarp.warp import (
     warp_view,
 )
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
+from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 from attnwarp_eval.world import World
@@ -38,6 +39,8 @@ Size = tuple[int, int]
 
 LABELS = {NONE: "none", VISIBLE: "visible", HIDDEN: "hidden", AMBIGUOUS: "ambiguous"}
 
+EDIT_DISAGREEMENT = "edit disagreement"
+
 COLORINGS = (
     "picture",
     "mask",
@@ -46,7 +49,7 @@ COLORINGS = (
     "depth error",
     "incidence",
     "covered by",
-    "edit disagreement",
+    EDIT_DISAGREEMENT,
 )
 """What the surface that the target sees can be coloured by; :attr:`Pair.colorings` has those that
 a pair can show."""
@@ -95,6 +98,7 @@ class Pair:
         model: the splats that give depth; None takes the truth's own depth.
         spp: samples a pixel of the true pictures.
         edit: of the scene.
+        exact_mask: whether the mask is the truth's, as an oracle's.
     """
 
     views: World | Capture
@@ -102,7 +106,8 @@ class Pair:
     settings: WarpSettings
     model: Gaussians | None
     spp: int = 8
-    edit: Edit | None = None
+    edit: Edit | RunEdit | None = None
+    exact_mask: bool = False
 
     @property
     def world(self) -> World | None:
@@ -160,6 +165,13 @@ class Pair:
     @cached_property
     def view(self) -> WarpedView:
         """The warp and its mask."""
+        view = self._warped_view()
+        if not self.exact_mask or self.truth is None:
+            return view
+        visible = torch.from_numpy(np.ascontiguousarray(self.truth.visible))
+        return replace(view, mask=visible & view.correspondence.defined, _at={})
+
+    def _warped_view(self) -> WarpedView:
         source, target = self.cameras
         if self.model is None:
             return warp_surfaces(source, target, self.surfaces[1], self.surfaces[0], self.settings)
@@ -404,7 +416,7 @@ class Pair:
             name
             for name in COLORINGS
             if (self.truth is not None or name not in NEEDS_TRUTH)
-            and (self.edit is not None or name != "edit disagreement")
+            and (self.edit is not None or name != EDIT_DISAGREEMENT)
         )
 
     def colors(self, coloring: str, layer: Size | None = None, step: str | None = None) -> Image:
@@ -431,7 +443,7 @@ class Pair:
             return tinted([*CATEGORIES, ACCEPTED], self.first_rejection, target)
         if coloring == "incidence":
             return incidence_map(self.incidence)
-        if coloring == "edit disagreement":
+        if coloring == EDIT_DISAGREEMENT:
             return disagreement_map(self.disagreement)
         assert truth is not None
         if coloring == "endpoint error":
@@ -466,7 +478,7 @@ class Pair:
             return _scale("RdBu_r", [f"{v:+.0%} of depth" for v in np.linspace(-limit, limit, 5)])
         if coloring == "incidence":
             return _scale("viridis_r", [f"{v:.0f} degrees" for v in np.linspace(0, 90, 4)])
-        if coloring == "edit disagreement":
+        if coloring == EDIT_DISAGREEMENT:
             values = np.linspace(0, DISAGREEMENT, 4)
             return [*_scale("magma", [f"{v:.1f} of sRGB" for v in values]), ("no warp", "#999999")]
         return []
@@ -475,11 +487,21 @@ class Pair:
         """(H, W, 3) the target's picture, or the render of the scene after a step of its edit."""
         if self.edit is None or step in (None, self.edit.steps[0]):
             return self.images[1]
-        part = f"renders/after/{self.target}.png" if step == "edited" else ""
-        made = self.edit.picture(part) if part else None
         target = self.cameras[1]
         assert step is not None
-        return rendered(self.edit.splats(step), target) if made is None else fitted(made, target)
+        made = self.edit.after(self.target, step)
+        return rendered(self.splats(step), target) if made is None else fitted(made, target)
+
+    def splats(self, step: str = "") -> Gaussians:
+        """The splats after a step of the edit; those before it where a run has no others.
+
+        Only for a pair with splats.
+        """
+        assert self.model is not None
+        if self.edit is None or step in ("", self.edit.steps[0]):
+            return self.model
+        after = self.edit.splats(step)
+        return self.model if after is None else after
 
     def insets(self, layer: Size | None = None, step: str | None = None) -> dict[str, Image]:
         """The pictures beside the 3D view, by title.
@@ -502,9 +524,7 @@ class Pair:
         title = "mask" if self.truth is None else "mask against truth"
         parts[title] = self.colors("mask", layer)
         if self.edit is not None:
-            features = self.edit.picture(f"features/{self.target}.png")
-            if features is not None:
-                parts["features, warped"] = features
+            parts |= self.edit.details(self.target)
         return parts
 
     def _warped(self, source: Image, layer: Size | None) -> Image:

@@ -273,7 +273,12 @@ def parts(
     result = [
         *_camera("source", source, reach, SOURCE_COLOR, lambda: pair.images[0]),
         *_camera(
-            "target", target, reach, TARGET_COLOR, lambda: pair.picture(state.step), state.step
+            "target",
+            target,
+            reach,
+            TARGET_COLOR,
+            lambda: pair.picture(state.step),
+            () if pair.edit is None else (state.variant, state.target, state.step),
         ),
         Part(
             "seen",
@@ -285,7 +290,7 @@ def parts(
     ]
     if state.splats and pair.model is not None:
         result.append(
-            Part("discs", (id(pair.model), state.step), lambda: discs(_splats(pair, state.step)))
+            Part("discs", (id(pair.model), state.step), lambda: discs(pair.splats(state.step)))
         )
     if state.surface and pair.world is not None:
         geometry = pair.world.geometry
@@ -325,26 +330,19 @@ def _camera(
     reach: float,
     color: str,
     picture: Callable[[], Image],
-    step: str = "",
+    key: tuple[str, ...] = (),
 ) -> list[Part]:
     edges, corners = frustum(camera, reach)
     return [
         Part(f"{name} frustum", (camera.name,), lambda: edges, color),
         Part(
             f"{name} picture",
-            (camera.name, step),
+            (camera.name, *key),
             lambda: picture_plane(corners),
             picture=picture,
             opacity=0.9,
         ),
     ]
-
-
-def _splats(pair: Pair, step: str) -> Gaussians:
-    assert pair.model is not None
-    if pair.edit is None or step in ("", pair.edit.steps[0]):
-        return pair.model
-    return pair.edit.splats(step)
 
 
 def as_bytes(colors: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:

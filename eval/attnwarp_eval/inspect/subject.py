@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,8 +16,17 @@ from attnwarp.io import read_dataset, read_ply, read_splat
 from attnwarp.io.names import file_stems
 from attnwarp.propagate.command import FIT_FOLDER
 from attnwarp.warp import PRESETS
-from attnwarp_eval.inspect.capture import Capture, Edit, is_edit, one_of, read_edit
+from attnwarp_eval.inspect.capture import (
+    BEFORE,
+    EDITED,
+    Capture,
+    Edit,
+    is_edit,
+    one_of,
+    read_edit,
+)
 from attnwarp_eval.inspect.pair import Pair
+from attnwarp_eval.inspect.run import Measured, measured
 from attnwarp_eval.study.parts import Splats, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
@@ -27,6 +37,8 @@ SIZE = 512
 
 EDIT_VARIANT = "the edit's"
 """Name of the variant with the settings that an edit's manifest names."""
+
+_NOT_MEASURED = Measured(Path())
 
 
 @dataclass(frozen=True)
@@ -43,6 +55,9 @@ class Subject:
         targets: names of the views.
         capture: the user's own scene, which has no truth.
         edit: of the user's own scene.
+        measured: what a run has of its variants, where they edit the scene or fit splats to it.
+        elsewhere: what to open for an edited view that a run has no pictures of; empty for
+            anything but a run of edits.
 
     Example:
         >>> subject = of_scene("spheres", 16)
@@ -58,9 +73,11 @@ class Subject:
     targets: tuple[str, ...]
     capture: Capture | None = field(default=None, repr=False)
     edit: Edit | None = field(default=None, repr=False)
+    measured: Mapping[str, Measured] = field(default_factory=dict, repr=False)
+    elsewhere: str = ""
 
     def pair(self, variant: str, target: str) -> Pair:
-        """One target view under one variant.
+        """One target view under one variant; an edited view of a run is named ``edit/view``.
 
         Raises:
             InputError: there is no such variant or view.
@@ -73,16 +90,38 @@ class Subject:
             if variant == EDIT_VARIANT and self.edit is not None:
                 settings = self.edit.settings
             return Pair(self.capture, target, settings, self.capture.model, edit=self.edit)
+        own = self.measured.get(variant, _NOT_MEASURED)
         gaussians = None
         if model is not None:
-            gaussians = splats(self.scene, self.size, self.seed, **model.model_dump())
-        return Pair(world(self.scene, self.size), target, settings, gaussians, self.spp)
+            gaussians = own.fitted()
+            if gaussians is None:
+                gaussians = splats(self.scene, self.size, self.seed, **model.model_dump())
+        return Pair(
+            world(self.scene, self.size),
+            target.rpartition("/")[2],
+            own.settings() or settings,
+            gaussians,
+            self.spp,
+            own.edits.get(target),
+            own.exact_mask,
+        )
 
     @property
     def preferred(self) -> str:
-        """The variant to begin with: the edit's own, else "corrected", else the first."""
+        """The variant to begin with: the edit's own, else "corrected", else the first with pictures
+        of an edit, else the first.
+        """
         names = list(self.variants)
-        return next((name for name in (EDIT_VARIANT, "corrected") if name in names), names[0])
+        edited = [name for name in names if name in self.measured and self.measured[name].edits]
+        wanted = (EDIT_VARIANT, "corrected", *edited)
+        return next((name for name in wanted if name in names), names[0])
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """Of the edits; one without a name where there is none."""
+        if self.edit is not None:
+            return self.edit.steps
+        return (BEFORE, EDITED) if any(own.edits for own in self.measured.values()) else ("",)
 
     @cached_property
     def views(self) -> World | Capture:
@@ -120,16 +159,20 @@ def _presets(model: Splats | None) -> dict[str, tuple[Variant, Splats | None]]:
     return {name: (Variant(preset=name), model) for name in sorted(PRESETS)}
 
 
-def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> Subject:
-    """A run's variants and views.
+def of_run(
+    folder: Path, scene: str | None = None, size: int | None = None, seed: int | None = None
+) -> Subject:
+    """A run's variants and views; edited views, of which the run has pictures, come first.
 
     Args:
         folder: of the run.
         scene: one of the run's; the first, if left out.
         size: of the images; the run's own, if left out.
+        seed: one of the run's; the first, if left out.
 
     Raises:
-        InputError: the folder is no run, or the run has no such scene or no warps.
+        InputError: the folder is no run, a record is damaged, the run has no such scene or seed or
+            no variants, or the scene was edited in a former state.
 
     Example:
         >>> from attnwarp_eval.study import Store, parse_study
@@ -141,9 +184,14 @@ def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> S
         >>> of_run(store.root).scene
         'spheres'
     """
-    study = parse_study(Store(folder).read_study()["study"])
+    stored = Store(folder).read_study()
+    study = parse_study(stored["study"])
+    if not study.scenes:
+        raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     scene = scene or study.scenes[0]
     one_of(scene, study.scenes, "scene")
+    seed = study.seeds[0] if seed is None else seed
+    one_of(str(seed), [str(number) for number in study.seeds], "seed")
     variants = {
         name: (variant, None if variant.geometry == "truth" else study.splats_of(variant))
         for name, variant in study.variants.items()
@@ -153,8 +201,38 @@ def of_run(folder: Path, scene: str | None = None, size: int | None = None) -> S
             f"{folder}: the study {study.name!r} has no variants; name a scene instead"
         )
     size = size or study.size
-    targets = tuple(study.views) or tuple(world(scene, size).targets)
-    return Subject(scene, size, study.spp, study.seeds[0], variants, targets)
+    views = world(scene, size)
+    records = measured(folder, stored["cells"], scene, seed, views.source.name)
+    for own in records.values():
+        if own.spec["scene"] != views.content_hash:
+            raise InputError(
+                f"{folder}: the scene {scene!r} has changed since the run was made; run the study"
+                " again, or name the scene instead of the run"
+            )
+    pictured = {name: list(own.edits) for name, own in records.items() if own.edits}
+    edited = tuple(dict.fromkeys(view for names in pictured.values() for view in names))
+    targets = (*edited, *(study.views or views.targets))
+    return Subject(
+        scene, size, study.spp, seed, variants, targets, measured=records,
+        elsewhere=_elsewhere(folder, list(pictured), edited) if any(
+            "edit" in own.spec for own in records.values()
+        ) else "",
+    )  # fmt: skip
+
+
+def _elsewhere(folder: Path, variants: Sequence[str], views: Sequence[str]) -> str:
+    """What to open for an edited view that a run has no pictures of."""
+    other = "edit the scene with attnwarp edit, and open its folder with --data"
+    if not views:
+        return (
+            f"{folder}: the run has no pictures of edited views; name variants and views under"
+            f" pictures in its study and run it anew, or {other}"
+        )
+    return (
+        f"{folder}: the run has pictures of the edited views {', '.join(views)} by the variants"
+        f" {', '.join(map(repr, variants))} alone; open one of these with --view and --variant,"
+        f" or {other}"
+    )
 
 
 def of_capture(

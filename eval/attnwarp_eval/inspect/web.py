@@ -228,7 +228,7 @@ class _Page:
                     )
                 looks = {
                     "source": lambda: window.look_through(window.pair.cameras[0].name),
-                    "target": lambda: window.look_through(window.state.target),
+                    "target": lambda: window.look_through(window.pair.target),
                     "outside": window.look_from_outside,
                 }
                 for name, look in looks.items():

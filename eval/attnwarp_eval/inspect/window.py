@@ -77,7 +77,7 @@ class Window:
         require_gl(display=not off_screen)
         self.subject = subject
         self.variants, self.targets = list(subject.variants), list(subject.targets)
-        self.steps = [""] if subject.edit is None else list(subject.edit.steps)
+        self.steps = list(subject.steps)
         self.state = state
         self.picked: PixelReport | CellReport | None = None
         self.help_shown = False
@@ -218,7 +218,7 @@ class Window:
             "g": lambda: self.show(surface=not state().surface),
             "question": self.toggle_help,
             "1": lambda: self.look_through(self.pair.cameras[0].name),
-            "2": lambda: self.look_through(state().target),
+            "2": lambda: self.look_through(self.pair.target),
             "0": self.look_from_outside,
             "f": self.fly,
         }
@@ -289,7 +289,7 @@ class Window:
     def _plotter(self, off_screen: bool, size: tuple[int, int]) -> Any:
         import pyvista
 
-        self._inset_columns = 1 if self.subject.edit is None else 2
+        self._inset_columns = 1 if len(self.steps) == 1 else 2
         columns = self._inset_columns
         # PyVista's own types name integers for both.
         layout: dict[str, Any] = {
@@ -343,7 +343,8 @@ class Window:
         for index in range(len(insets), INSET_ROWS * self._inset_columns):
             self.plotter.subplot(*divmod(index, self._inset_columns))
             for name in ("picture", "title"):
-                self.plotter.remove_actor(name)
+                # The plotter would remove it from all parts of the window.
+                self.plotter.renderer.remove_actor(name)
 
     def _draw_inset(self, title: str, image: Image) -> None:
         height, width = image.shape[:2]
@@ -402,7 +403,7 @@ class Window:
     def _draw_texts(self) -> None:
         pair, state = self.pair, self.state
         layer = "" if state.layer is None else f", grid {state.layer[1]} x {state.layer[0]}"
-        step = f", {state.step}" if state.step else ""
+        step = f", {state.step}" if pair.edit is not None else ""
         title = (
             f"{Path(self.subject.scene).name}, {state.variant}, {pair.cameras[0].name} ->"
             f" {state.target}{layer}{step}; colours: {state.coloring}"

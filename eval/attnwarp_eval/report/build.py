@@ -7,6 +7,7 @@ from pathlib import Path
 from attnwarp_eval.document.model import Report, Section
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.claims import claims
+from attnwarp_eval.report.commands import add_commands
 from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
@@ -66,6 +67,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         for section in sections:
             section.tables = [table.without_timings() for table in section.tables]
     first = findings(results, problems(results), pictures=pictures)
+    add_commands(results, sections, first)
     return Report(study.title or study.name, lead, sections, first)
 
 

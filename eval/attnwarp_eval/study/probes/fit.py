@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -336,11 +337,10 @@ def fit_of(work: Work) -> attnwarp.fit.Fit:
     """
     spec, world = work.spec, work.world
     data = spec["fit"]
-    decisive = {**data, **{key: spec[key] for key in ("scene", "size", "spp", "seed")}}
     return fitted.fit_scene(
         world.scene,
         FitSettings.from_dict(data["settings"]),
-        work.root / "fits" / digest(decisive)[:16],
+        folder_of(work.root, spec),
         views=data["views"],
         spp=spec["spp"],
         points=data["points"],
@@ -348,6 +348,12 @@ def fit_of(work: Work) -> attnwarp.fit.Fit:
         seed=spec["seed"],
         geometry=world.geometry,
     )
+
+
+def folder_of(root: Path, spec: Mapping[str, Any]) -> Path:
+    """The folder of the fit that a cell's spec names under ``fit``, below a run's folder."""
+    keys = ("scene", "size", "spp", "seed")
+    return root / "fits" / digest({**spec["fit"], **{key: spec[key] for key in keys}})[:16]
 
 
 def _measure(point: Point, name: str) -> float:

@@ -1,0 +1,75 @@
+"""The command that opens what stands behind each picture of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from attnwarp_eval.document.model import Finding, Gallery, Picture, Section, Slider
+from attnwarp_eval.inspect.command import inspect_command
+from attnwarp_eval.study.results import Results
+
+FOLDER = "."
+"""The run as the commands name it: the report lies in its folder, wherever that is moved."""
+
+COLORS = {
+    "mask": "mask",
+    "warped": None,
+    "endpoint-error": "endpoint error",
+    "depth-error": "depth error",
+    "edited": "edit disagreement",
+}
+"""Pictures of a variant that can be inspected, and the colouring that explains each; None for the
+command's own choice."""
+
+
+def add_commands(
+    results: Results, sections: Iterable[Section], findings: Iterable[Finding]
+) -> None:
+    """Give pictures of a variant in a target view their command; the others have none.
+
+    Args:
+        results: of the run.
+        sections: whose galleries also get one command a scene, for plain text.
+        findings: with pictures.
+    """
+    commands = {path: (scene, command) for path, scene, command in _commands(results)}
+    for gallery in (section.gallery for section in sections):
+        if gallery is None:
+            continue
+        first: dict[str, str] = {}
+        for picture in _pictures(gallery):
+            if picture.path in commands:
+                scene, picture.command = commands[picture.path]
+                first.setdefault(scene, picture.command)
+        gallery.commands = list(first.values())
+    for finding in findings:
+        entry = finding.picture
+        pair = [entry.before, entry.after] if isinstance(entry, Slider) else [entry]
+        for one in pair:
+            if one is not None and one.path in commands:
+                one.command = commands[one.path][1]
+
+
+def _commands(results: Results) -> Iterator[tuple[str, str, str]]:
+    """Path of a picture, its scene, and its command."""
+    study = results.study
+    for cell in results.cells:
+        variant = cell.variants[0]
+        if cell.record is None or cell.scene not in study.scenes or variant not in study.variants:
+            continue
+        # Views that are no targets of the scene, such as those of a fit, cannot be opened.
+        targets = cell.record.spec.get("views", [])
+        for picture in cell.record.pictures:
+            if picture.content in COLORS and picture.view.rpartition("/")[2] in targets:
+                seed = cell.seed if len(study.seeds) > 1 else None
+                command = inspect_command(
+                    FOLDER, cell.scene, variant, picture.view,
+                    seed=seed, color=COLORS[picture.content],
+                )  # fmt: skip
+                yield picture.path, cell.scene, command
+
+
+def _pictures(gallery: Gallery) -> Iterator[Picture]:
+    for _, entries in gallery.rows:
+        for entry in entries:
+            yield from [entry.before, entry.after] if isinstance(entry, Slider) else [entry]
