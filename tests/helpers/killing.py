@@ -66,7 +66,12 @@ def killed(arguments, log, moment):
     pid = fork(arguments, log)
     time.sleep(moment)
     os.kill(pid, signal.SIGKILL)
-    return os.WIFSIGNALED(os.waitpid(pid, 0)[1])
+    hit = os.WIFSIGNALED(os.waitpid(pid, 0)[1])
+    print(
+        f"{arguments[0]}: {'killed after' if hit else 'had ended by'} {moment:.2f} s",
+        file=sys.stderr,
+    )
+    return hit
 
 
 def records(run):
