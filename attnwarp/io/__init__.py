@@ -1,5 +1,6 @@
-"""Files: splats as PLY and .splat, cameras as transforms.json and COLMAP models."""
+"""Files: splats as PLY and .splat, cameras as transforms.json, COLMAP models and BlendedMVS."""
 
+from attnwarp.io.blendedmvs import read_blendedmvs
 from attnwarp.io.colmap import read_colmap
 from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import FileFormatError
@@ -17,6 +18,7 @@ __all__ = [
     "FileFormatError",
     "Lens",
     "image_size",
+    "read_blendedmvs",
     "read_colmap",
     "read_dataset",
     "read_image",

@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 from attnwarp import check
+from attnwarp.io.blendedmvs import is_blendedmvs, read_blendedmvs
 from attnwarp.io.colmap import find_model, read_colmap
 from attnwarp.io.dataset import Dataset, Distorted, Missing
 from attnwarp.io.file import FileFormatError
 from attnwarp.io.transforms import SPLITS, read_transforms
 
-Format = Literal["transforms", "colmap"]
+Format = Literal["transforms", "colmap", "blendedmvs"]
+
+SCALES = (1, 2, 4, 8)
+"""Of image folders, as nerfstudio and Mip-NeRF 360 have them: images, images_2 and so on."""
 
 
 def read_dataset(
@@ -26,17 +30,19 @@ def read_dataset(
     points: bool = True,
     distorted: Distorted = "error",
     ignore_keys: Sequence[str] = (),
+    scale: int = 1,
 ) -> Dataset:
-    """Read a transforms.json or a COLMAP model.
+    """Read a transforms.json, a COLMAP model or a scene of BlendedMVS.
 
     A file is a transforms.json. A folder with transforms.json, or transforms_train.json and its
     like, is that; one with a sparse model (``cameras.bin`` or ``.txt`` in it, in ``sparse/0`` or in
     ``sparse``) is COLMAP's. A folder that is both needs ``format``, except that a model under
-    ``colmap/`` is what nerfstudio made the transforms.json from, and is passed over.
+    ``colmap/`` is what nerfstudio made the transforms.json from, and is passed over. A folder with
+    ``cams`` and ``blended_images`` is a scene of BlendedMVS.
 
     Args:
         path: file or folder.
-        format: "transforms" or "colmap", for a folder that is both.
+        format: "transforms", "colmap" or "blendedmvs", for a folder that is more than one.
         images: folder of the images of a COLMAP model; see :func:`read_colmap`.
         missing_images: "error", or "none" to get None for the path of an image that is not there.
         resize_cameras: when an image has another size than its camera, resize the camera instead of
@@ -47,6 +53,8 @@ def read_dataset(
             ``Dataset.lenses`` for :func:`undistort`.
         ignore_keys: keys of a transforms.json to pass over although they change what a picture
             shows, such as "mask_path".
+        scale: one of 1, 2, 4 and 8: images are read from ``images_4`` in place of ``images``, and
+            the cameras resized to them.
 
     Raises:
         FileNotFoundError: nothing there that could be read.
@@ -62,7 +70,11 @@ def read_dataset(
     """
     path = Path(path)
     if format is not None:
-        check.one_of(format, ("transforms", "colmap"), "format")
+        check.one_of(format, ("transforms", "colmap", "blendedmvs"), "format")
+    if scale not in SCALES:
+        raise ValueError(f"scale: got {scale!r}, expected one of {', '.join(map(str, SCALES))}")
+    if scale > 1 and images is not None:
+        raise ValueError("scale: given with images (--images); name the folder or the scale")
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder")
     if format is None:
@@ -75,18 +87,27 @@ def read_dataset(
                 f"holds both a transforms.json and a COLMAP model ({model}); pass"
                 " format='transforms' or 'colmap' (--format)",
             )
-        if not transforms and model is None:
+        if transforms or model is not None:
+            format = "transforms" if transforms else "colmap"
+        elif is_blendedmvs(path):
+            format = "blendedmvs"
+        else:
             raise FileNotFoundError(
                 f"{path}: neither a transforms.json nor a COLMAP model (cameras.bin or cameras.txt,"
                 " here, in sparse/0 or in sparse) is there"
             )
-        format = "transforms" if transforms else "colmap"
+    if format == "blendedmvs":
+        if scale > 1 or images is not None:
+            raise ValueError(
+                "scale, images: a scene of BlendedMVS has one folder of images; leave them out"
+            )
+        return read_blendedmvs(path, missing_images=missing_images)
     if format == "colmap":
         return read_colmap(
             path,
-            images=images,
+            images=images if scale == 1 else f"images_{scale}",
             missing_images=missing_images,
-            resize_cameras=resize_cameras,
+            resize_cameras=resize_cameras or scale > 1,
             points=points,
             distorted=distorted,
         )
@@ -102,4 +123,5 @@ def read_dataset(
         points=points,
         distorted=distorted,
         ignore_keys=ignore_keys,
+        scale=scale,
     )

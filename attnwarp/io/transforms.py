@@ -111,6 +111,7 @@ def read_transforms(
     points: bool = True,
     distorted: Distorted = "error",
     ignore_keys: Sequence[str] = (),
+    scale: int = 1,
 ) -> Dataset:
     """Read a transforms.json.
 
@@ -132,6 +133,8 @@ def read_transforms(
             ``Dataset.lenses`` for :func:`undistort`.
         ignore_keys: keys to pass over although they change what a picture shows, such as
             "mask_path".
+        scale: 4 to read ``images_4/a.png`` where the file says ``images/a.png``, as nerfstudio
+            lays out smaller copies; the cameras are resized to them.
 
     Raises:
         FileNotFoundError: no such file.
@@ -165,6 +168,7 @@ def read_transforms(
         with_points=points,
         distorted=distorted,
         ignore_keys=ignore_keys,
+        scale=scale,
     )
     if not path.is_dir():
         return read(path, _split_of(path))
@@ -272,6 +276,18 @@ def write_transforms(
 # --------------------------------------------------------------------------------------------------
 
 
+def _scaled(path: Path, name: str, scale: int) -> str:
+    """The name of a smaller copy of an image."""
+    parts = list(Path(name).parts)
+    if "images" not in parts:
+        raise FileFormatError(
+            path, f"got {name!r}, which is not in a folder images; read it without a scale",
+            field="file_path",
+        )  # fmt: skip
+    parts[parts.index("images")] = f"images_{scale}"
+    return str(Path(*parts))
+
+
 def _split_of(path: Path) -> str | None:
     return next((split for split in SPLITS if path.name == f"transforms_{split}.json"), None)
 
@@ -285,6 +301,7 @@ def _read_file(
     with_points: bool,
     distorted: Distorted,
     ignore_keys: Sequence[str],
+    scale: int,
 ) -> Dataset:
     path = existing_file(path)
     data = _read_json(path)
@@ -317,7 +334,8 @@ def _read_file(
         cameras.append(_camera(values, image))
         lenses.append(lens)
         names.append(name)
-        paths.append(image)
+        # The camera is that of the full picture; with_images resizes it.
+        paths.append(image if scale == 1 else _find_image(path.parent / _scaled(path, name, scale)))
     keys = {key for level in (data, *frames) for key in level}
     unknown = sorted(keys - USED - UNUSED - CHANGES_THE_PICTURE.keys())
     if unknown:
@@ -329,7 +347,11 @@ def _read_file(
     _warn_of_own_intrinsics(path, data, frames)
     splits = _splits(path, data, names, paths, split)
     cameras, available = with_images(
-        path, cameras, paths, missing_images=missing_images, resize_cameras=resize_cameras
+        path,
+        cameras,
+        paths,
+        missing_images=missing_images,
+        resize_cameras=resize_cameras or scale > 1,
     )
     points = colors = None
     ply = data.get("ply_file_path") if with_points else None

@@ -48,6 +48,26 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Count what would be measured, and run nothing.")
     ] = False,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help=(
+                "Run the study's editing methods on this capture (transforms.json, COLMAP,"
+                " BlendedMVS) instead of on scenes; --size is then the longest side."
+            )
+        ),
+    ] = None,
+    ply: Annotated[Path | None, typer.Option(help="With --data: its splats.")] = None,
+    instruction: Annotated[str | None, typer.Option(help="With --data: the edit.")] = None,
+    target_prompt: Annotated[
+        str | None, typer.Option(help="With --data: what the edited scene shows.")
+    ] = None,
+    source_prompt: Annotated[
+        str | None, typer.Option(help="With --data: what the scene shows before.")
+    ] = None,
+    scale: Annotated[
+        int, typer.Option(help="With --data: 2, 4 or 8 reads images_2 and so on.")
+    ] = 1,
 ) -> None:
     """Run a study and write its report.
 
@@ -60,10 +80,57 @@ def run(
 
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
-    if dry_run:
+    if data is not None:
+        words = (instruction, target_prompt, source_prompt)
+        _run_on_capture(lambda: load_study(study), data, ply, words, out, size, scale)
+    elif dry_run:
         _print_plan(load, out)
     else:
         run_study(load, out, jobs, scheduler, keep_going)
+
+
+def _run_on_capture(
+    load: Callable[[], Study],
+    data: Path,
+    ply: Path | None,
+    words: tuple[str | None, str | None, str | None],
+    out: Path | None,
+    size: int | None,
+    scale: int,
+) -> None:
+    """Run a study's methods where no truth is known."""
+    from attnwarp.errors import InputError
+    from attnwarp.fit import load_views
+    from attnwarp.io import read_dataset, read_ply
+    from attnwarp_eval.experiments import captured
+
+    with clear_errors():
+        if ply is None:
+            raise InputError(
+                f"--data {data}: needs --ply; make it with: attnwarp fit {data} --out fit"
+            )
+        if words[0] is None:
+            raise InputError(f"--data {data}: needs --instruction, such as 'make it snow'")
+        loaded = load()
+        folder = out or Path("runs") / f"{loaded.name}-{data.resolve().name}"
+        try:
+            dataset = read_dataset(data, points=False, scale=scale)
+        except (FileNotFoundError, ValueError) as error:
+            raise InputError(f"--data: {error}") from None
+        views = load_views(dataset, max_size=size)
+        with progress(lines=True) as show, resumable(lambda: "finished edits are kept"):
+            result = captured.compare(
+                loaded,
+                views,
+                read_ply(ply),
+                captured.Words(words[0], words[1], words[2]),
+                folder,
+                show,
+            )
+    for what, why in result.left_out.items():
+        typer.echo(f"left out: {what}: {why}", err=True)
+    for name in ("captured.json", "captured.md", "captured.html"):
+        typer.echo(folder / name)
 
 
 def _print_plan(load: Callable[[], Study], out: Path | None) -> None:

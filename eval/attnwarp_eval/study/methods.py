@@ -41,6 +41,8 @@ class Job:
         truth: the true edited views by answer, in the order of ``cameras``. Only methods that
             bound others may look at it.
         budget: limits of the method; None for none. Only methods with ``takes_budget`` get one.
+        source_picture: (H, W, 3) sRGB in [0, 1], the source view edited by hand; None where the
+            editor edits it. Only methods with ``takes_picture`` get one.
     """
 
     gaussians: Gaussians
@@ -53,6 +55,7 @@ class Job:
     warps: Callable[[int, int], WarpedView] | None
     truth: Mapping[str, Sequence[Image]]
     budget: Budget | None = None
+    source_picture: Image | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +87,13 @@ class Method:
             variant, and the seed. ValueError: an unknown field or a value out of range.
         run: the method.
         takes_budget: whether it can be cut short by a budget.
+        takes_picture: whether its source view can be edited by hand.
     """
 
     settings: Callable[[str, dict[str, Any], int], dict[str, Any]]
     run: Callable[[Job], EditedScene]
     takes_budget: bool = False
+    takes_picture: bool = False
 
 
 def _propagate_settings(name: str, fields: dict[str, Any], seed: int) -> dict[str, Any]:
@@ -110,6 +115,7 @@ def _propagate(job: Job) -> EditedScene:
         PropagateSettings.from_dict(job.settings),
         warps=job.warps,
         folder=job.folder,
+        source_picture=job.source_picture,
     )
     return EditedScene(result.gaussians, result.edited, result.seconds, result.counters)
 
@@ -178,7 +184,7 @@ def _baseline(name: str) -> Method:
 
 
 METHODS: dict[str, Method] = {
-    "propagate": Method(_propagate_settings, _propagate),
+    "propagate": Method(_propagate_settings, _propagate, takes_picture=True),
     "true pictures": Method(_propagate_settings, _true_pictures),
     **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
 }

@@ -42,6 +42,7 @@ from attnwarp_eval.study.edit_truth import (
     neighbours,
     pair_of,
 )
+from attnwarp_eval.study.hand_made import Kind, hand_made
 from attnwarp_eval.study.methods import METHODS, EditedScene, Job
 from attnwarp_eval.study.parts import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
@@ -118,6 +119,8 @@ class VariantPart(Part):
     its preset, else the variant's. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``fitted`` takes splats that are fitted to
     true pictures (keys ``fit``) in place of sampled ones. ``budget`` cuts the method short.
+    ``by_hand`` gives the method a source view that was edited by hand
+    (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
     """
 
     method: str = "propagate"
@@ -126,6 +129,7 @@ class VariantPart(Part):
     fitted: bool = False
     editor: EditorPart | None = None
     budget: BudgetPart | None = None
+    by_hand: Kind | None = None
 
 
 @dataclass(frozen=True)
@@ -245,6 +249,12 @@ class EditingProbe(Probe[EditResult]):
             raise ValueError(
                 f"budget: method {own.method!r} runs to its end; methods with a budget are {able}"
             )
+        if own.by_hand is not None and not METHODS[own.method].takes_picture:
+            able = ", ".join(repr(name) for name, method in METHODS.items() if method.takes_picture)
+            raise ValueError(
+                f"by_hand: method {own.method!r} edits its source itself; methods that take a"
+                f" picture are {able}"
+            )
         if self.name in study.probes or own.options or study.part(StudyPart).editing.options:
             settings_of(study, variant, 0)
 
@@ -296,6 +306,7 @@ class EditingProbe(Probe[EditResult]):
                 else {"splats": study.splats_of(variant).model_dump()}
             ),
             **self._budget_spec(study, variant, seed),
+            **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
         }
 
     def _budget_spec(self, study: Study, variant: Variant, seed: int) -> Json:
@@ -319,7 +330,7 @@ class EditingProbe(Probe[EditResult]):
         settings = settings_of(study, variant, 0)
         return (
             own.method, settings, variant.geometry, own.mask, splats_from,
-            editor_of(study, variant), own.budget,
+            editor_of(study, variant), own.budget, own.by_hand,
         )  # fmt: skip
 
     # From a cell to its record
@@ -435,8 +446,24 @@ def run_method(
             _warps(work, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},
             budget,
+            source_by_hand(work, truth, names[0]),
         )
         return METHODS[spec["method"]].run(job)
+
+
+def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
+    """The source view that a cell's spec has edited by hand: the first answer; None for none."""
+    kind = work.spec.get("by_hand")
+    if kind is None:
+        return None
+    answer = next(iter(truth.answers))
+    return hand_made(
+        kind,
+        truth.originals[source],
+        truth.answers[answer][source],
+        truth.masks[answer][source],
+        work.spec["seed"],
+    )
 
 
 def splats_of(work: Work) -> Gaussians:
@@ -643,6 +670,7 @@ class _Measure:
         answer = self.judged.answer
         shown = {
             "before": self.truth.originals[name],
+            "by hand": source_by_hand(self.work, self.truth, self.source),
             "source edit": self.pictures["edit"].get(self.source),
             "edited": self.pictures["edit"].get(name),
             "render": self.pictures["render"][name],

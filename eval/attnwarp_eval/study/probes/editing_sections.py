@@ -222,7 +222,12 @@ def side_by_side(results: Results, probe: str) -> Section | None:
     for (scene, view), variants in rows.items():
         first = next(iter(variants.values()))
         shown = [Picture(first[key], key.replace("-", " ")) for key in ("before", "source-edit")]
-        shown += [Picture(own["edited"], name) for name, own in variants.items() if "edited" in own]
+        for name, files in variants.items():
+            if "by-hand" in files:
+                shown.append(Picture(files["by-hand"], f"{name}: the source, by hand"))
+                shown.append(Picture(files["source-edit"], f"{name}: the source, replayed"))
+            if "edited" in files:
+                shown.append(Picture(files["edited"], name))
         if "truth" in first:
             shown.append(Picture(first["truth"], "truth of the source's answer"))
         gallery.append((f"**{scene}, {view}**", shown))

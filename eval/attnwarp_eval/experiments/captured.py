@@ -1,0 +1,316 @@
+"""A study's methods on a person's own capture, of which no truth is known.
+
+Figures that need no true pictures are computed; all others are left out by name. Each method has a
+folder of its own and goes on there after an interruption.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.errors import InputError
+from attnwarp_eval.document import write
+from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.document.numbers import number
+from attnwarp_eval.files import write_atomic, write_picture
+from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.study.methods import METHODS, EditedScene, Job
+from attnwarp_eval.study.parts import Study, Variant
+from attnwarp_eval.study.probes import editing
+from attnwarp_eval.study.probes.sensitivity import StudyPart as EncodersPart
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.user_images import measure
+
+if TYPE_CHECKING:
+    from attnwarp.camera import Camera
+    from attnwarp.fit import Views
+    from attnwarp.gaussians import Gaussians
+
+WITHOUT_TRUTH = ("image.", "embedding.")
+"""Beginnings of the names of figures that need no true pictures."""
+
+SHOWN = 4
+"""Views side by side in the report, evenly spread."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """What is asked for.
+
+    Attributes:
+        instruction: for editors that are told what to change.
+        target: what the edited scene shows, for editors guided by depth and for CLIP; None: depth
+            editors get the instruction, and CLIP's figures are left out.
+        source: what the scene showed before, for CLIP's direction; None leaves that out.
+    """
+
+    instruction: str
+    target: str | None = None
+    source: str | None = None
+
+
+@dataclass
+class Comparison:
+    """The result of all methods.
+
+    Attributes:
+        rows: by variant, its figures and costs.
+        left_out: variants and figures -> why.
+    """
+
+    rows: dict[str, dict[str, Any]] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def needs_truth(variant: Variant) -> str | None:
+    """Why a variant cannot run without a scene whose truth is known; None where it can."""
+    own = variant.part(editing.VariantPart)
+    if own.method == "true pictures":
+        return "its edits are the true pictures"
+    if own.mask == "truth" or variant.geometry == "truth":
+        return "its warp is the true one"
+    if own.by_hand is not None:
+        return "its source is drawn from the true picture"
+    if own.fitted:
+        return "its splats are fitted to true pictures"
+    return None
+
+
+def compare(
+    study: Study,
+    views: Views,
+    splats: Gaussians,
+    words: Words,
+    out: Path,
+    progress: Progress = silent,
+) -> Comparison:
+    """Run every variant of a study on a capture, measure it, and write a report.
+
+    Args:
+        study: with the probe ``editing``.
+        views: pictures and cameras, the source first.
+        splats: the scene before the edit.
+        words: the edit.
+        out: folder of ``captured.json``, ``.md`` and ``.html``, and of a folder for each variant.
+        progress: told of each variant.
+
+    Raises:
+        InputError: no variant that can run without truth, or one whose folder holds another run.
+    """
+    names = study.probes.get("editing", [])
+    result = Comparison()
+    for name in names:
+        if (reason := needs_truth(study.variants[name])) is not None:
+            result.left_out[f"variant {name}"] = reason
+    usable = [name for name in names if f"variant {name}" not in result.left_out]
+    if not usable:
+        raise InputError(f"{study.name}: no variant of the probe editing runs without truth")
+    # Variants whose seconds limit others come first.
+    usable.sort(key=lambda name: _reference(study.variants[name]) is not None)
+    result.left_out |= {
+        title: f"{metric} needs the true edited views or the true surface"
+        for title, metric in editing.EditingProbe.columns.items()
+        if not metric.startswith(WITHOUT_TRUTH)
+    }
+    originals = _originals(views, out / "originals")
+    seconds: dict[str, float] = {}
+    for place, name in enumerate(usable):
+        progress(place, len(usable), name)
+        folder = out / f"variant-{names.index(name) + 1}"
+        edited = _edit(study, name, views, splats, words, folder / "run", seconds)
+        seconds[name] = sum(edited.seconds.get(part, 0.0) for part in editing.OWN_WORK)
+        _write_pictures(views.cameras, edited, originals, folder)
+        result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
+        result.rows[name] |= {
+            "folder": folder.name,
+            "seconds": seconds[name],
+            "network_rows": edited.counters.get("network_rows", math.nan),
+            "edited_views": len(edited.edited),
+            "cut": edited.cut,
+        }
+    progress(len(usable), len(usable), "report")
+    _write(study, words, views.cameras, result, out)
+    return result
+
+
+def _reference(variant: Variant) -> str | None:
+    budget = variant.part(editing.VariantPart).budget
+    return None if budget is None else budget.seconds_of
+
+
+def _originals(views: Views, folder: Path) -> list[npt.NDArray[np.float32]]:
+    """(H, W, 3) pictures over black, also written as files."""
+    import torch
+
+    images = [views.target(k, torch.zeros(3)).numpy() for k in range(len(views.cameras))]
+    for k, image in enumerate(images):
+        write_picture(folder / f"{_name(k)}.png", _bytes(image))
+    return images
+
+
+def _name(view: int) -> str:
+    return f"view-{view:04d}"
+
+
+def _bytes(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)
+
+
+def _edit(
+    study: Study,
+    name: str,
+    views: Views,
+    splats: Gaussians,
+    words: Words,
+    folder: Path,
+    seconds: dict[str, float],
+) -> EditedScene:
+    import torch
+
+    from attnwarp.baselines import Budget
+
+    variant = study.variants[name]
+    own = variant.part(editing.VariantPart)
+    part = editing.editor_of(study, variant)
+    editor = editing.load(part.name, editing.editor_identity(part))
+    settings = editing.settings_of(study, variant, study.seeds[0])
+    if settings.get("size") is None:
+        settings["size"] = editor.unet.config.sample_size * editor.factor
+    budget = None
+    if own.budget is not None:
+        limit = own.budget.seconds
+        if own.budget.seconds_of is not None:
+            if own.budget.seconds_of not in seconds:
+                raise InputError(
+                    f"variants.{name}.budget.seconds_of: {own.budget.seconds_of!r} is not"
+                    " measured; add it to probes.editing"
+                )
+            limit = seconds[own.budget.seconds_of]
+        budget = Budget(limit, own.budget.network_rows)
+    text = words.target or words.instruction if editor.guide == "depth" else words.instruction
+    black = torch.zeros(3)
+    images = [views.target(k, black).numpy() for k in range(len(views.cameras))]
+    folder.mkdir(parents=True, exist_ok=True)
+    job = Job(
+        splats, views.cameras, images, editor, text, settings, folder, None, {}, budget
+    )  # fmt: skip
+    return METHODS[own.method].run(job)
+
+
+def _write_pictures(
+    cameras: Sequence[Camera],
+    edited: EditedScene,
+    originals: Sequence[npt.NDArray[np.float32]],
+    folder: Path,
+) -> None:
+    """Renders of all views and the edited views, at the capture's size."""
+    from attnwarp.propagate.pictures import enlarged_change
+    from attnwarp.propagate.scene import near_of, render_picture
+
+    near = near_of(cameras)
+    for k, camera in enumerate(cameras):
+        picture = render_picture(edited.gaussians, camera, near, "auto")
+        write_picture(folder / "renders" / f"{_name(k)}.png", _bytes(picture))
+    for k, pixels in edited.edited.items():
+        picture = enlarged_change(originals[k], pixels.astype(np.float32) / np.float32(255))
+        write_picture(folder / "edited" / f"{_name(k)}.png", _bytes(picture))
+
+
+def _measured(
+    study: Study,
+    edited: EditedScene,
+    words: Words,
+    folder: Path,
+    originals: Path,
+    result: Comparison,
+) -> dict[str, Any]:
+    source = folder / "edited" / f"{_name(0)}.png"
+    inputs = measure.Inputs(
+        renders=folder / "renders",
+        edited=folder / "edited",
+        originals=originals,
+        source_edit=source if 0 in edited.edited else None,
+        prompt=words.target,
+        source_prompt=words.source,
+    )
+    encoders: dict[Any, str | None] = {
+        str(kind): name for kind, name in study.part(EncodersPart).encoders.items()
+    }
+    done = measure.measure(inputs, encoders, store=Store(folder / "measured"))
+    result.left_out |= {
+        title: why for title, why in done.missing.items() if title not in result.left_out
+    }
+    return {"figures": {row.title: row.value for row in done.rows}}
+
+
+def _write(
+    study: Study, words: Words, cameras: Sequence[Camera], result: Comparison, out: Path
+) -> None:
+    from attnwarp_eval.canonical_json import without_nan
+
+    document = report(study, words, cameras, result)
+    data = {
+        "study": study.name,
+        "words": vars(words),
+        "views": [camera.name for camera in cameras],
+        "variants": result.rows,
+        "left_out": result.left_out,
+    }
+    text = json.dumps(without_nan(data), indent=1, ensure_ascii=False) + "\n"
+    write_atomic(out / "captured.json", text.encode())
+    write_atomic(out / "captured.md", write.markdown(document).encode())
+    write_atomic(out / "captured.html", write.page(document, out).encode())
+
+
+def report(study: Study, words: Words, cameras: Sequence[Camera], result: Comparison) -> Report:
+    """The comparison as a document."""
+    titles = list(dict.fromkeys(t for row in result.rows.values() for t in row["figures"]))
+    costs = ["seconds", "network rows", "edited views", "cut short by"]
+    rows = [
+        [
+            name,
+            *(number(row["figures"].get(title, math.nan)) for title in titles),
+            number(row["seconds"]),
+            number(row["network_rows"]),
+            str(row["edited_views"]),
+            (row["cut"] or "–").replace("_", " "),
+        ]
+        for name, row in result.rows.items()
+    ]
+    table = Table(["variant", *titles, *costs], rows, timed=("seconds",))
+    lacking = Table(["left out", "reason"], [list(entry) for entry in result.left_out.items()])
+    count = len(cameras)
+    views = sorted({k * count // min(SHOWN, count) for k in range(min(SHOWN, count))})
+    pictures = []
+    for view in views:
+        shown = [Picture(f"originals/{_name(view)}.png", "before")]
+        shown += [
+            Picture(f"{row['folder']}/renders/{_name(view)}.png", name)
+            for name, row in result.rows.items()
+        ]
+        pictures.append((f"**{cameras[view].name or _name(view)}**", shown))
+    lead = [
+        f"Study `{study.name}` on {count} views; instruction: {words.instruction}.",
+        "One scene and one seed: figures without intervals, from which nothing follows for other"
+        " scenes.",
+    ]
+    cut = [name for name, row in result.rows.items() if row["cut"]]
+    if cut:
+        lead.append(f"**Did not finish within their budget: {', '.join(cut)}.**")
+    return Report(
+        f"{study.title or study.name}, on a capture",
+        lead,
+        [
+            Section("Figures that need no truth", tables=[table]),
+            Section("Left out", ["What cannot be computed here, by name."], [lacking]),
+            Section("Edited scenes", gallery=Gallery(pictures)),
+        ],
+    )

@@ -1,0 +1,176 @@
+"""A study on a person's capture. Oracles: the files that were written, and another library's PSNR."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio
+from typer.testing import CliRunner
+
+from attnwarp import Camera, Gaussians
+from attnwarp.io import Dataset, write_ply, write_transforms
+from attnwarp.render import render
+from attnwarp_eval.cli.main import app
+
+STUDY = {
+    "name": "mine",
+    "scenes": ["bear"],
+    "encoders": {"clip": "clip-small", "dino": "dino-small"},
+    "editing": {"editor": {"name": "small-plain"}, "options": {"size": 32}},
+    "variants": {
+        "whole": {"method": "by_view", "options": {"steps": 1, "iterations": 2}},
+        "short": {"method": "by_view", "options": {"steps": 1, "iterations": 2, "batch": 1},
+                  "budget": {"network_rows": 5}},
+        "ceiling": {"method": "true pictures"},
+        "oracle": {"mask": "truth"},
+    },
+    "probes": {"editing": ["whole", "short", "ceiling", "oracle"]},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture of three views of 32 px, in two scales, its splats, and a study."""
+    path = tmp_path_factory.mktemp("capture")
+    generator = torch.Generator().manual_seed(0)
+    splats = Gaussians(
+        "2d",
+        torch.randn(60, 3, generator=generator) * 0.4,
+        torch.nn.functional.normalize(torch.randn(60, 4, generator=generator), dim=1),
+        torch.full((60, 2), 0.15),
+        torch.full((60,), 0.9),
+        torch.randn(60, 1, 3, generator=generator) * 0.5,
+    )
+    write_ply(path / "scene.ply", splats)
+    cameras, paths = [], []
+    for k, angle in enumerate((-0.4, 0.0, 0.4)):
+        camera = Camera.look_at(
+            [3 * np.sin(angle), -3 * np.cos(angle), 0.5], [0, 0, 0], width=32, height=32, fov_y=40
+        )
+        pixels = np.round(255 * render(splats, camera).color.clamp(0, 1).numpy()).astype(np.uint8)
+        for name, side in (("images", 32), ("images_2", 16)):
+            (path / name).mkdir(exist_ok=True)
+            Image.fromarray(pixels).resize((side, side), Image.Resampling.BOX).save(
+                path / name / f"{k}.png"
+            )
+        cameras.append(camera)
+        paths.append(path / "images" / f"{k}.png")
+    write_transforms(path / "transforms.json", Dataset(cameras, paths))
+    (path / "study.yaml").write_text(yaml.safe_dump(STUDY))
+    return path
+
+
+def run(folder, out, *more):
+    return CliRunner().invoke(app, [
+        "run", str(folder / "study.yaml"), "--data", str(folder), "--out", str(out), *map(str, more),
+    ])  # fmt: skip
+
+
+WORDS = (
+    "--instruction",
+    "make it red",
+    "--target-prompt",
+    "a red thing",
+    "--source-prompt",
+    "a thing",
+)
+
+
+def read(path):
+    return np.asarray(Image.open(path))
+
+
+@pytest.fixture(scope="module")
+def done(folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out")
+    result = run(folder, out, "--ply", folder / "scene.ply", *WORDS)
+    assert result.exit_code == 0, result.output
+    return result, out, json.loads((out / "captured.json").read_text())
+
+
+def test_the_figures_are_those_of_the_written_pictures(done, folder):
+    _, out, data = done
+    assert list(data["variants"]) == ["whole", "short"]
+    row = data["variants"]["whole"]
+    renders, edited = (
+        {p.stem: read(p) for p in (out / row["folder"] / name).iterdir()}
+        for name in ("renders", "edited")
+    )
+    assert sorted(renders) == sorted(edited) == [f"view-{k:04d}" for k in range(3)]
+    expected = np.mean(
+        [peak_signal_noise_ratio(edited[k], renders[k], data_range=255) for k in renders]
+    )
+    assert row["figures"]["Edit PSNR, mean of the views"] == pytest.approx(expected, abs=1e-3)
+    assert set(row["figures"]) >= {
+        "CLIP similarity",
+        "CLIP directional similarity",
+        "DINO single-image similarity",
+    }
+    # Three views, one step, two rows each; image guidance of 1 drops a branch.
+    assert (row["network_rows"], row["edited_views"], row["cut"]) == (6, 3, None)
+    for k in range(3):
+        assert (
+            read(out / "originals" / f"view-{k:04d}.png") == read(folder / "images" / f"{k}.png")
+        ).all()
+
+
+def test_what_did_not_finish_and_what_needs_truth_stand_there_by_name(done):
+    result, out, data = done
+    assert (data["variants"]["short"]["cut"], data["variants"]["short"]["edited_views"]) == (
+        "network_rows",
+        2,
+    )
+    left = data["left_out"]
+    assert left["variant ceiling"] == "its edits are the true pictures"
+    assert left["variant oracle"] == "its warp is the true one"
+    assert {"same answer", "PSNR to truth inside, dB", "AbsRel of depth after"} <= set(left)
+    assert not {"Edit PSNR, dB", "CLIP direction"} & set(left)
+    assert "left out: variant ceiling" in result.stderr
+    report = (out / "captured.md").read_text()
+    assert "**Did not finish within their budget: short.**" in report
+    assert "| same answer | multiview.same_answer.edit needs" in report
+    assert (out / "captured.html").read_text().count("data:image/png") >= 3
+
+
+def test_a_second_run_edits_nothing_again_and_gives_the_same_figures(done, folder):
+    _, out, data = done
+    before = (out / "variant-1" / "run" / "rounds" / "1.pt").stat().st_mtime_ns
+    assert run(folder, out, "--ply", folder / "scene.ply", *WORDS).exit_code == 0
+    again = json.loads((out / "captured.json").read_text())
+    assert (out / "variant-1" / "run" / "rounds" / "1.pt").stat().st_mtime_ns == before
+    assert again["variants"]["whole"]["figures"] == data["variants"]["whole"]["figures"]
+
+
+def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path):
+    done = run(
+        folder,
+        tmp_path,
+        "--ply",
+        folder / "scene.ply",
+        "--instruction",
+        "make it red",
+        "--scale",
+        2,
+    )
+    assert done.exit_code == 0, done.output
+    assert read(tmp_path / "originals" / "view-0000.png").shape == (16, 16, 3)
+    left = json.loads((tmp_path / "captured.json").read_text())["left_out"]
+    assert left["CLIP similarity"] == "needs --prompt"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--instruction", "red"], "needs --ply"),
+        (["--ply", "scene.ply"], "needs --instruction"),
+        (["--ply", "scene.ply", "--instruction", "red", "--scale", "3"], "scale: got 3"),
+        (["--ply", "none.ply", "--instruction", "red"], "none.ply"),
+    ],
+)
+def test_what_is_missing_is_one_line(folder, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(folder)
+    done = run(folder, tmp_path, *arguments)
+    assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
