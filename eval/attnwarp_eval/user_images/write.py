@@ -1,4 +1,4 @@
-"""What was measured on a person's pictures, as JSON, as Markdown and as a table on the terminal."""
+"""Metrics of a user's pictures as JSON, as Markdown and as a table on the terminal."""
 
 from __future__ import annotations
 
