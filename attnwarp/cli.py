@@ -19,6 +19,9 @@ import typer
 
 from attnwarp.editing.cli import (
     SEGMENTER,
+    DeviceOption,
+    EditorOption,
+    InstructionOption,
     SegmenterOption,
     ThreadsOption,
     WhereOption,
@@ -113,6 +116,12 @@ class Coordinates(StrEnum):
     relative = "relative"
 
 
+DataArgument = Annotated[
+    Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
+]
+MaxSizeOption = Annotated[
+    int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
+]
 FormatOption = Annotated[
     Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")
 ]
@@ -232,9 +241,7 @@ def _use_threads(threads: int | None) -> None:
 
 @app.command()
 def fit(
-    data: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
-    ],
+    data: DataArgument,
     out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
     kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids.")] = Kind.two,
     iterations: Annotated[
@@ -243,9 +250,7 @@ def fit(
     max_seconds: Annotated[
         float | None, typer.Option(min=0, help="Stop after so many seconds of fitting.")
     ] = None,
-    max_size: Annotated[
-        int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
-    ] = None,
+    max_size: MaxSizeOption = None,
     max_splats: Annotated[
         int | None, typer.Option(min=1, help="Do not grow the model beyond.")
     ] = None,
@@ -496,17 +501,13 @@ def _near(settings: FitSettings, extent: float) -> float:
 
 @app.command()
 def edit(
-    data: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
-    ],
-    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    data: DataArgument,
+    instruction: InstructionOption,
     out: Annotated[Path, typer.Option(help="Folder for the result; an edit in it is resumed.")],
     ply: Annotated[
         Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
     ] = None,
-    editor: Annotated[
-        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
-    ] = "small-plain",
+    editor: EditorOption = "small-plain",
     preset: Annotated[
         Preset, typer.Option(help="The method's choices; see docs/editing-a-scene.md.")
     ] = Preset.corrected,
@@ -548,11 +549,9 @@ def edit(
     max_splats: Annotated[
         int, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
     ] = 30_000,
-    max_size: Annotated[
-        int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
-    ] = None,
+    max_size: MaxSizeOption = None,
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
-    device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
+    device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
     format: FormatOption = None,
     images: ImagesOption = None,
@@ -722,9 +721,7 @@ def convert(
 
 @app.command()
 def undistort(
-    data: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
-    ],
+    data: DataArgument,
     out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],
     format: FormatOption = None,
     images: ImagesOption = None,
@@ -757,9 +754,7 @@ def inspect(
     splats: Annotated[
         Path, typer.Argument(help="Splats (.ply, .splat), or a folder that attnwarp edit made.")
     ],
-    data: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
-    ],
+    data: DataArgument,
 ) -> None:
     """See a scene, its cameras and its warps in 3D; takes the options of attnwarp-eval inspect."""
     from importlib.util import find_spec
@@ -774,15 +769,11 @@ def inspect(
 @app.command()
 def baseline(
     method: Annotated[BaselineMethod, typer.Argument(help="Of docs/baselines.md.")],
-    data: Annotated[
-        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder, with images.")
-    ],
+    data: DataArgument,
     ply: Annotated[Path, typer.Option(help="Splats of the scene, such as attnwarp fit makes.")],
-    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    instruction: InstructionOption,
     out: Annotated[Path, typer.Option(help="Folder for the result; a run in it is resumed.")],
-    editor: Annotated[
-        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
-    ] = "small-plain",
+    editor: EditorOption = "small-plain",
     preset: Annotated[
         str, typer.Option(help="The method's choices; see docs/baselines.md.")
     ] = "default",
@@ -796,14 +787,9 @@ def baseline(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the method."),
     ] = None,
-    max_size: Annotated[
-        int | None, typer.Option(min=16, help="Shrink larger images to this many px.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")] = "cpu",
-    threads: Annotated[
-        int | None,
-        typer.Option(min=1, help="CPU threads; all cores if left out, one for a bundled editor."),
-    ] = None,
+    max_size: MaxSizeOption = None,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
     format: FormatOption = None,
     images: ImagesOption = None,
     missing_images: MissingOption = MissingImages.error,
@@ -820,13 +806,8 @@ def baseline(
         settings = choices(method.value, preset, **changes)
         budget = Budget(seconds, network_rows)
         _use_threads(threads)
-        import torch
-
         from attnwarp.baselines.command import edit_dataset
-        from attnwarp.editing.small import bundled
 
-        small = editor in bundled()
-        torch.set_num_threads(threads or (1 if small else len(os.sched_getaffinity(0))))
         dataset = _read_views(
             data,
             format=format,
@@ -838,7 +819,7 @@ def baseline(
         )
         result = edit_dataset(
             method.value, dataset, _read_splats(ply, None, None), editor, instruction, settings,
-            out, budget=budget, max_size=max_size, device=device,
+            out, budget=budget, max_size=max_size, device=device, threads=threads,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(

@@ -8,7 +8,7 @@ import torch
 
 from attnwarp.baselines import METHODS, Baseline
 from attnwarp.baselines.settings import BaselineSettings, Budget
-from attnwarp.editing.small import load_editor
+from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.fit import load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset
@@ -27,6 +27,7 @@ def edit_dataset(
     budget: Budget,
     max_size: int | None,
     device: str,
+    threads: int | None,
 ) -> Baseline:
     """Run a method on the views of a data set.
 
@@ -41,6 +42,7 @@ def edit_dataset(
         budget: limits of the run.
         max_size: larger pictures are averaged down to it.
         device: of the editor.
+        threads: of the editor; see :func:`attnwarp.editing.small.thread_count`.
 
     Raises:
         InputError: no such editor; a folder of another run.
@@ -49,6 +51,7 @@ def edit_dataset(
     black = torch.zeros(3)
     images = [views.target(k, black).numpy() for k in range(len(views))]
     editor = load_editor(editor_name, device=device)
+    torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)
     with progress_display(title=out.name) as progress:

@@ -15,6 +15,11 @@ TILE_COLUMNS = 5
 SEGMENTER = "clip-small"
 """What ``--where`` asks if ``--segmenter`` is left out."""
 
+InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
+EditorOption = Annotated[
+    str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
+]
+DeviceOption = Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")]
 WhereOption = Annotated[
     str | None,
     typer.Option(
@@ -35,11 +40,9 @@ ThreadsOption = Annotated[
 
 def edit_image(
     picture: Annotated[Path, typer.Argument(help="A PNG or JPEG file.")],
-    instruction: Annotated[str, typer.Option(help='What to change, such as "make it red".')],
+    instruction: InstructionOption,
     out: Annotated[Path, typer.Option(help="PNG file for the result.")],
-    editor: Annotated[
-        str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
-    ] = "small-plain",
+    editor: EditorOption = "small-plain",
     seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
     steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
     size: Annotated[
@@ -60,7 +63,7 @@ def edit_image(
     mask_out: Annotated[
         Path | None, typer.Option("--mask", help="PNG file for the mask that --where gives.")
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
 ) -> None:
     """Edit a picture by an instruction."""

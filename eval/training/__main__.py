@@ -76,7 +76,7 @@ def export(name: str, out: Out = OUT, weights: Weights = WEIGHTS) -> None:
 def assess(
     name: str, data: Data = DATA, out: Out = OUT, weights: Weights = WEIGHTS, threads: Threads = 2
 ) -> None:
-    """Measure an encoder on what it has never seen, and write its card; the checkpoint, if there is
+    """Measure an encoder on unseen data, and write its card; the checkpoint, if there is
     one, says how long training took.
     """
     import torch

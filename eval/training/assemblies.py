@@ -504,7 +504,7 @@ def _moved(part: Part, x: float, y: float, z: float, size: float) -> Part:
 
 @dataclass(frozen=True)
 class Assembly(World):
-    """A thing with parts, one of which an edit changes; the rest looks as it did.
+    """A thing with parts, one of which an edit changes.
 
     Attributes:
         thing: index into :data:`KINDS`.
@@ -515,7 +515,7 @@ class Assembly(World):
 
     @property
     def kind(self) -> str:
-        """What it is."""
+        """Name of its kind."""
         return KINDS[self.thing]
 
     def pieces(self) -> Pieces:
@@ -524,7 +524,7 @@ class Assembly(World):
         return RECIPES[self.kind](Dice(rng))
 
     def surfaces(self, look: Look) -> tuple[Look, ...]:
-        """A look for each part: the given one where the edit goes, the world's own elsewhere.
+        """A look for each part: the given one for the edited part, the world's own for the others.
 
         A look without a finish (-1) leaves every part as it was before an edit.
         """
@@ -553,7 +553,7 @@ class Assembly(World):
         return tuple(k for k, name in enumerate(self.pieces()) if self.part in (name, WHOLE))
 
     def spec(self, look: Look, size: int, *, statue: bool | None = None) -> dict[str, Any]:
-        """The scene, as a file would say it: the parts first, then the ground."""
+        """The scene as a file has it: the parts first, then the ground."""
         alone = World(OBJECTS.index("ball"), 0, self.seed, self.views, self.bare)
         base = alone.spec(look, size)
         first, ground, *rest = base["objects"]

@@ -1,4 +1,4 @@
-"""Model cards: what each bundled encoder was made from, what it can and cannot do, and the figures
+"""Model cards: data, abilities and limits of each bundled encoder, and the figures
 behind that.
 """
 

@@ -35,8 +35,8 @@ from training.worlds import (
     OBJECTS,
     TIMES,
     TWO_COLORED,
+    captioned,
     sentence,
-    told,
 )
 
 SEED = 1
@@ -65,7 +65,7 @@ def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
     corpus = []
     for _ in range(sentences):
         drawn = _any_attributes(rng)
-        corpus.append(sentence(told(drawn, rng), rng, fillers=True))
+        corpus.append(sentence(captioned(drawn, rng), rng, fillers=True))
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
@@ -235,17 +235,17 @@ def naming_loss(
     logits = model.scale.clamp(max=4.6).exp() * images @ words.T
     total = torch.zeros(())
     for column, low, high in spans:
-        asked = attributes[:, column] >= 0
+        counted = attributes[:, column] >= 0
         if (
             column == 1
         ):  # without its colour, a coloured finish cannot be told from pattern or shine
-            asked &= ~np.isin(attributes[:, 1], [FINISHES.index(f) for f in COLORED])
+            counted &= ~np.isin(attributes[:, 1], [FINISHES.index(f) for f in COLORED])
         if column == 2:
-            asked &= np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
-        if asked.any():
-            rows = torch.from_numpy(np.flatnonzero(asked))
+            counted &= np.isin(attributes[:, 1], [FINISHES.index("plain"), FINISHES.index("shiny")])
+        if counted.any():
+            rows = torch.from_numpy(np.flatnonzero(counted))
             loss = functional.cross_entropy(
-                logits[rows, low:high], torch.from_numpy(attributes[asked, column])
+                logits[rows, low:high], torch.from_numpy(attributes[counted, column])
             )
             total = total + (2 if column == 0 else 1) * loss
     return total / (len(spans) + 1)
@@ -269,17 +269,19 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         (k, rows) for k, part in enumerate(sets) for rows in part.views for _ in range(part.times)
     ]
     each = sum(len(rows) for _, rows in units) // BATCH
-    seen = [*groups(model.vision, 0.05), *groups(heads, 0.05)]
+    pretrained = [*groups(model.vision, 0.05), *groups(heads, 0.05)]
     optimizer = torch.optim.AdamW(
         [
-            *seen,
+            *pretrained,
             *groups(model.pool, 0.05),
             *groups(model.text, 0.05),
             {"params": [model.scale], "weight_decay": 0.0},
         ],
         betas=(0.9, 0.98),
     )
-    peaks = [PEAK * VISION] * len(seen) + [PEAK] * (len(optimizer.param_groups) - len(seen))
+    peaks = [PEAK * VISION] * len(pretrained) + [PEAK] * (
+        len(optimizer.param_groups) - len(pretrained)
+    )
 
     def epoch(number: int) -> dict[str, float]:
         rng = np.random.default_rng([SEED, number])
@@ -299,7 +301,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             images = scrambled(images, is_scrambled, rng)
             attributes[is_scrambled, 1:] = -1
             whole = np.flatnonzero(~is_scrambled)
-            captions = [told(tuple(int(v) for v in row), rng) for row in attributes[whole]]
+            captions = [captioned(tuple(int(v) for v in row), rng) for row in attributes[whole]]
             false_captions = [wrong(s, rng) for s in captions]
             texts = [
                 _scattered(sentence(s, rng, fillers=True), rng)

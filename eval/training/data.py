@@ -84,7 +84,7 @@ TEXELS = 512
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Pictures with what they show.
+    """Pictures with their attributes.
 
     Attributes:
         images: (N, size, size, 3) uint8 sRGB.
@@ -181,7 +181,7 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
 
 
 def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
-    """Render what is missing of a split; the files of it, in order."""
+    """Render the missing files of a split; all of them are returned in order."""
     from rich.progress import Progress
 
     split = SPLITS[name]

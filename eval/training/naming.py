@@ -59,15 +59,15 @@ class Heads(nn.Module):
         return dict(zip(self.counts, parts, strict=True))
 
     def forward(self, x: torch.Tensor, attributes: Ints) -> torch.Tensor:
-        """Cross-entropy of (N, dim) features with what is shown, (N, 6), meant over the attributes;
-        -1 is not asked.
+        """Cross-entropy of (N, dim) features with the attributes (N, 6), mean over attributes;
+        -1 is left out.
         """
         total = torch.zeros(())
         for column, scores in self.scores(x).items():
-            asked = torch.from_numpy(attributes[:, column])
-            if bool((asked >= 0).any()):
+            labels = torch.from_numpy(attributes[:, column])
+            if bool((labels >= 0).any()):
                 loss = functional.cross_entropy(
-                    scores, asked, ignore_index=-1, label_smoothing=SMOOTHING
+                    scores, labels, ignore_index=-1, label_smoothing=SMOOTHING
                 )
                 total = total + (2 if column == 0 else 1) * loss
         return total / (len(self.counts) + 1)

@@ -449,7 +449,7 @@ SHARP = {"cube", "cone", "cylinder", "mug", "chair", "table", "lamp", "house", "
 
 
 def body(word: str, instance: int, *, plain: bool = False, resolution: int = 64) -> dict[str, Any]:
-    """The shape of one instance of ``word``, as a scene file says it, standing at the origin.
+    """The shape of one instance of ``word``, as a scene file has it, at the origin.
 
     Args:
         word: a key of :data:`RECIPES`.

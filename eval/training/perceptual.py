@@ -137,8 +137,10 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             for group in optimizer.param_groups:
                 group["lr"] = rate(number * STEPS + step, epochs * STEPS, PEAK, 100)
             x, weak, strong, strengths = _batch(lambda: triple(sources, rng, TRAIN_KINDS), BATCH)
-            seen = [y.chunk(3) for y in model.stack(torch.cat([x, weak, strong]))]
-            near, far = (model.between([y[0] for y in seen], [y[k] for y in seen]) for k in (1, 2))
+            features = [y.chunk(3) for y in model.stack(torch.cat([x, weak, strong]))]
+            near, far = (
+                model.between([y[0] for y in features], [y[k] for y in features]) for k in (1, 2)
+            )
             d = torch.cat([near, far])
             order = functional.softplus(
                 -4 * (torch.log(far + 1e-5) - torch.log(near + 1e-5))

@@ -39,9 +39,7 @@ def overlap(mask: Mask, truth: Mask) -> float:
 
 
 def pictures(worlds: Worlds) -> Iterator[tuple[Image, Mask, str, str]]:
-    """Of each world a picture in a random look, the exact mask of its thing, the word for it, and the word for a thing
-    that it does not show.
-    """
+    """Of each world a picture in a random look, the exact mask of its thing, the word for it, and the word for a thing that is absent."""
     for world in range(len(worlds)):
         rng = np.random.default_rng([5, world])
         view, look = int(rng.integers(2)), int(rng.choice(np.flatnonzero(worlds.valid[world])))

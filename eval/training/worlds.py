@@ -1,4 +1,4 @@
-"""Random scenes with captions: what stands where, how it looks, and the sentences that are true of it.
+"""Random scenes with true captions: objects, their looks and places.
 
 A :class:`World` is a shape, its surroundings and its cameras; a :class:`Look` is how it appears: surface, ground and time
 of day. One world has many looks, so pictures come that differ in one attribute alone.
@@ -63,7 +63,7 @@ class Look:
 
     @cached_property
     def surface(self) -> dict[str, Any]:
-        """``texture`` or ``material`` of the object, as a scene file says it."""
+        """``texture`` or ``material`` of the object, as a scene file has it."""
         rng = np.random.default_rng([self.seed, 1])
         finish = FINISHES[self.finish]
         grain = {"variation": round(float(rng.uniform(0.05, 0.3)), 3), "grain": round(float(rng.uniform(0.03, 0.1)), 3)}
@@ -127,7 +127,7 @@ class Look:
 
     @cached_property
     def floor(self) -> dict[str, Any]:
-        """The ground's texture, as a scene file says it."""
+        """The ground's texture, as a scene file has it."""
         rng = np.random.default_rng([self.seed, 2])
         kind = GROUNDS[self.ground]
         bright = rng.uniform(0.85, 1.1)
@@ -171,7 +171,7 @@ class Look:
 
     @cached_property
     def lights(self) -> list[dict[str, Any]]:
-        """Sun and sky of the time of day, as a scene file says them."""
+        """Sun and sky of the time of day, as a scene file has them."""
         rng = np.random.default_rng([self.seed, 3])
         azimuth = round(float(rng.uniform(0, 360)), 1)
         match TIMES[self.time]:
@@ -266,7 +266,7 @@ class World:
         return (look,)
 
     def spec(self, look: Look, size: int, *, statue: bool | None = None) -> dict[str, Any]:
-        """The scene, as a file would say it; the object is object 0, the ground object 1."""
+        """The scene as a file has it; the object is object 0, the ground object 1."""
         rng = np.random.default_rng([self.seed, 4])
         statue = look.statue if statue is None else statue
         shape = body(OBJECTS[self.thing], self.instance, plain=statue)
@@ -421,7 +421,7 @@ def draw_look(thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> L
 
 
 def change(look: Look, what: str, thing: int, rng: np.random.Generator, *, pairs: str = "seen") -> Look:
-    """The look with one attribute changed: "surface" (finish and colours), "ground" or "time"; all else as it was."""
+    """The look with one attribute changed: "surface" (finish and colours), "ground" or "time"; all else the same."""
     while True:
         other = draw_look(thing, rng, pairs=pairs)
         match what:
@@ -438,7 +438,7 @@ def change(look: Look, what: str, thing: int, rng: np.random.Generator, *, pairs
 
 
 def attributes(thing: int, look: Look) -> tuple[int, ...]:
-    """What a picture shows, in the order of :data:`ATTRIBUTES`."""
+    """Attributes of a picture, in the order of :data:`ATTRIBUTES`."""
     return (thing, look.finish, look.color, look.second, look.ground, look.time)
 
 
@@ -474,7 +474,7 @@ FILLERS = (
 
 
 def surface_words(finish: int, color: int, second: int, rng: np.random.Generator) -> tuple[str, bool]:
-    """The adjective of a surface, and whether it is said of a statue ("bronze statue of a bear")."""
+    """The adjective of a surface, and whether it names a statue ("bronze statue of a bear")."""
     kind = FINISHES[finish]
     hue = _one(HUES[COLORS[color]], rng) if color >= 0 else ""
     match kind:
@@ -522,8 +522,8 @@ def sentence(values: tuple[int, ...], rng: np.random.Generator, *, fillers: bool
     return " ".join(" ".join(parts + tail).split())
 
 
-def told(pictured: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
-    """What a caption says of a picture: the object and the surface nearly always, ground and time half of the time."""
+def captioned(pictured: tuple[int, ...], rng: np.random.Generator) -> tuple[int, ...]:
+    """Attributes that a caption names: object and surface nearly always, ground and time half of the time."""
     thing, finish, color, second, ground, time = pictured
     if rng.uniform() < 0.2:
         return thing, -1, -1, -1, -1, -1

@@ -9,10 +9,10 @@ import json
 import pathlib
 import tarfile
 
+import mutate
 import numpy as np
 import pytest
 import yaml
-from mutate import mutate_bytes, mutate_text, survey
 
 from attnwarp.errors import InputError
 from attnwarp_eval import cache
@@ -180,17 +180,9 @@ def run_in(folder, sealed=True):
 def failures(name, folder, seeds):
     form = FORMATS[name](folder)
     form.use(form.whole)  # the undamaged file is read
-
-    def damaged(seed):
-        if name != "cache" and seed % 2:
-            return mutate_text(form.whole.decode(), seed).encode("utf-8", "surrogatepass")
-        return mutate_bytes(form.whole, seed)
-
-    cases = [(f"{name} {seed}", damaged(seed)) for seed in seeds]
-    outcomes = survey(cases, form.use, refusals=(InputError,))
-    assert len(outcomes) == len(cases)
-    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
-    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
+    return mutate.failures(
+        name, form.whole, form.use, seeds, refusals=(InputError,), text=name != "cache"
+    )
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

@@ -23,6 +23,7 @@ import traceback
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 SECONDS = 10.0
 """Longest time for one input."""
@@ -221,6 +222,38 @@ class Outcome:
     def failed(self) -> bool:
         """Whether it is neither a result nor a refusal in one line."""
         return self.kind not in ("result", "refused")
+
+
+def failures(
+    name: str,
+    whole: bytes,
+    read: Callable[[Any], object],
+    seeds: Sequence[int],
+    *,
+    refusals: tuple[type[BaseException], ...],
+    text: bool = False,
+) -> list[str]:
+    """What went wrong with damaged copies of a file, each by its label: the name and the seed.
+
+    Args:
+        name: of the file or of its format.
+        whole: the undamaged file.
+        read: see :func:`survey`.
+        seeds: one for each copy.
+        refusals: see :func:`survey`; at least one copy must be refused.
+        text: whether every second copy is damaged as a text.
+    """
+
+    def damaged(seed: int) -> bytes:
+        if text and seed % 2:
+            return mutate_text(whole.decode(), seed).encode("utf-8", "surrogatepass")
+        return mutate_bytes(whole, seed)
+
+    cases = [(f"{name} {seed}", damaged(seed)) for seed in seeds]
+    outcomes = survey(cases, read, refusals=refusals)
+    assert len(outcomes) == len(cases)
+    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
+    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
 
 
 def survey(

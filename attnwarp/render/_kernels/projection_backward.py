@@ -57,8 +57,9 @@ VIEW = ViewColumns()
 def view_row(view: View) -> np.ndarray:
     """(24,) the view for :func:`project_backward`.
 
-    One row, and one long function below: with separate values, or split, LLVM adds in another
-    order, and the last bits of the gradients move.
+    One row, and one long function below: with separate values LLVM adds in another order, and the
+    last bits of the gradients move. Steps that take the splat's arrays stay in it: a function of
+    its own counts references to each of them for every splat, which takes half as long again.
     """
     return np.array([*view.rotation.reshape(-1), *view.translation, *view[2:]], np.float64)
 
@@ -74,6 +75,63 @@ def _rotation(quats, i, Q):
     Q[1, 0], Q[1, 1], Q[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
     Q[2, 0], Q[2, 1], Q[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     return length
+
+
+@inlined
+def _direction_backward(degree, x, y, z, d_basis):
+    """From gradients in the harmonics to those in the direction (x, y, z), as if it were free."""
+    dx, dy, dz = 0.0, 0.0, 0.0
+    if degree > 0:
+        dx -= C1 * d_basis[3]
+        dy -= C1 * d_basis[1]
+        dz += C1 * d_basis[2]
+    if degree > 1:
+        dx += (
+            C2[0] * y * d_basis[4]
+            - 2 * C2[2] * x * d_basis[6]
+            + C2[3] * z * d_basis[7]
+            + 2 * C2[4] * x * d_basis[8]
+        )
+        dy += (
+            C2[0] * x * d_basis[4]
+            + C2[1] * z * d_basis[5]
+            - 2 * C2[2] * y * d_basis[6]
+            - 2 * C2[4] * y * d_basis[8]
+        )
+        dz += C2[1] * y * d_basis[5] + 4 * C2[2] * z * d_basis[6] + C2[3] * x * d_basis[7]
+    if degree > 2:
+        d = d_basis
+        dx += C3[0] * 6 * x * y * d[9] + C3[1] * y * z * d[10] - C3[2] * 2 * x * y * d[11]
+        dx += -C3[3] * 6 * x * z * d[12] + C3[4] * (4 * z * z - 3 * x * x - y * y) * d[13]
+        dx += C3[5] * 2 * x * z * d[14] + C3[6] * 3 * (x * x - y * y) * d[15]
+        dy += C3[0] * 3 * (x * x - y * y) * d[9] + C3[1] * x * z * d[10]
+        dy += C3[2] * (4 * z * z - x * x - 3 * y * y) * d[11] - C3[3] * 6 * y * z * d[12]
+        dy += -C3[4] * 2 * x * y * d[13] - C3[5] * 2 * y * z * d[14] - C3[6] * 6 * x * y * d[15]
+        dz += C3[1] * x * y * d[10] + C3[2] * 8 * y * z * d[11]
+        dz += C3[3] * 3 * (2 * z * z - x * x - y * y) * d[12] + C3[4] * 8 * x * z * d[13]
+        dz += C3[5] * (x * x - y * y) * d[14]
+    return dx, dy, dz
+
+
+@inlined
+def _quaternion_backward(quats, i, size, d_Q, d_quats):
+    """Of the rotation of quaternion i, which has the length ``size``."""
+    w, x, y, z = (
+        f64(quats[i, 0]) / size,
+        f64(quats[i, 1]) / size,
+        f64(quats[i, 2]) / size,
+        f64(quats[i, 3]) / size,
+    )
+    dw = 2 * (
+        x * (d_Q[2, 1] - d_Q[1, 2]) + y * (d_Q[0, 2] - d_Q[2, 0]) + z * (d_Q[1, 0] - d_Q[0, 1])
+    )
+    yx, zx, zy = d_Q[0, 1] + d_Q[1, 0], d_Q[0, 2] + d_Q[2, 0], d_Q[1, 2] + d_Q[2, 1]
+    dx = 2 * (-2 * x * (d_Q[1, 1] + d_Q[2, 2]) + y * yx + z * zx + w * (d_Q[2, 1] - d_Q[1, 2]))
+    dy = 2 * (x * yx - 2 * y * (d_Q[0, 0] + d_Q[2, 2]) + z * zy + w * (d_Q[0, 2] - d_Q[2, 0]))
+    dz = 2 * (x * zx + y * zy - 2 * z * (d_Q[0, 0] + d_Q[1, 1]) + w * (d_Q[1, 0] - d_Q[0, 1]))
+    along = w * dw + x * dx + y * dy + z * dz
+    d_quats[i, 0], d_quats[i, 1] = (dw - w * along) / size, (dx - x * along) / size
+    d_quats[i, 2], d_quats[i, 3] = (dy - y * along) / size, (dz - z * along) / size
 
 
 @jit
@@ -140,10 +198,10 @@ def project_backward(
         prefetch(values, later * values.shape[1])
         i = order[place]
         g = total[place]
-        blamed = False
+        contributes = False
         for k in range(g.shape[0]):
-            blamed |= g[k] != 0.0
-        if not blamed:
+            contributes |= g[k] != 0.0
+        if not contributes:
             # Never seen, or not even projected: its row of the table may hold anything.
             continue
         for k in range(sizes.shape[1]):
@@ -383,41 +441,7 @@ def project_backward(
                     for j in range(bases):
                         d_values[i, 3 * j + k] = g[GRADIENTS + 3 + k] * Y[j]
                         gY[j] += g[GRADIENTS + 3 + k] * values[i, 3 * j + k]
-            dx, dy, dz = 0.0, 0.0, 0.0
-            if degree > 0:
-                dx -= C1 * gY[3]
-                dy -= C1 * gY[1]
-                dz += C1 * gY[2]
-            if degree > 1:
-                dx += (
-                    C2[0] * y * gY[4]
-                    - 2 * C2[2] * x * gY[6]
-                    + C2[3] * z * gY[7]
-                    + 2 * C2[4] * x * gY[8]
-                )
-                dy += (
-                    C2[0] * x * gY[4]
-                    + C2[1] * z * gY[5]
-                    - 2 * C2[2] * y * gY[6]
-                    - 2 * C2[4] * y * gY[8]
-                )
-                dz += C2[1] * y * gY[5] + 4 * C2[2] * z * gY[6] + C2[3] * x * gY[7]
-            if degree > 2:
-                dx += (
-                    C3[0] * 6 * x * y * gY[9] + C3[1] * y * z * gY[10] - C3[2] * 2 * x * y * gY[11]
-                )
-                dx += -C3[3] * 6 * x * z * gY[12] + C3[4] * (4 * z * z - 3 * x * x - y * y) * gY[13]
-                dx += C3[5] * 2 * x * z * gY[14] + C3[6] * 3 * (x * x - y * y) * gY[15]
-                dy += C3[0] * 3 * (x * x - y * y) * gY[9] + C3[1] * x * z * gY[10]
-                dy += C3[2] * (4 * z * z - x * x - 3 * y * y) * gY[11] - C3[3] * 6 * y * z * gY[12]
-                dy += (
-                    -C3[4] * 2 * x * y * gY[13]
-                    - C3[5] * 2 * y * z * gY[14]
-                    - C3[6] * 6 * x * y * gY[15]
-                )
-                dz += C3[1] * x * y * gY[10] + C3[2] * 8 * y * z * gY[11]
-                dz += C3[3] * 3 * (2 * z * z - x * x - y * y) * gY[12] + C3[4] * 8 * x * z * gY[13]
-                dz += C3[5] * (x * x - y * y) * gY[14]
+            dx, dy, dz = _direction_backward(degree, x, y, z, gY)
             along = x * dx + y * dy + z * dz
             h[0], h[1], h[2] = (
                 (dx - x * along) / length,
@@ -446,20 +470,7 @@ def project_backward(
             gt[r] += gc[r]
             for k in range(3):
                 gR[r, k] += gc[r] * at[k]
-        w, x, y, z = (
-            f64(q[i, 0]) / size,
-            f64(q[i, 1]) / size,
-            f64(q[i, 2]) / size,
-            f64(q[i, 3]) / size,
-        )
-        gw = 2 * (x * (gQ[2, 1] - gQ[1, 2]) + y * (gQ[0, 2] - gQ[2, 0]) + z * (gQ[1, 0] - gQ[0, 1]))
-        yx, zx, zy = gQ[0, 1] + gQ[1, 0], gQ[0, 2] + gQ[2, 0], gQ[1, 2] + gQ[2, 1]
-        gx = 2 * (-2 * x * (gQ[1, 1] + gQ[2, 2]) + y * yx + z * zx + w * (gQ[2, 1] - gQ[1, 2]))
-        gy = 2 * (x * yx - 2 * y * (gQ[0, 0] + gQ[2, 2]) + z * zy + w * (gQ[0, 2] - gQ[2, 0]))
-        gz = 2 * (x * zx + y * zy - 2 * z * (gQ[0, 0] + gQ[1, 1]) + w * (gQ[1, 0] - gQ[0, 1]))
-        along = w * gw + x * gx + y * gy + z * gz
-        d_quats[i, 0], d_quats[i, 1] = (gw - w * along) / size, (gx - x * along) / size
-        d_quats[i, 2], d_quats[i, 3] = (gy - y * along) / size, (gz - z * along) / size
+        _quaternion_backward(q, i, size, gQ, d_quats)
     for r in range(3):
         g_view[9 + r] = gt[r]
         for k in range(3):

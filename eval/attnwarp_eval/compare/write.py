@@ -174,7 +174,7 @@ def _section(title: str, columns: list[str], rows: list[list[str]]) -> Section:
 
 def _cells(row: Row) -> list[str]:
     difference = number(row.difference.mean)
-    if row.difference.known:
+    if row.difference.bounded:
         difference += f" ± {number(row.difference.high - row.difference.mean, 2)}"
     unit = METRICS[row.metric].unit
     worst = ""

@@ -153,8 +153,8 @@ def lines(
         if not keep.any():
             continue
         x_values = np.asarray(line.x, dtype=float)[keep]
-        low = np.array([v.low if v.known else v.mean for v in line.y])[keep]
-        high = np.array([v.high if v.known else v.mean for v in line.y])[keep]
+        low = np.array([v.low if v.bounded else v.mean for v in line.y])[keep]
+        high = np.array([v.high if v.bounded else v.mean for v in line.y])[keep]
         shift = (i - (len(series) - 1) / 2) * 0.8
         bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
         axes.errorbar(
@@ -341,7 +341,7 @@ def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:
 
 
 def _bars(value: Interval) -> list[list[float]] | None:
-    if not value.known:
+    if not value.bounded:
         return None
     low = max(value.low, value.mean / 20)
     return [[max(value.mean - low, 0.0)], [max(value.high - value.mean, 0.0)]]

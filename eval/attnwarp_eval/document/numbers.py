@@ -46,6 +46,6 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     if scenes is not None and value.scenes < scenes:
         notes.append(f"{value.scenes} of {scenes} scenes")
     note = f" ({', '.join(notes)})" if notes else ""
-    if not value.known:
+    if not value.bounded:
         return number(value.mean) + note
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"

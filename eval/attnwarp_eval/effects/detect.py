@@ -60,8 +60,8 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
     """
     spec_effects = transport.called_for(scene.spec)
     plugins, objects = graph(scene)
-    seen = _in_graphs(plugins, objects)
-    for effect, evidence in seen.items():
+    by_graph = _in_graphs(plugins, objects)
+    for effect, evidence in by_graph.items():
         if effect not in spec_effects and not (
             effect == "textures" and not _checked_textures(scene)
         ):
@@ -74,7 +74,7 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
     out: dict[Effect, Finding] = {}
     for effect in EFFECTS:
         if effect in spec_effects:
-            evidence = (spec_effects[effect], *seen.get(effect, ()))
+            evidence = (spec_effects[effect], *by_graph.get(effect, ()))
             pinned = effect in scene.spec.effects.pin
             caustic = effect == "caustics" and not _caustic_simulated(scene)
             out[effect] = Finding(
@@ -105,8 +105,8 @@ def detect(scene: Scene) -> dict[Effect, Finding]:
 
 
 def _caustic_simulated(scene: Scene) -> bool:
-    """Camera paths find the caustic of anything but a small light; ptracer knows neither media nor
-    our lens.
+    """Whether the plan renders the caustic. Camera paths miss it for small lights, and ptracer has
+    neither media nor our lens.
     """
     if small_lights(scene) is None:
         return True
@@ -134,14 +134,14 @@ _ABSENT: dict[Effect, str] = {
 
 
 def _checked_textures(scene: Scene) -> bool:
-    """Meshes may bring vertex colours, of which the file says nothing."""
+    """Whether no mesh has vertex colours, which the scene's file does not name."""
     return all(getattr(shape, "tint", None) is None for shape in scene.shapes())
 
 
 def _in_graphs(
     plugins: list[tuple[str, str]], objects: list[tuple[str, Any]]
 ) -> dict[Effect, tuple[str, ...]]:
-    """Effects that Mitsuba's own graphs show.
+    """Effects that Mitsuba's own graphs have, with the evidence.
 
     Args:
         plugins: (path, plugin name) of the graph as parsed.
@@ -204,8 +204,7 @@ def _in_graphs(
             and thing.class_name().startswith("Bitmap")
             and _varies(thing)
         ):
-            # A mesh's attribute is not looked at: whether its colours vary the file and the mesh's
-            # tint say.
+            # A mesh's attributes are left out: the file and its tint tell whether they vary.
             note("textures", f"texture {thing.class_name()} at {path} varies")
     return {
         effect: tuple(dict.fromkeys(evidence[:1] + evidence[-1:]))
@@ -217,8 +216,7 @@ def _varies(texture: Any) -> bool:
     import mitsuba
 
     data = np.array(mitsuba.traverse(texture)["data"])
-    # Over the rows first, which are contiguous: over all texels of a channel at once takes 10 times
-    # as long.
+    # Over rows first, which are contiguous: 10 times as fast as over all texels of a channel.
     low, high = data.min(axis=0).min(axis=0), data.max(axis=0).max(axis=0)
     return bool((high - low).max() > 1e-6)
 

@@ -1,5 +1,4 @@
-"""Proof that a plan drops nothing that shows: a ladder of tests, each of which can refuse, and one
-that can certify.
+"""Proof that a plan leaves out nothing visible: a ladder of tests that refuse it or certify it.
 
 1. Structural: what the plan leaves out is nowhere in the file, in Mitsuba's parsed graph or in the
    loaded scene.
@@ -10,9 +9,9 @@ that can certify.
    block and the whole picture, with Sidak's correction over all of them, AND equivalence of the
    whole (two one-sided tests within 1 %).
 
-No difference found is not yet equality: only the equivalence test certifies, and it refuses when
-the noise is too great for it. What neither side simulates no comparison can find: a scene that
-calls for it is never certified. The tests are those of :mod:`attnwarp_eval.statistics.equivalence`.
+A difference that is not significant does not show equality: the equivalence test must hold, which
+noise prevents. An effect that neither side simulates is invisible to every comparison, so a scene
+that needs one is never certified. The tests are in :mod:`attnwarp_eval.statistics.equivalence`.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ class Level:
         threshold: what p must stay above, after Sidak over the values and over the three levels.
         worst: the largest difference in standard errors, as a share of the picture's mean.
         detectable: the difference, as a share of the picture's mean, that a value of median noise
-            would have shown with 80 % chance.
+            would have been detected with a power of 80 %.
 
     Example:
         >>> level = Level("pixel", 64, 1e-9, threshold=1e-5, worst=0.02, detectable=0.01)
@@ -164,7 +163,7 @@ def levels(a: npt.ArrayLike, b: npt.ArrayLike, *, alpha: float = ALPHA) -> list[
 
 @dataclass(frozen=True)
 class Rung:
-    """One test of the ladder: what it found, in words and numbers.
+    """One test of the ladder: its outcome in words and numbers.
 
     Example:
         >>> Rung("same seed", None, "the pictures differ").passed is None
@@ -179,18 +178,17 @@ class Rung:
 
 @dataclass(frozen=True)
 class Proof:
-    """What the ladder says of a plan.
+    """The outcome of the ladder for a plan.
 
     Attributes:
         verdict: "certified" only when bits are equal or the equivalence test holds, nothing else
             refused, and all that the scene calls for is simulated; "refused" when a difference was
             found; "can't tell" otherwise.
-        of_simulated: what the comparison alone says, of what is simulated; above ``verdict`` only
-            where something is not.
-        not_simulated: what the scene calls for and neither the plan nor everything on shows.
+        of_simulated: the verdict of the comparison alone; it differs from ``verdict`` only where an
+            effect is not simulated.
+        not_simulated: effects that the scene needs and that neither side simulates.
         rungs: the tests, in order.
-        detectable: the smallest difference that could have been seen, a share of the mean, by
-            level.
+        detectable: the smallest detectable difference, as a share of the mean, by level.
         seconds: spent.
 
     Example:
@@ -226,8 +224,8 @@ class Proof:
             word = {None: "-", True: "ok", False: "REFUSED"}[rung.passed]
             yield f"  {rung.name:20} {word:8} {rung.words}"
         if self.detectable:
-            told = ", ".join(f"{name} {share:.2%}" for name, share in self.detectable.items())
-            yield f"  smallest difference that could have been seen, of the mean: {told}"
+            shares = ", ".join(f"{name} {share:.2%}" for name, share in self.detectable.items())
+            yield f"  smallest difference that could have been seen, of the mean: {shares}"
 
 
 def prove(
@@ -287,8 +285,8 @@ def prove(
         ).astype(np.float64)
 
     def finish(verdict: Verdict, detectable: dict[str, float] | None = None) -> Proof:
-        # Both sides lack what is not simulated, so that equal pictures say nothing of it; unequal
-        # ones still refuse.
+        # Neither side has what is not simulated: equal pictures do not certify it, and unequal ones
+        # still refuse.
         capped: Verdict = "can't tell" if blind and verdict == "certified" else verdict
         return Proof(
             capped, tuple(rungs), detectable or {}, time.perf_counter() - start, verdict, blind
@@ -312,7 +310,7 @@ and count.
 
 @dataclass(frozen=True)
 class Climb:
-    """What the rungs after the first say, by pictures alone.
+    """The outcome of the rungs that compare pictures.
 
     Example:
         >>> Climb("can't tell", (), {"picture": 0.004}).detectable["picture"]
@@ -332,11 +330,11 @@ def climb(
     seed: int = 1000,
     alpha: float = ALPHA,
 ) -> Climb:
-    """The rungs that look at pictures only; together they refuse two sides that are the same with
-    chance ``alpha``.
+    """The rungs that compare pictures; together they refuse two equal sides with probability
+    ``alpha``.
 
-    Two of them can refuse, paired bias and Welch's test, and they look at pictures of different
-    seeds: each has Sidak's share of ``alpha``.
+    Two of them can refuse: paired bias and Welch's test. Their pictures have different seeds, so
+    each has Sidak's share of ``alpha``.
 
     Example:
         >>> def pictures(side, spp, first, count):
@@ -423,9 +421,9 @@ def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
     variance = (
         sum(float(m.var(ddof=1)) for m in means) / scale**2 * trial
     )  # of one sample, both sides together
-    wanted = variance / seeds / (MARGIN / 2 / ONE_SIDED) ** 2
+    needed = variance / seeds / (MARGIN / 2 / ONE_SIDED) ** 2
     affordable = max(0.0, seconds - (time.perf_counter() - start)) / (each * seeds)
-    spp = max(16.0, min(wanted, affordable, 4096.0))
+    spp = max(16.0, min(needed, affordable, 4096.0))
     if affordable < 16:
         return max(1, int(affordable))
     grid = 4 ** math.ceil(math.log(spp, 4))  # a power of 4 is a grid, which stratifies
@@ -433,7 +431,7 @@ def _samples(pictures: Pictures, seed: int, seeds: int, seconds: float) -> int:
 
 
 def _structural(scene: Scene, ours: Plan) -> Rung:
-    """Whether what the plan leaves out is absent from all that was looked at."""
+    """Whether the file and Mitsuba's graphs lack what the plan leaves out."""
     findings = detect(scene)
     blind: list[str] = [
         name for name in findings if findings[name].needed and not findings[name].simulated
@@ -458,8 +456,7 @@ def _structural(scene: Scene, ours: Plan) -> Rung:
 
 
 def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
-    """What the scene's words and Mitsuba's graphs call for and the plan's passes do not make, one
-    sentence each.
+    """Effects that the scene needs and the plan's passes do not render, one sentence each.
 
     Args:
         caustic: whether the scene has a caustic that can be simulated.
@@ -479,21 +476,20 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
     elif lens is None and ours.lens is not None:
         yield "the scene says no lens, but the plan has one"
 
-    # What a light shows where something rough is seen first, and where something smooth is (or a
-    # lamp, or nothing).
+    # A light needs passes for both: the first surface is rough, or it is smooth, a lamp or nothing.
     both = {"smooth", "rough"}
     for name, shines in _shining(scene):
-        seen: set[str] = set()
+        covered: set[str] = set()
         for step in ours.passes:
             if step.sign > 0 and not step.beam and shines(step):
-                seen |= (
+                covered |= (
                     {"rough"}
                     if step.integrator == "ptracer"
                     else both
                     if step.first == "any"
                     else {step.first}
                 )
-        missing = sorted(both - seen)
+        missing = sorted(both - covered)
         if missing:
             condition = "" if len(missing) == 2 else f" where what is seen first is {missing[0]}"
             yield f"{name} shines in no pass{condition}"
@@ -514,10 +510,10 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
     for step in ours.passes:
         reach = 2 if step.integrator == "direct" else step.max_depth
         if reach >= 0 and (depth < 0 or reach < depth):
-            wanted = "no end" if depth < 0 else f"{depth} edges"
+            expected = "no end" if depth < 0 else f"{depth} edges"
             yield (
                 f"paths of the pass {step.integrator} have {reach} edges, but"
-                f" {', '.join(longer) or 'the scene'} needs {wanted}"
+                f" {', '.join(longer) or 'the scene'} needs {expected}"
             )
 
     if caustic:
@@ -538,9 +534,7 @@ def _lacks(scene: Scene, ours: Plan, *, caustic: bool) -> Iterator[str]:
 
 
 def _shining(scene: Scene) -> Iterator[tuple[str, Callable[[Pass], bool]]]:
-    """Every light of a scene and its lamps together: what they are called, and whether they shine
-    in a pass.
-    """
+    """Name of each light, and of the lamps together, with whether it shines in a pass."""
     for k, light in enumerate(scene.spec.lights):
         yield f"lights[{k}], a {light.type},", functools.partial(_shines, k)
     lamps = [item.name for item in scene.spec.objects if item.emission]

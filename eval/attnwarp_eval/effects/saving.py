@@ -1,4 +1,4 @@
-"""What a scene's plan costs against a rendering with everything on."""
+"""Cost of a scene's plan against a rendering with everything on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Cap:
-    """What a scene's own cap on bounces cuts off, and what everything on costs within it.
+    """Light that a scene's cap on bounces removes, and the cost of everything on within it.
 
     Attributes:
         bounces: the cap.
@@ -54,7 +54,7 @@ class Cap:
 
 @dataclass(frozen=True)
 class Cost:
-    """What everything on would cost, against the plan, measured on one small picture of the source.
+    """Cost of everything on against the plan, measured on one small picture of the source.
 
     Everything on follows light until roulette ends it. Where the scene caps its bounces that is
     light that the plan leaves out, so that the two pictures have other means: equal noise is not

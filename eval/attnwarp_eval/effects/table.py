@@ -62,7 +62,7 @@ class Settings:
 def measure_entry(
     scene: Scene, settings: Settings, progress: Callable[[str], None]
 ) -> dict[str, Any]:
-    """What one scene calls for, what its plan costs, and the proof, as JSON.
+    """A scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
         scene: the scene.
@@ -136,7 +136,7 @@ def side_by_side(scene: Scene, path: Path) -> dict[str, Any]:
 
 
 def table(entries: Iterable[Mapping[str, Any]]) -> Table:
-    """The entries as a table: effects, plan, and what was proved and timed of them.
+    """The entries as a table: effects, plan, proof and times.
 
     Example:
         >>> planned = {"integrator": "direct", "sensor": {"type": "perspective"}}

@@ -5,7 +5,8 @@ and pictures of edited views.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from attnwarp.errors import InputError
 from attnwarp.io import read_ply
 from attnwarp.warp import WarpSettings
 from attnwarp_eval.inspect.capture import BEFORE, EDITED, Image, read_picture
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes import probes
+from attnwarp_eval.study.probes.base import Probe
 from attnwarp_eval.study.probes.fit import folder_of
 from attnwarp_eval.study.record import PictureFile, Record
 from attnwarp_eval.study.store import Store
@@ -65,27 +67,23 @@ class RunEdit:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The records of one variant of a scene.
+    """What the records of one variant of a scene say of its warp.
 
     Attributes:
-        folder: of the run.
-        spec: of an edit or of a fit; empty where the variant has neither.
+        scene: content hash of the scene.
+        edited: whether an editing method was measured, else a fit alone.
+        settings: of the method's warp; None where it has none.
+        exact_mask: whether the method injects features where the source truly sees the surface.
+        fit: file of the splats that were fitted to true pictures; None where none were.
         edits: by "edit/view", those of which the run has pictures.
     """
 
-    folder: Path
-    spec: Mapping[str, Any] = field(default_factory=dict)
+    scene: str = ""
+    edited: bool = False
+    settings: WarpSettings | None = None
+    exact_mask: bool = False
+    fit: Path | None = None
     edits: Mapping[str, RunEdit] = field(default_factory=dict)
-
-    @property
-    def exact_mask(self) -> bool:
-        """Whether the method injects features where the source truly sees the surface."""
-        return self.spec.get("mask") == "truth"
-
-    def settings(self) -> WarpSettings | None:
-        """Of the editing method's warp; None where it has none."""
-        warp = self.spec["settings"].get("warp") if "edit" in self.spec else None
-        return None if warp is None else WarpSettings.from_dict(warp)
 
     def fitted(self) -> Gaussians | None:
         """The splats that were fitted to true pictures; None where none were.
@@ -93,15 +91,14 @@ class Measured:
         Raises:
             InputError: the run's folder lacks them.
         """
-        if "fit" not in self.spec:
+        if self.fit is None:
             return None
-        file = folder_of(self.folder, self.spec) / "splats.ply"
-        if not file.is_file():
+        if not self.fit.is_file():
             raise InputError(
-                f"{file}: missing, so this variant's fitted splats cannot be shown; open another"
-                " --variant, or run the study anew in another folder"
+                f"{self.fit}: missing, so this variant's fitted splats cannot be shown; open"
+                " another --variant, or run the study anew in another folder"
             )
-        return read_ply(file)
+        return read_ply(self.fit)
 
 
 def measured(
@@ -119,28 +116,43 @@ def measured(
         StoreError: a record is damaged.
     """
     store = Store(folder)
-    done = store.done()
-    specs: dict[str, Mapping[str, Any]] = {}
-    edits: dict[str, dict[str, RunEdit]] = {}
+    done, available = store.done(), {p.name: p for p in probes()}
+    result: dict[str, Measured] = {}
     sampled = set()
     for cell in cells:
-        if (cell["scene"], cell["seed"]) != (scene, seed) or cell["id"] not in done:
+        own = available.get(cell["probe"])
+        if (cell["scene"], cell["seed"]) != (scene, seed) or cell["id"] not in done or own is None:
             continue
-        record: Record[Any] = store.read_as(cell["id"], probe(cell["probe"]).read)
+        read = partial(_measured, folder, source, own)
+        one = store.read_as(cell["id"], read)
         for name in cell["variants"]:
-            if "edit" in record.spec:
-                specs[name] = record.spec
-                edits.setdefault(name, {}).update(_edits(folder, record, source))
-            elif "fit" in record.spec:
-                specs.setdefault(name, record.spec)
-            else:
+            if one is None:
                 sampled.add(name)
-    return {
-        name: Measured(folder, spec, edits.get(name, {}))
-        for name, spec in specs.items()
-        # Where a variant is also measured on sampled splats, its warp is theirs.
-        if "edit" in spec or name not in sampled
-    }
+            elif one.edited:
+                former = result.get(name, one).edits
+                result[name] = replace(one, edits={**former, **one.edits})
+            else:
+                result.setdefault(name, one)
+    # Where a variant is also measured on sampled splats, its warp is theirs.
+    return {name: one for name, one in result.items() if one.edited or name not in sampled}
+
+
+def _measured(folder: Path, source: str, own: Probe[Any], data: dict[str, Any]) -> Measured | None:
+    """From the JSON of a record; None where it neither edits nor fits."""
+    record = own.read(data)
+    spec = record.spec
+    edited = "edit" in spec
+    if not edited and "fit" not in spec:
+        return None
+    warp = spec["settings"].get("warp") if edited else None
+    return Measured(
+        spec["scene"],
+        edited,
+        None if warp is None else WarpSettings.from_dict(warp),
+        spec.get("mask") == "truth",
+        folder_of(folder, spec) / "splats.ply" if "fit" in spec else None,
+        _edits(folder, record, source),
+    )
 
 
 def _edits(folder: Path, record: Record[Any], source: str) -> dict[str, RunEdit]:

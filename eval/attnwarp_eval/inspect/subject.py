@@ -38,7 +38,7 @@ SIZE = 512
 EDIT_VARIANT = "the edit's"
 """Name of the variant with the settings that an edit's manifest names."""
 
-_NOT_MEASURED = Measured(Path())
+_NOT_MEASURED = Measured()
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Subject:
         return Pair(
             world(self.scene, self.size),
             target.rpartition("/")[2],
-            own.settings() or settings,
+            own.settings or settings,
             gaussians,
             self.spp,
             own.edits.get(target),
@@ -204,20 +204,22 @@ def of_run(
     views = world(scene, size)
     records = measured(folder, stored["cells"], scene, seed, views.source.name)
     for own in records.values():
-        if own.spec["scene"] != views.content_hash:
+        if own.scene != views.content_hash:
             raise InputError(
                 f"{folder}: the scene {scene!r} has changed since the run was made; run the study"
                 " again, or name the scene instead of the run"
             )
-    pictured = {name: list(own.edits) for name, own in records.items() if own.edits}
-    edited = tuple(dict.fromkeys(view for names in pictured.values() for view in names))
+    pictured = [name for name, own in records.items() if own.edits]
+    edited = tuple(dict.fromkeys(view for name in pictured for view in records[name].edits))
+    for view in edited:
+        one_of(view.rpartition("/")[2], list(views.targets), f"{folder}: picture of the view")
+    elsewhere = ""
+    if any(own.edited for own in records.values()):
+        elsewhere = _elsewhere(folder, pictured, edited)
     targets = (*edited, *(study.views or views.targets))
     return Subject(
-        scene, size, study.spp, seed, variants, targets, measured=records,
-        elsewhere=_elsewhere(folder, list(pictured), edited) if any(
-            "edit" in own.spec for own in records.values()
-        ) else "",
-    )  # fmt: skip
+        scene, size, study.spp, seed, variants, targets, measured=records, elsewhere=elsewhere
+    )
 
 
 def _elsewhere(folder: Path, variants: Sequence[str], views: Sequence[str]) -> str:

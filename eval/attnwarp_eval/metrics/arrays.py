@@ -1,4 +1,4 @@
-"""What checks and metrics share: checks at the door, and means that are NaN when there is nothing
+"""Shared by checks and metrics: validation of arrays, and means that are NaN where there is nothing
 to average.
 """
 

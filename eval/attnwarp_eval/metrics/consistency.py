@@ -52,7 +52,7 @@ class Disagreement:
         linear: (H, W, 3) target minus source at the same point, linear RGB; NaN elsewhere.
         srgb: (H, W, 3) the same of sRGB values.
         delta_e: (H, W) CIEDE2000 between the two colours (D65, 2 degree observer); NaN elsewhere.
-        candidates: number of pixels that could have been compared: those asked about that have a
+        candidates: number of pixels that could have been compared: those to compare that have a
             position.
 
     Example:
@@ -109,7 +109,7 @@ def cross_view(
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
         pair: :func:`attnwarp_eval.truth.two_view` of them.
-        mask: (H, W) bool of the target, pixels that are asked about, such as the edited object's;
+        mask: (H, W) bool of the target, pixels to compare, such as the edited object's;
             all if left out.
         exclude: (H, W) bool of the target, pixels that may rightly differ, from
             :func:`view_dependent`.
@@ -130,11 +130,11 @@ def cross_view(
         (0.1, True)
     """
     source, target = _pictures(source_srgb, target_srgb, pair)
-    asked = region(mask, target.shape) & pair.visible
-    counted = asked & ~pair.edge
+    selected = region(mask, target.shape) & pair.visible
+    counted = selected & ~pair.edge
     if exclude is not None:
         counted &= ~region(exclude, target.shape, "exclude")
-    return _disagreement(source, target, pair.xy, counted, int(asked.sum()))
+    return _disagreement(source, target, pair.xy, counted, int(selected.sum()))
 
 
 def view_dependent(
@@ -269,7 +269,7 @@ def flow_consistency(
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the size of ``flow``.
         flow: from :func:`optical_flow`.
-        mask: (H, W) bool of the target, pixels that are asked about; all if left out.
+        mask: (H, W) bool of the target, pixels to compare; all if left out.
 
     Example:
         >>> import numpy as np
@@ -284,8 +284,8 @@ def flow_consistency(
     shape = flow.accepted.shape
     target = picture(target_srgb, "target_srgb", shape=shape)
     source = picture(source_srgb, "source_srgb", shape=shape)
-    asked = region(mask, shape)
-    return _disagreement(source, target, flow.xy, asked & flow.accepted, int(asked.sum()))
+    selected = region(mask, shape)
+    return _disagreement(source, target, flow.xy, selected & flow.accepted, int(selected.sum()))
 
 
 def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, float]:
@@ -293,8 +293,8 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
 
     Args:
         flow: from :func:`optical_flow` on the pictures of ``pair``.
-        pair: what is exactly known about them.
-        mask: (H, W) bool of the target, pixels that are asked about; all if left out.
+        pair: their exact relation.
+        mask: (H, W) bool of the target, pixels to compare; all if left out.
 
     Returns:
         ``consistency.flow_epe_median``, ``_p95`` and ``flow_below_1px`` over all pixels that the
@@ -320,11 +320,11 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
             f"flow: got {flow.accepted.shape} pixels (H x W), expected {shape}, those of pair's"
             " target"
         )
-    asked = region(mask, shape)
-    seen = asked & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
+    selected = region(mask, shape)
+    scored = selected & pair.visible & ~pair.edge & np.isfinite(flow.xy).all(axis=-1)
     offset = np.hypot(*np.moveaxis(flow.xy - pair.xy, -1, 0))
-    every, accepted_offset = offset[seen], offset[seen & flow.accepted]
-    accepted = asked & flow.accepted
+    every, accepted_offset = offset[scored], offset[scored & flow.accepted]
+    accepted = selected & flow.accepted
     wrong = accepted & pair.unseen
     return {
         "consistency.flow_epe_median": quantile(every, 0.5),
@@ -406,12 +406,12 @@ def _disagreement(
     shape = counted.shape
     linear, srgb, delta_e = (np.full((*shape, *rest), np.nan) for rest in ((3,), (3,), ()))
     if counted.any():
-        there = _sample(to_linear(source), xy[counted])
-        here = target[counted]
-        there_srgb = to_srgb(there)
-        linear[counted] = to_linear(here) - there
-        srgb[counted] = here - there_srgb
-        delta_e[counted] = deltaE_ciede2000(rgb2lab(here), rgb2lab(there_srgb))
+        source_colors = _sample(to_linear(source), xy[counted])
+        target_colors = target[counted]
+        source_srgb_colors = to_srgb(source_colors)
+        linear[counted] = to_linear(target_colors) - source_colors
+        srgb[counted] = target_colors - source_srgb_colors
+        delta_e[counted] = deltaE_ciede2000(rgb2lab(target_colors), rgb2lab(source_srgb_colors))
     return Disagreement(counted, linear, srgb, delta_e, candidates)
 
 
@@ -421,17 +421,21 @@ def _grey(image: Array) -> npt.NDArray[np.uint8]:
     return cv2.cvtColor(np.round(255 * image).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(np.uint8)
 
 
-def _flow(here: npt.NDArray[np.uint8], there: npt.NDArray[np.uint8], method: FlowMethod) -> Array:
+def _flow(
+    target_colors: npt.NDArray[np.uint8], source_colors: npt.NDArray[np.uint8], method: FlowMethod
+) -> Array:
     """(H, W, 2) displacement of each pixel of ``here`` in ``there``."""
     import cv2
 
     cv: Any = cv2  # its stubs lack DIS, and None for the flow to start from
     if method == "dis":
-        flow = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(here, there, None)
+        flow = cv.DISOpticalFlow_create(cv.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(
+            target_colors, source_colors, None
+        )
     else:
         flow = cv.calcOpticalFlowFarneback(
-            here,
-            there,
+            target_colors,
+            source_colors,
             None,
             pyr_scale=0.5,
             levels=5,

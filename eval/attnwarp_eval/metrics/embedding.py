@@ -1,4 +1,4 @@
-"""What is computed from embeddings of pictures and texts. Pure: arrays in, arrays out; no network,
+"""Metrics of embeddings of pictures and texts. Pure: arrays in, arrays out; no network,
 no file.
 
 Everything is a cosine, so embeddings may come with any length. Which encoder gave them decides what
@@ -56,7 +56,7 @@ class Similarity:
 
 
 def clip_similarity(images: npt.ArrayLike, text: npt.ArrayLike) -> Similarity:
-    """Cosine of each picture with the prompt: how well the pictures show what the prompt says.
+    """Cosine of each picture with the prompt.
 
     Args:
         images: (N, D) embeddings of the renders.

@@ -1,4 +1,4 @@
-"""Did the edit do what it should, where it should, and leave the rest alone? Against the rendered
+"""Errors of edited pictures inside and outside the edited object, against the rendered
 truth of the edit.
 """
 

@@ -208,7 +208,7 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
 
 
 def image_error(image_srgb: Any, target_srgb: Any, mask: Any = None) -> dict[str, float]:
-    """The ``image.*`` figures of an sRGB picture against what it should be.
+    """The ``image.*`` figures of an sRGB picture against its reference.
 
     All are of the sRGB values, as the field has it, apart from those named ``_linear``, which are
     of linear light and so weigh bright parts more.
@@ -281,7 +281,7 @@ class EditPsnr:
 
     @property
     def undefined(self) -> int:
-        """Number of views with nothing to measure."""
+        """Number of views without a pixel to compare."""
         return sum(math.isnan(value) for value in self.psnr)
 
     def figures(self) -> dict[str, float]:

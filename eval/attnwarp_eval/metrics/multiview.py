@@ -61,16 +61,16 @@ def above_floor(
         >>> figures["multiview.delta_e"], figures["multiview.delta_e_above"]
         (0.0, 0.0)
     """
-    here = cross_view(*edited, pair, mask=mask, exclude=exclude)
+    difference = cross_view(*edited, pair, mask=mask, exclude=exclude)
     floor = cross_view(*truth, pair, mask=mask, exclude=exclude)
     # The pixels follow from the geometry alone, so both are means over the same ones.
-    value, least = mean(here.delta_e[here.counted]), mean(floor.delta_e[floor.counted])
-    pixels = int(here.counted.sum())
+    value, least = mean(difference.delta_e[difference.counted]), mean(floor.delta_e[floor.counted])
+    pixels = int(difference.counted.sum())
     return {
         "multiview.delta_e": value,
         "multiview.delta_e_floor": least,
         "multiview.delta_e_above": value - least,
-        "multiview.share": share(pixels, here.candidates),
+        "multiview.share": share(pixels, difference.candidates),
         "multiview.pixels": pixels,
     }
 
@@ -106,13 +106,13 @@ def answers_by_view(
         raise ValueError("answers: got none, expected the truth of at least one")
     result: dict[str, str | None] = {}
     for view, image in images.items():
-        here = picture(image, f"images[{view!r}]")
-        inside = region(None if masks is None else masks[view], here.shape)
+        edited = picture(image, f"images[{view!r}]")
+        inside = region(None if masks is None else masks[view], edited.shape)
         errors = {}
         for name, truth in answers.items():
             if view not in truth:
                 raise ValueError(f"answers[{name!r}]: lacks the view {view!r} of images")
-            errors[name] = mse(here, truth[view], inside)
+            errors[name] = mse(edited, truth[view], inside)
         defined = {name: error for name, error in errors.items() if not math.isnan(error)}
         result[view] = min(defined, key=defined.__getitem__) if defined else None
     return result

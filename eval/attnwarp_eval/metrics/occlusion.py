@@ -1,4 +1,4 @@
-"""Does the mask know what the source could not see?
+"""Masks against true visibility from the source: precision, recall and other scores.
 
 Truth has three classes for a pixel that shows a surface: visible, hidden (occluded, turned away)
 and ambiguous, and those whose point falls outside the source image or behind its camera. Ambiguous
@@ -42,7 +42,7 @@ Ints = npt.NDArray[np.int64]
 def confusion(
     accepted: Any, label: Any, surface: Any, behind: Any = None, among: Any = None
 ) -> Counts:
-    """What a mask did with each class of pixel.
+    """Counts of accepted and rejected pixels by their true class.
 
     Args:
         accepted: (H, W) bool, the mask to judge.

@@ -1,4 +1,4 @@
-"""What every figure is: its unit, which way is better, and how closely two runs of it must agree.
+"""Definition of every metric: its unit, its direction, and how closely two runs of it must agree.
 
 Nothing heavy is imported here, so that reports and comparisons can read it without the checks.
 """
@@ -137,8 +137,8 @@ _SPECS = (
     Metric("edit.views_identical", "views", "none", 0, 0, "of them, views whose pictures are equal (PSNR infinite)"),
     Metric("edit.views_undefined", "views", "none", 0, 0, "of them, views with nothing to measure"),
     *(
-        Metric(f"consistency.{prefix}{name}", unit, direction, atol, rtol, f"{what}, {where}")
-        for prefix, where in (
+        Metric(f"consistency.{prefix}{name}", unit, direction, atol, rtol, f"{what}, {pixels}")
+        for prefix, pixels in (
             ("", "at exact correspondences"),
             ("flow_", "along optical flow"),
             ("flow_same_", "along optical flow at the pixels of the exact figure"),

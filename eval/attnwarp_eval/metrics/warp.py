@@ -12,7 +12,7 @@ from attnwarp_eval.metrics.arrays import floats, mask, mean, quantiles, regions,
 def endpoint_error(
     xy: Any, true_xy: Any, visible: Any, edge: Any = None, *, image_px: Any = 1.0
 ) -> dict[str, float]:
-    """Distance between where a warp looks and where it should look.
+    """Distance between a warp's position in the source and the exact one.
 
     Args:
         xy: (H, W, 2) source positions of the warp, NaN where undefined.
@@ -40,13 +40,13 @@ def endpoint_error(
     truth = floats(true_xy, ("H", "W", 2), "true_xy")
     shape = truth.shape[:2]
     estimate = floats(xy, truth.shape, "xy")
-    seen = mask(visible, shape, "visible")
+    visible_pixels = mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
-    if not np.isfinite(truth[seen]).all():
+    if not np.isfinite(truth[visible_pixels]).all():
         raise ValueError(
             "true_xy: not finite in a visible pixel; positions and labels do not belong together"
         )
-    offset = (estimate - truth)[seen]
+    offset = (estimate - truth)[visible_pixels]
     layer = np.hypot(offset[:, 0], offset[:, 1])
     unit = np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
     one = bool((unit == 1).all())
@@ -54,7 +54,7 @@ def endpoint_error(
     defined = np.isfinite(layer)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        inside = region[seen]
+        inside = region[visible_pixels]
         total = int(inside.sum())
         among = inside & defined
         px = image[among]
@@ -78,7 +78,7 @@ def endpoint_error(
 def feature_error(
     warped: Any, exact: Any, accepted: Any, visible: Any, edge: Any = None
 ) -> dict[str, float]:
-    """Error of warped features where the exact answer is known: sqrt(sum (warped - exact)^2 / sum
+    """Error of warped features where the exact ones are defined: sqrt(sum (warped - exact)^2 / sum
     exact^2).
 
     Args:
@@ -106,19 +106,23 @@ def feature_error(
     truth = floats(exact, ("C", "H", "W"), "exact")
     shape = truth.shape[1:]
     estimate = floats(warped, truth.shape, "warped")
-    passed, seen = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
+    passed, visible_pixels = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
     surface = np.isfinite(truth).all(axis=0)
     square = ((estimate - truth) ** 2).sum(axis=0)
     power = (truth**2).sum(axis=0)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        groups = {"accepted": passed & seen, "visible": seen, "all_accepted": passed & surface}
+        groups = {
+            "accepted": passed & visible_pixels,
+            "visible": visible_pixels,
+            "all_accepted": passed & surface,
+        }
         for name, group in groups.items():
             among = group & region
             total = float(power[among].sum())
             figures[f"warp.feature_{name}{suffix}"] = (
                 float(np.sqrt(square[among].sum() / total)) if total > 0 else float("nan")
             )
-        figures[f"warp.feature_pixels{suffix}"] = int((passed & seen & region).sum())
+        figures[f"warp.feature_pixels{suffix}"] = int((passed & visible_pixels & region).sum())
     return figures

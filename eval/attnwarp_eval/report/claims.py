@@ -182,7 +182,7 @@ def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not see
 
 
 def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
-    if not contrast.known or not adjusted_p <= 0.05:
+    if not contrast.bounded or not adjusted_p <= 0.05:
         return "can't tell"
     return "holds" if claim.sign * contrast.mean > 0 else "does not hold"
 

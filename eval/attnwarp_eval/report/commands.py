@@ -1,4 +1,4 @@
-"""The command that opens what stands behind each picture of a report."""
+"""The command that opens the view of each picture of a report in 3D."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from attnwarp_eval.inspect.command import inspect_command
 from attnwarp_eval.study.results import Results
 
 FOLDER = "."
-"""The run as the commands name it: the report lies in its folder, wherever that is moved."""
+"""The run as the commands name it: they are for a shell in its folder, wherever that is moved."""
 
 COLORS = {
     "mask": "mask",

@@ -110,7 +110,7 @@ def _of_table(results: Results, ablation: Ablation, claimed: list[set[str]]) -> 
     own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
     for name, metric, difference, p in contrasts(results, ablation):
         specification = own.metric(metric)
-        if specification.direction not in ("higher", "lower") or not difference.known:
+        if specification.direction not in ("higher", "lower") or not difference.bounded:
             continue
         direction: Literal["higher", "lower"] = (
             "higher" if specification.direction == "higher" else "lower"

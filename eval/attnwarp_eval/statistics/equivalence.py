@@ -78,8 +78,8 @@ def welch(a: npt.ArrayLike, b: npt.ArrayLike) -> Welch:
 
 
 def _beyond(difference: Array, error: Array, rounding: Array) -> Array:
-    """What of a difference noise must explain: all of it, or only what is beyond the rounding where
-    the noise is below that.
+    """Part of a difference that noise must explain: all of it, or only what exceeds the rounding
+    where the noise is smaller.
     """
     return np.where(
         error > rounding, np.abs(difference), np.maximum(np.abs(difference) - rounding, 0.0)

@@ -26,8 +26,8 @@ class Interval:
         low, high: the interval; NaN with fewer than two scenes.
         scenes, views: how many of each went in.
         undefined: values that were NaN, left out and counted.
-        detectable: the smallest difference that would have been seen (80 % power at 5 %); NaN with
-            under two scenes.
+        detectable: the smallest difference with a power of 80 % at 5 %; NaN with under two
+            scenes.
         p: two-sided probability of a mean this far from 0 were the truth 0 (Student's t); NaN with
             under two scenes.
 
@@ -47,8 +47,8 @@ class Interval:
     p: float
 
     @property
-    def known(self) -> bool:
-        """Whether there is an interval at all."""
+    def bounded(self) -> bool:
+        """Whether both bounds are finite: of one scene there is no interval."""
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
 
 
@@ -230,21 +230,21 @@ def verdict(
     atol: float = 0.0,
     adjusted_p: float | None = None,
 ) -> Verdict:
-    """What a paired difference (ours - theirs) says: better, worse, or can't tell; never "equal".
+    """Verdict on a paired difference (ours - theirs): better, worse, or can't tell; never "equal".
 
     Args:
         difference: from :func:`paired`.
         direction: which values of the metric are better.
-        atol: differences whose interval does not clear this size are not told apart.
+        atol: an interval that reaches into [-atol, atol] gives "can't tell".
         adjusted_p: the difference's p-value adjusted for the other tests of its table; above 0.05
-            nothing is told.
+            the verdict is "can't tell".
 
     Example:
         >>> difference = interval({"bear": [1.0], "fence": [1.1], "glass": [0.9]})
         >>> verdict(difference, "lower"), verdict(difference, "lower", atol=2.0)
         ('worse', "can't tell")
     """
-    if not difference.known or (adjusted_p is not None and not adjusted_p <= 0.05):
+    if not difference.bounded or (adjusted_p is not None and not adjusted_p <= 0.05):
         return "can't tell"
     sign = 1.0 if direction == "higher" else -1.0
     low, high = sorted((sign * difference.low, sign * difference.high))

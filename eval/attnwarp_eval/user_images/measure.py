@@ -1,8 +1,6 @@
-"""A person's own pictures: found and paired by name, read, and measured as the paper's table has
-it.
+"""Metrics of a user's own pictures, which are paired by name: the columns of the paper's table.
 
-The figures themselves are pure functions in :mod:`attnwarp_eval.metrics`; files are touched here
-alone.
+The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module reads the files.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ BATCH = 4
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a person has. Every part may be missing; so then are the figures that need it.
+    """The pictures and prompts. Each may be missing; figures that need it are then left out.
 
     Attributes:
         renders: folder of renders of the edited scene.
@@ -102,7 +100,7 @@ class Row:
 
 @dataclass
 class Measured:
-    """Everything that was measured on a person's pictures, and everything that was not.
+    """The figures of a user's pictures, and why others are missing.
 
     Attributes:
         inputs: what it was measured on.
@@ -110,7 +108,7 @@ class Measured:
         missing: title of a figure that was not computed -> why.
         encoders: kind -> which one.
         unpaired: sentence for each group of pictures that found no partner.
-        notes: what a reader has to know of the values.
+        notes: remarks on the values.
     """
 
     inputs: Inputs
@@ -163,7 +161,7 @@ def measure(
     inputs: Inputs, encoders: Mapping[Kind, str | None] | None = None, *, device: str = "cpu",
     progress: Progress = silent, store: Store | None = None,
 ) -> Measured:  # fmt: skip
-    """Measure a person's pictures: every figure of the paper's table that they allow.
+    """Compute every figure of the paper's table that the pictures and prompts allow.
 
     Args:
         inputs: the pictures and prompts.
@@ -221,8 +219,7 @@ def measure(
 
 
 def pictures_in(folder: Path, option: str) -> dict[str, Path]:
-    """The picture files of a folder by their names without suffix, in the order that a person would
-    put them.
+    """The picture files of a folder by their names without suffix, in natural order.
 
     Normal maps that ``attnwarp render`` writes beside its pictures are left out; see
     :func:`normal_maps`.
@@ -355,35 +352,35 @@ def _compare_names(
     views: Mapping[_Figure, Sequence[str]],
     done: Measured,
 ) -> None:
-    """Say what found no partner."""
-    shown = list(folders["renders"])
+    """Name the pictures without a partner."""
+    renders = list(folders["renders"])
     used = {name for figure in views for name in figure.needs} | (
         {"masks"} if any(figure in views for figure in _MASKED) else set()
     )
     for other in (
         name for name in ("edited", "originals", "masks") if name in folders and name in used
     ):
-        there = folders[other]
+        partners = folders[other]
         # A scene is usually fitted on some of its views: renders without an edited picture are no
         # mistake.
-        for where, names in (
+        for relation, names in (
             (
                 f"of {_option('renders')} without one in {_option(other)}",
-                [n for n in shown if n not in there],
+                [n for n in renders if n not in partners],
             ),
             (
                 f"of {_option(other)} without one in {_option('renders')}",
-                [n for n in there if n not in shown],
+                [n for n in partners if n not in renders],
             ),
         ):
             if names:
-                done.unpaired.append(f"{len(names)} {where}: {_some(names, 8)}")
+                done.unpaired.append(f"{len(names)} {relation}: {_some(names, 8)}")
 
 
 def _check_sizes(
     folders: Mapping[str, Mapping[str, Path]], views: Mapping[_Figure, Sequence[str]]
 ) -> None:
-    """Before anything is computed: every pair has one size."""
+    """Check before anything is computed that both pictures of a pair have one size."""
     from attnwarp.io import image_size
 
     for figure, names in views.items():
@@ -403,7 +400,7 @@ def _same_size(one: Path, a: tuple[int, ...], two: Path, b: tuple[int, ...]) -> 
 
 @dataclass
 class _Gathered:
-    """What is kept of the pictures once they are out of memory."""
+    """What the figures need of each view, so that its pictures can be freed."""
 
     errors: dict[str, tuple[float, float]] = field(default_factory=dict)  # MSE and PSNR
     distances: dict[str, float] = field(default_factory=dict)
@@ -450,7 +447,7 @@ def _gather(
     store: Store | None,
     device: str,
 ) -> Iterator[tuple[list[str], dict[str, Any]]]:
-    """Read every picture once: some views, and what the figures need of them as JSON."""
+    """Read each picture once; yield batches of views with what the figures need, as JSON."""
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
@@ -477,12 +474,12 @@ def _gather(
     ]
 
     def gather(batch: Sequence[str]) -> _Gathered:
-        kept = _Gathered()
+        result = _Gathered()
         renders = read("renders", batch)
-        encode("clip", renders, kept.clip)
-        encode("dino", renders, kept.dino)
+        encode("clip", renders, result.clip)
+        encode("dino", renders, result.dino)
         changed = [name for name in batch if name in members[_DIRECTION]]
-        encode("clip", partners("originals", changed, renders), kept.before)
+        encode("clip", partners("originals", changed, renders), result.before)
         paired = [name for name in batch if name in members[_EDIT] | members[_PERCEPTUAL]]
         masked = paired if "masks" in folders else []
         masks = {
@@ -492,15 +489,15 @@ def _gather(
             if name in members[_EDIT]:
                 mask = {name: masks[name]} if masks else None
                 one = metrics.edit_psnr({name: picture}, {name: renders[name]}, mask)
-                kept.errors[name] = (one.mse[0], one.psnr[0])
+                result.errors[name] = (one.mse[0], one.psnr[0])
             if name in members[_PERCEPTUAL]:
                 try:
-                    kept.distances[name] = metrics.perceptual(
+                    result.distances[name] = metrics.perceptual(
                         picture, renders[name], distance, masks.get(name)
                     )
                 except ValueError as error:
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
-        return kept
+        return result
 
     # Encoders take a batch at once and round differently in another one: a batch is the cell.
     for start in range(0, len(needed), BATCH):
@@ -542,58 +539,60 @@ def _rows(
     source: Picture | None,
     views: Mapping[_Figure, Sequence[str]],
     loaded: Mapping[Kind, Any],
-    kept: _Gathered,
+    gathered: _Gathered,
     done: Measured,
 ) -> None:
-    """The figures of what was gathered, in the order of the paper's table."""
+    """Add the figures in the order of the paper's table."""
     texts = {
         name: _text(loaded["clip"], getattr(inputs, name), _option(name), done)
         for name in _texts_needed(views)
     }
     for figure, names in views.items():
         if figure is _EDIT:
-            _edit_rows(kept.errors, done)
+            _edit_rows(gathered.errors, done)
             continue
         if figure is _PERCEPTUAL:
-            defined = [value for value in kept.distances.values() if not np.isnan(value)]
+            defined = [value for value in gathered.distances.values() if not np.isnan(value)]
             value = float(np.mean(defined)) if defined else float("nan")
-            done.rows.append(Row(figure.key, figure.title, value, kept.distances, figure.encoder))
+            done.rows.append(
+                Row(figure.key, figure.title, value, gathered.distances, figure.encoder)
+            )
             continue
         if figure is _CLIP:
-            found = metrics.clip_similarity(_stack(kept.clip, names), texts["prompt"])
+            similarity = metrics.clip_similarity(_stack(gathered.clip, names), texts["prompt"])
         elif figure is _DIRECTION:
-            before, after = _stack(kept.before, names), _stack(kept.clip, names)
-            found = metrics.directional_similarity(
+            before, after = _stack(gathered.before, names), _stack(gathered.clip, names)
+            similarity = metrics.directional_similarity(
                 before, after, texts["source_prompt"], texts["prompt"]
             )
         else:
             kind: Kind = "dino" if figure is _DINO else "clip"
             assert source is not None  # the figure needs it, see _possible
             edit = loaded[kind].images([source])
-            found = metrics.image_similarity(
-                edit, _stack(kept.dino if figure is _DINO else kept.clip, names)
+            similarity = metrics.image_similarity(
+                edit, _stack(gathered.dino if figure is _DINO else gathered.clip, names)
             )
-        values = dict(zip(names, map(float, found.values), strict=True))
-        done.rows.append(Row(figure.key, figure.title, found.mean, values, figure.encoder))
+        values = dict(zip(names, map(float, similarity.values), strict=True))
+        done.rows.append(Row(figure.key, figure.title, similarity.mean, values, figure.encoder))
 
 
 def _edit_rows(errors: Mapping[str, tuple[float, float]], done: Measured) -> None:
-    found = metrics.EditPsnr(
+    psnr = metrics.EditPsnr(
         tuple(errors), tuple(m for m, _ in errors.values()), tuple(p for _, p in errors.values())
     )
-    values = dict(zip(found.views, found.psnr, strict=True))
+    values = dict(zip(psnr.views, psnr.psnr, strict=True))
     done.rows.append(
-        Row("edit.psnr_mean", "Edit PSNR, mean of the views", found.mean_finite, values)
+        Row("edit.psnr_mean", "Edit PSNR, mean of the views", psnr.mean_finite, values)
     )
-    done.rows.append(Row("edit.psnr_pooled", "Edit PSNR, pooled", found.pooled, values))
-    if found.identical:
+    done.rows.append(Row("edit.psnr_pooled", "Edit PSNR, pooled", psnr.pooled, values))
+    if psnr.identical:
         done.notes.append(
-            f"{found.identical} edited pictures equal their renders: their PSNR is infinite and not"
+            f"{psnr.identical} edited pictures equal their renders: their PSNR is infinite and not"
             " in the mean of the views; in the pooled figure they count as no error"
         )
-    if found.undefined:
+    if psnr.undefined:
         done.notes.append(
-            f"{found.undefined} masks are black all over: nothing of those views counts"
+            f"{psnr.undefined} masks are black all over: nothing of those views counts"
         )
 
 
@@ -619,7 +618,7 @@ def _stack(rows: Mapping[str, Embedding], names: Sequence[str]) -> Embedding:
 
 
 def natural(name: str) -> list[tuple[int, int, str]]:
-    """So that view2 comes before view10."""
+    """Sort key that puts view2 before view10."""
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in re.split(r"(\d+)", name) if p]
 
 

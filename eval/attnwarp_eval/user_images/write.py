@@ -1,23 +1,29 @@
-"""What was measured on a person's pictures, as JSON, as Markdown and as a table on the terminal."""
+"""Metrics of a user's pictures as JSON, as Markdown and as a table on the terminal."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.document.model import Report, Section, Table
+from attnwarp_eval.document.write import markdown, terminal
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
 from attnwarp_eval.user_images.measure import Measured, Row, natural
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    import rich.table
 
 FORMAT = 1
 """Version of metrics.json."""
+
+_TITLE = "Metrics of the edited scene"
+
+_INPUTS = ("renders", "edited", "originals", "source_edit", "masks", "prompt", "source_prompt")
 
 _READING = (
     "Pictures are read as sRGB in [0, 1]: 8 bits over 255, 16 bits over 65535, grey as three equal"
@@ -36,15 +42,7 @@ def to_dict(measured: Measured) -> dict[str, Any]:
         "inputs": {
             **{
                 name: None if getattr(inputs, name) is None else str(getattr(inputs, name))
-                for name in (
-                    "renders",
-                    "edited",
-                    "originals",
-                    "source_edit",
-                    "masks",
-                    "prompt",
-                    "source_prompt",
-                )
+                for name in _INPUTS
             },
             "background": list(inputs.background),
             "reading": _READING,
@@ -79,66 +77,30 @@ def to_json(measured: Measured) -> str:
 
 def to_markdown(measured: Measured) -> str:
     """The text of metrics.md."""
-    inputs = measured.inputs
-    lines = ["# Metrics of the edited scene", ""]
-    for name in (
-        "renders",
-        "edited",
-        "originals",
-        "source_edit",
-        "masks",
-        "prompt",
-        "source_prompt",
-    ):
-        value = getattr(inputs, name)
-        if value is not None:
-            lines.append(f"- {name.replace('_', ' ')}: {_cell(str(value))}")
-    lines += [
-        "",
-        *_grid(["figure", "value", "views", "undefined", "better", "encoder"], _overview(measured)),
-    ]
-    for title, items in (
-        ("Not computed", [f"{what}: {why}" for what, why in measured.missing.items()]),
-        ("Pictures without a partner", measured.unpaired),
-        ("Notes", [*measured.notes, _READING]),
-    ):
-        if items:
-            lines += ["", f"## {title}", "", *(f"- {_cell(item)}" for item in items)]
+    lists = {
+        "Not computed": [f"{what}: {why}" for what, why in measured.missing.items()],
+        "Pictures without a partner": measured.unpaired,
+        "Notes": [*measured.notes, _READING],
+    }
+    sections = [Section("Figures", tables=[_overview(measured)])]
+    sections += [Section(title, [_list(items)]) for title, items in lists.items() if items]
     if measured.encoders:
-        rows = [
-            [a.name, kind, a.source, a.weights_sha256, a.preprocessing]
-            for kind, a in sorted(measured.encoders.items())
-        ]
-        lines += [
-            "",
-            "## Encoders",
-            "",
-            *_grid(["name", "kind", "source", "SHA-256 of the weights", "pictures"], rows),
-        ]
-    shown = [row for row in measured.rows if row.key != "edit.psnr_pooled"]
-    if shown:
-        names = sorted({name for row in shown for name in row.views}, key=natural)
-        rows = [
-            [name, *(_value(row, row.views[name]) if name in row.views else "" for row in shown)]
-            for name in names
-        ]
-        heads = [row.title.removesuffix(", mean of the views") for row in shown]
-        lines += ["", "## View by view", "", *_grid(["view", *heads], rows)]
-    return "\n".join(lines) + "\n"
+        sections.append(Section("Encoders", tables=[_encoders(measured)]))
+    if measured.rows:
+        sections.append(Section("View by view", tables=[_by_view(measured)]))
+    inputs = {name: getattr(measured.inputs, name) for name in _INPUTS}
+    lead = _list(
+        f"{name.replace('_', ' ')}: {value}" for name, value in inputs.items() if value is not None
+    )
+    return markdown(Report(_TITLE, [lead], sections))
 
 
-def table(measured: Measured) -> Table:
+def table(measured: Measured) -> rich.table.Table:
     """The figures, for a terminal; encoders by their kind, since the names of real ones are
     long."""
-    from rich.table import Table
-    from rich.text import Text
-
-    grid = Table(
-        "figure", "value", "views", "undefined", "better", title="Metrics of the edited scene"
-    )
-    for cells in _overview(measured):
-        grid.add_row(*map(Text, cells[:5]))
-    return grid
+    overview = _overview(measured)
+    rows = [cells[:5] for cells in overview.rows]
+    return terminal(Table(overview.columns[:5], rows, _TITLE))
 
 
 def write(measured: Measured, folder: Path) -> list[Path]:
@@ -151,23 +113,36 @@ def write(measured: Measured, folder: Path) -> list[Path]:
     return paths
 
 
-def _overview(measured: Measured) -> list[list[str]]:
+def _overview(measured: Measured) -> Table:
     rows = []
     for row in measured.rows:
         encoder = "" if row.encoder is None else measured.encoders[row.encoder].name
-        defined = len(row.views) - len(row.undefined)
+        undefined = len(row.undefined)
+        views = len(row.views) - undefined
+        direction = _spec(row).direction
         rows.append(
-            [
-                row.title,
-                _value(row, row.value),
-                str(defined),
-                str(len(row.undefined)),
-                _spec(row).direction,
-                encoder,
-            ]
+            [row.title, _value(row, row.value), str(views), str(undefined), direction, encoder]
         )
     rows += [[title, "not computed", "0", "", "", ""] for title in measured.missing]
-    return rows
+    return Table(["figure", "value", "views", "undefined", "better", "encoder"], rows)
+
+
+def _encoders(measured: Measured) -> Table:
+    rows = [
+        [a.name, kind, a.source, a.weights_sha256, a.preprocessing]
+        for kind, a in sorted(measured.encoders.items())
+    ]
+    return Table(["name", "kind", "source", "SHA-256 of the weights", "pictures"], rows)
+
+
+def _by_view(measured: Measured) -> Table:
+    own = [row for row in measured.rows if row.key != "edit.psnr_pooled"]
+    names = sorted({name for row in own for name in row.views}, key=natural)
+    rows = [
+        [_line(name), *(_value(row, row.views[name]) if name in row.views else "" for row in own)]
+        for name in names
+    ]
+    return Table(["view", *(row.title.removesuffix(", mean of the views") for row in own)], rows)
 
 
 def _spec(row: Row) -> Metric:
@@ -190,11 +165,10 @@ def _number(value: float) -> Any:
     return "inf" if math.isinf(value) else without_nan(value)
 
 
-def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return ["| " + " | ".join(_cell(cell) for cell in line) + " |" for line in lines]
+def _list(items: Iterable[str]) -> str:
+    return "\n".join(f"- {_line(item)}" for item in items)
 
 
-def _cell(text: str) -> str:
-    """Of one line, and without what Markdown would take for a table's or a tag's."""
-    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+def _line(text: str) -> str:
+    """On one line, as names of files need not be."""
+    return " ".join(text.split())

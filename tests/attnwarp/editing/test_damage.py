@@ -6,11 +6,11 @@ A failure is repeated by its label: the file and the seed of :mod:`mutate`.
 import json
 import struct
 
+import mutate
 import numpy as np
 import pytest
 import tiny_editors
 import torch
-from mutate import mutate_bytes, mutate_text, survey
 
 from attnwarp.editing.folder import load_controlnet, load_parts
 from attnwarp.errors import InputError
@@ -65,24 +65,14 @@ def use(folder, name, data):
 
 def failures(folder, name, seeds):
     whole = (folder / name).read_bytes()
-
-    def damaged(seed):
-        if name.endswith(".json") and seed % 2:
-            return mutate_text(whole.decode(), seed).encode("utf-8", "surrogatepass")
-        return mutate_bytes(whole, seed)
-
     try:
         use(folder, name, whole)
-        outcomes = survey(
-            [(f"{name} {seed}", damaged(seed)) for seed in seeds],
-            lambda data: use(folder, name, data),
-            refusals=(InputError,),
-        )
+        return mutate.failures(
+            name, whole, lambda data: use(folder, name, data), seeds,
+            refusals=(InputError,), text=name.endswith(".json"),
+        )  # fmt: skip
     finally:
         (folder / name).write_bytes(whole)
-    assert len(outcomes) == len(seeds)
-    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
-    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

@@ -7,11 +7,11 @@ import json
 import shutil
 import struct
 
+import mutate
 import numpy as np
 import pytest
 import tiny_models
 import torch
-from mutate import mutate_bytes, survey
 from safetensors.torch import save_file
 
 from attnwarp.encoders import load_encoder
@@ -107,11 +107,7 @@ def failures(name, folder, seeds):
         reader.path.write_bytes(data)
         reader.use(data)
 
-    cases = [(f"{name} {seed}", mutate_bytes(whole, seed)) for seed in seeds]
-    outcomes = survey(cases, read, refusals=(InputError,))
-    assert len(outcomes) == len(cases)
-    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
-    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
+    return mutate.failures(name, whole, read, seeds, refusals=(InputError,))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

@@ -10,10 +10,10 @@ import re
 import struct
 import warnings
 
+import mutate
 import numpy as np
 import pytest
 import torch
-from mutate import mutate_bytes, mutate_text, survey
 from PIL import Image
 
 from attnwarp import Camera, Gaussians
@@ -231,12 +231,6 @@ FORMATS = {
 TEXTS = ("ascii ply", "transforms", "colmap text")
 
 
-def damaged(name, data, seed):
-    if name in TEXTS and seed % 2:
-        return mutate_text(data.decode(), seed).encode("utf-8", "surrogatepass")
-    return mutate_bytes(data, seed)
-
-
 def failures(name, folder, seeds):
     form = FORMATS[name]
     data = form.original(folder)
@@ -246,11 +240,8 @@ def failures(name, folder, seeds):
             warnings.simplefilter("ignore", InputWarning)
             form.use(folder, given)
 
-    cases = [(f"{name} {seed}", damaged(name, data, seed)) for seed in seeds]
-    outcomes = survey(cases, read, refusals=(InputError, FileNotFoundError))
-    assert len(outcomes) == len(cases)
-    assert any(o.kind == "refused" for o in outcomes), "the damage reaches the reader"
-    return [f"{o.case}: {o.kind}\n{o.detail}" for o in outcomes if o.failed]
+    refusals = (InputError, FileNotFoundError)
+    return mutate.failures(name, data, read, seeds, refusals=refusals, text=name in TEXTS)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

@@ -17,7 +17,6 @@ from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.inspect.window import Window
 from attnwarp_eval.study.pictures import jpeg
 from attnwarp_eval.study.probes.editing import EditResult, Judgement
-from attnwarp_eval.study.probes.fit import folder_of
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.world import world
 
@@ -42,7 +41,7 @@ STUDY = {
 }
 
 
-def make(folder, content=None):
+def make(folder, content=None, view=VIEW, settings=None):
     """A run with an edit of one view by the variant "oracle", and one on fitted splats that has no
     pictures."""
     store = Store(folder)
@@ -55,7 +54,7 @@ def make(folder, content=None):
         "edit": {"name": "red"},
         "geometry": "splats",
     }
-    settings = {"warp": PRESETS["paper"].to_dict()}
+    settings = settings or {"warp": PRESETS["paper"].to_dict()}
     specs = {
         "oracle": {**common, "mask": "truth", "settings": settings},
         "fitted": {**common, "mask": "rules", "settings": {}, "fit": {"views": 9}},
@@ -70,7 +69,7 @@ def make(folder, content=None):
                 path = store.pictures / "a" / f"{VIEW}-{what}.jpg"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(jpeg(np.full((64, 64, 3), color, np.float32)))
-                record["pictures"].append(store.keep_picture(path, view=f"red/{VIEW}", what=what))
+                record["pictures"].append(store.keep_picture(path, view=f"red/{view}", what=what))
         store.write(record)
         cells.append(
             {"id": record["id"], "title": name, "scene": "spheres", "variants": [name]}
@@ -121,7 +120,7 @@ def test_disagreement_of_edited_views_is_the_difference_of_their_colours(edited)
 def test_fitted_splats_are_read_from_the_run(run, edited):
     with pytest.raises(InputError, match="fitted splats cannot be shown; open another --variant"):
         edited.pair("fitted", VIEW)
-    file = folder_of(run, edited.measured["fitted"].spec) / "splats.ply"
+    file = edited.measured["fitted"].fit
     file.parent.mkdir(parents=True)
     write_ply(file, splats())
     model = edited.pair("fitted", VIEW).model
@@ -129,7 +128,8 @@ def test_fitted_splats_are_read_from_the_run(run, edited):
 
 
 def test_the_window_of_an_edit_shows_every_inset(edited):
-    window = Window(edited, State("oracle", edited.targets[0], step="edited"), off_screen=True)
+    state = State("oracle", edited.targets[0], step="edited")
+    window = Window(edited, state, off_screen=True, size=(600, 360))
     try:
         image = window.plotter.screenshot(return_img=True)[..., :3] / 255
     finally:
@@ -147,7 +147,7 @@ def test_the_window_of_an_edit_shows_every_inset(edited):
     ],
 )
 def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options):
-    file = folder_of(run, edited.measured["fitted"].spec) / "splats.ply"
+    file = edited.measured["fitted"].fit
     file.parent.mkdir(parents=True, exist_ok=True)
     write_ply(file, splats())
     result = CliRunner().invoke(app, ["inspect", str(run), *options])
@@ -156,13 +156,19 @@ def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options
     assert "attnwarp edit" in result.stderr
 
 
-def test_a_scene_that_has_changed_a_seed_and_a_damaged_picture_are_refused(tmp_path):
+def test_runs_that_do_not_fit_and_damaged_ones_are_refused(tmp_path):
     run = make(tmp_path / "changed", content="0" * 64)
     with pytest.raises(InputError, match="'spheres' has changed since the run was made"):
         subject.of_run(run)
     with pytest.raises(InputError, match=r"seed: got '5'.*expected one of 3, 4"):
         subject.of_run(run, seed=5)
     assert subject.of_run(run, seed=4).targets == (VIEW, "yaw120")
+    run = make(tmp_path / "view", view="yaw999")
+    with pytest.raises(InputError, match="picture of the view: got 'yaw999'"):
+        subject.of_run(run)
+    run = make(tmp_path / "settings", settings={"warp": 7})
+    with pytest.raises(InputError, match="not a record of its probe"):
+        subject.of_run(run)
     run = make(tmp_path / "damaged")
     (run / f"pictures/a/{VIEW}-edited.jpg").write_bytes(b"")
     with pytest.raises(InputError, match="changed since it was written"):

@@ -68,14 +68,14 @@ def test_undefined_values_are_counted_and_never_averaged_in():
 def test_nothing_defined_is_nan_and_not_zero():
     result = interval({"a": [np.nan]})
     assert np.isnan(result.mean)
-    assert not result.known
+    assert not result.bounded
     assert result.undefined == 1
 
 
 def test_one_scene_has_a_mean_but_no_interval():
     result = interval({"a": [1.0, 2.0, 3.0]})
     assert result.mean == pytest.approx(2.0)
-    assert not result.known
+    assert not result.bounded
     assert verdict(result, "higher") == "can't tell"
 
 

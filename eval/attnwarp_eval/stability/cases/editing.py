@@ -9,14 +9,17 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.attention import Layer, RecordingPlan, constant, inject, record
-from attnwarp.warp import FeatureWarp, Surface, preset, warp_surfaces
+from attnwarp.warp import FeatureWarp, Surface, WarpedView, warp_surfaces
 from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways
 from attnwarp_eval.stability.cases.warps import (
+    BOUNDS_ONLY,
     HALVES,
-    Pair,
+    before_a_plane,
     engine_of,
     grid_sampled,
+    in_steps,
     positions,
+    random_features,
 )
 from attnwarp_eval.stability.closed_forms import orbit, plane_depth
 
@@ -25,17 +28,19 @@ SIZE = 16
 
 
 def _layer(way: Way, mask: torch.Tensor | None = None) -> FeatureWarp:
-    source, target = orbit(0, size=SIZE, height=1), orbit(25, size=SIZE, height=1)
-    pair = Pair(source, target, plane_depth(target, (1, 0, 0), 0.0))
-    result = positions(pair, Way(way.backend))
+    result = positions(before_a_plane(SIZE), Way(way.backend))
     return FeatureWarp(result, result.defined if mask is None else mask, engine_of(way))
+
+
+def _view(source: Camera, target: Camera, depth: np.ndarray, way: Way) -> WarpedView:
+    """A warp by positions alone."""
+    surface = Surface(torch.from_numpy(depth))
+    return warp_surfaces(source, target, surface, None, BOUNDS_ONLY, backend=engine_of(way))
 
 
 def _tokens(way: Way, magnitude: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
     """(1, H W, 4) source and target tokens between half of a magnitude and the whole."""
-    generator = torch.Generator().manual_seed(2)
-    uniform = torch.rand(2, SIZE * SIZE, 4, generator=generator, dtype=torch.float64)
-    values = ((0.5 + uniform / 2) * magnitude).to(way.dtype)
+    values = random_features((2, SIZE * SIZE, 4), way, seed=2, magnitude=magnitude)
     return values[:1], values[1:]
 
 
@@ -52,10 +57,8 @@ def _exact_blend(
 def _magnitude(magnitude: float, way: Way) -> float:
     """Error of blended tokens in steps of their type."""
     layer, (source, new) = _layer(way), _tokens(way, magnitude)
-    result = layer.blend_tokens(source, new, 0.7)[0].double()
-    expected = _exact_blend(layer, source, new, 0.7)
-    step = torch.finfo(way.dtype).eps * expected.abs()
-    return float(((result - expected).abs() / step).max())
+    result = layer.blend_tokens(source, new, 0.7)[0]
+    return float(in_steps(result, _exact_blend(layer, source, new, 0.7), way).max())
 
 
 def _weight(weight: float, way: Way) -> float:
@@ -66,9 +69,7 @@ def _weight(weight: float, way: Way) -> float:
         side = layer.warp_tokens(source) if weight else new
         inside = layer.mask.reshape(-1)
         return 0.0 if torch.equal(result[:, inside], side[:, inside]) else math.inf
-    expected = _exact_blend(layer, source, new, weight)
-    step = torch.finfo(way.dtype).eps * expected.abs()
-    return float(((result[0].double() - expected).abs() / step).max())
+    return float(in_steps(result[0], _exact_blend(layer, source, new, weight), way).max())
 
 
 def _outside(share: float, way: Way) -> float:
@@ -114,17 +115,7 @@ def _views_of_a_batch(views: float, way: Way) -> float:
         orbit(0, size=SIZE, height=1),
         [orbit(8.0 * k, size=SIZE, height=1) for k in range(count)],
     )
-    warps = [
-        warp_surfaces(
-            source,
-            target,
-            Surface(torch.from_numpy(plane_depth(target, (1, 0, 0), 0.0))),
-            None,
-            preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
-            backend=engine_of(way),
-        )
-        for target in targets
-    ]
+    warps = [_view(source, target, plane_depth(target, (1, 0, 0), 0.0), way) for target in targets]
     generator = torch.Generator().manual_seed(1)
     latents = torch.randn(
         count + 1, channels, SIZE, SIZE, generator=generator, dtype=torch.float64
@@ -185,14 +176,7 @@ def _apart(yaw: float, way: Way) -> float:
     pose[0, 2], pose[2, 0] = -math.sin(angle), math.sin(angle)
     source = Camera(K, pose, SIZE, SIZE)
     depth = np.full((SIZE, SIZE), 4.0)
-    view = warp_surfaces(
-        source,
-        target,
-        Surface(torch.from_numpy(depth)),
-        None,
-        preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
-        backend=engine_of(way),
-    )
+    view = _view(source, target, depth, way)
     # A turn moves a direction's azimuth by the yaw, whatever its depth.
     x, y, _ = np.moveaxis(target.directions(), -1, 0)
     azimuth = np.arctan2(x, 1) - angle
@@ -216,14 +200,7 @@ def _latents(size: float, way: Way) -> float:
     near = np.eye(4)
     near[2, 3] = -1.0
     source, target = Camera(K, near, 64, 64), Camera(K, np.eye(4), 64, 64)
-    view = warp_surfaces(
-        source,
-        target,
-        Surface(torch.from_numpy(np.full((64, 64), 2.0))),
-        None,
-        preset("corrected", opaque=None, depth_agreement=False, normal_test="none"),
-        backend=engine_of(way),
-    )
+    view = _view(source, target, np.full((64, 64), 2.0), way)
     layer = view.at((n, n))
     # A step along the axis by half of the depth doubles the offsets from the middle.
     expected = 2 * (target.resize(n, n).pixel_centers() - n / 2) + n / 2

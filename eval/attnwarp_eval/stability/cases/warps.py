@@ -255,8 +255,7 @@ def _undefined_depth(share: float, way: Way) -> float:
     expected = np.ones(64, bool)
     expected[chosen] = False
     wrong = (result.defined.numpy().ravel() != expected).sum()
-    features = torch.ones(1, 8, 8, dtype=way.dtype)
-    warped = FeatureWarp(result, result.defined, engine_of(way)).warp(features).numpy().ravel()
+    warped = _warped(result, torch.ones(1, 8, 8, dtype=way.dtype), way).numpy().ravel()
     return float(wrong + (warped[~expected] != 0).sum() + (~np.isfinite(warped)).sum())
 
 
@@ -265,14 +264,39 @@ def engine_of(way: Way) -> Backend:
     return "reference" if way.backend == "reference" else "auto"
 
 
+def _warped(result: Correspondence, features: torch.Tensor, way: Way) -> torch.Tensor:
+    """Features along a correspondence wherever it is defined."""
+    return FeatureWarp(result, result.defined, engine_of(way)).warp(features)
+
+
+def random_features(
+    shape: tuple[int, ...], way: Way, seed: int, magnitude: float = 1.0
+) -> torch.Tensor:
+    """Between half of a magnitude and the whole, rounded to the type of a way."""
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(shape, generator=generator, dtype=torch.float64)
+    return ((0.5 + uniform / 2) * magnitude).to(way.dtype)
+
+
+def before_a_plane(size: int) -> Pair:
+    """Two cameras, 25 degrees apart, and a plane through what they look at."""
+    source, target = orbit(0, size=size, height=1), orbit(25, size=size, height=1)
+    return Pair(source, target, plane_depth(target, (1, 0, 0), 0.0))
+
+
+def in_steps(result: torch.Tensor, expected: torch.Tensor, way: Way) -> torch.Tensor:
+    """Errors in steps of the type: one unit in the last place is at most eps * value."""
+    step = torch.finfo(way.dtype).eps * expected.abs()
+    return (result.double() - expected).abs() / step
+
+
 def _identity_bits(distance: float, way: Way) -> float:
     """Values that a view warped onto itself changes."""
     pair = _same_view(distance)
     result = positions(pair, Way(way.backend, "float64"))
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(3, 8, 8, generator=generator, dtype=torch.float64).to(way.dtype)
-    warped = FeatureWarp(result, result.defined, engine_of(way)).warp(features)
-    return float((warped != features).sum())
+    return float((_warped(result, features, way) != features).sum())
 
 
 def _opposed(yaw: float, way: Way) -> float:
@@ -389,7 +413,7 @@ def _ramp(size: float, way: Way) -> float:
     layer = positions(pair, Way(way.backend))
     ramp = np.moveaxis(source.resize(n, n).pixel_centers() / n, -1, 0)
     features = torch.from_numpy(ramp.astype(way.numpy))
-    warped = FeatureWarp(layer, layer.defined, engine_of(way)).warp(features).double().numpy()
+    warped = _warped(layer, features, way).double().numpy()
     position = np.moveaxis(layer.xy.numpy() / n, -1, 0)
     # Nearer the border than half a pixel the ramp is clamped.
     inner = ((position > 0.5 / n) & (position < 1 - 0.5 / n)).all(0)
@@ -398,18 +422,10 @@ def _ramp(size: float, way: Way) -> float:
 
 def _half(magnitude: float, way: Way) -> float:
     """Error of warped features in units of their last place, against torch's float64 sampling."""
-    source, target = orbit(0, size=32, height=1), orbit(25, size=32, height=1)
-    pair = Pair(source, target, plane_depth(target, (1, 0, 0), 0.0))
-    result = positions(pair, Way(way.backend))
-    generator = torch.Generator().manual_seed(1)
-    uniform = torch.rand(3, 32, 32, generator=generator, dtype=torch.float64)
-    features = ((0.5 + uniform / 2) * magnitude).to(way.dtype)
-    warped = FeatureWarp(result, result.defined, engine_of(way)).warp(features).double()
-    expected = grid_sampled(result, features)
-    inside = in_bounds(result)
-    step = torch.finfo(way.dtype).eps * expected.abs()
-    # The largest value of a binade has steps of half of that size: one unit is at most eps * value.
-    return float(((warped - expected).abs() / step)[:, inside].max())
+    result = positions(before_a_plane(32), Way(way.backend))
+    features = random_features((3, 32, 32), way, seed=1, magnitude=magnitude)
+    errors = in_steps(_warped(result, features, way), grid_sampled(result, features), way)
+    return float(errors[:, in_bounds(result)].max())
 
 
 def grid_sampled(result: Correspondence, features: torch.Tensor) -> torch.Tensor:
@@ -439,10 +455,7 @@ def _nan_positions(share: float, way: Way) -> float:
     holed = Correspondence(source, target, xy, whole.points, whole.target_depth)
     generator = torch.Generator().manual_seed(0)
     features = torch.rand(2, 16, 16, generator=generator, dtype=torch.float64).to(way.dtype)
-    results = [
-        FeatureWarp(c, c.defined, engine_of(way)).warp(features).reshape(2, -1)
-        for c in (whole, holed)
-    ]
+    results = [_warped(c, features, way).reshape(2, -1) for c in (whole, holed)]
     expected = results[0].clone()
     expected[:, chosen] = 0
     return float((expected != results[1]).sum())

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from ball_scene import ball_scene
 
 from attnwarp.encoders import EncoderInfo
 from attnwarp.errors import InputError
@@ -21,41 +22,17 @@ from attnwarp_eval.study.probes import probe, sensitivity
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import appearance
 
-SCENE = {
-    "name": "ball",
-    "title": "A ball and a box on the ground",
-    "objects": [
-        {
-            "name": "ground",
-            "shape": {
-                "type": "rectangle",
-                "center": [0, 0, 0],
-                "size": [8, 8],
-                "facing": [0, 0, 1],
-            },
-            "texture": {"type": "checker", "colors": ["#808080", "#909090"], "size": 1.0},
-        },
-        {
-            "name": "ball",
-            "shape": {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8},
-            "texture": {"type": "checker", "colors": ["#3050c0", "#4060d0"], "size": 0.5},
-        },
-        {
-            "name": "box",
-            "shape": {"type": "box", "center": [0.3, 1.6, 0.3], "size": [0.6, 0.6, 0.6]},
-            "texture": {"type": "checker", "colors": ["#c0c0c0", "#d0d0d0"], "size": 0.3},
-        },
-    ],
-    "lights": [{"type": "sky", "horizon": "#ffffff", "zenith": "#ffffff", "radiance": 0.8}],
-    "cameras": {
-        "look_at": [0, 0, 0.7],
-        "radius": 4,
-        "fov": 50,
-        "size": [32, 32],
-        "source": {"yaw": 0, "height": 1.5},
-        "targets": [{"yaw": 15, "height": 1.5}, {"yaw": 30, "height": 1.5}],
-    },
-    "edits": [
+BOX = {
+    "name": "box",
+    "shape": {"type": "box", "center": [0.3, 1.6, 0.3], "size": [0.6, 0.6, 0.6]},
+    "texture": {"type": "checker", "colors": ["#c0c0c0", "#d0d0d0"], "size": 0.3},
+}
+SCENE = ball_scene(
+    "A ball and a box on the ground",
+    0.8,
+    ("#3050c0", "#4060d0"),
+    {"look_at": [0, 0, 0.7], "radius": 4, "targets": (15, 30)},
+    [
         {
             "name": "green",
             "instruction": "Make the ball green",
@@ -93,7 +70,8 @@ SCENE = {
             "lights": [{"type": "sky", "horizon": "#f0a060", "zenith": "#604060", "radiance": 0.5}],
         },
     ],
-}
+    objects=[BOX],
+)
 WORDS = {
     "a blue ball": (0, 0, 1),
     "a green ball": (0, 1, 0),
