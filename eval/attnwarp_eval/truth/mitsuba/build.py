@@ -106,7 +106,7 @@ def load_world(
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel
-    base = (mi.variant(), scene.world_hash, texel)
+    base = (mi.variant(), scene.world_hash, texel, TEXELS)
     forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
     shone = {
         f"light_{k}": _beam(scene, k, center)
