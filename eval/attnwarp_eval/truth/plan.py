@@ -203,7 +203,8 @@ def plan(
             "light passes through a medium"
             f" ({needed.get('medium') or needed['subsurface']}): volpath"
         )
-        return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, roulette))
+        # Scattered light takes many short steps, of which roulette saves more than its noise costs.
+        return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, ROULETTE))
     if not {"specular", "glossy", "refraction"} & set(needed):
         reasons.append(
             "every material is diffuse and opaque: no path passes through glass or a medium, and"
