@@ -32,7 +32,7 @@ def world(lights, objects=None, **appearance_):
         "title": "t",
         "objects": objects or [FLOOR],
         "lights": lights,
-        "appearance": appearance_,
+        "appearance": {"bounces": 1} | appearance_,
         "cameras": {
             "look_at": [0, 0, 0],
             "radius": 3,

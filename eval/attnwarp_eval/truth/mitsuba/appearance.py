@@ -142,7 +142,9 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
         if step.integrator == "ptracer":
             # Lamps, seen directly, are the other pass's.
             options |= {"hide_emitters": True}
-        world, center, fog = load_world(scene, step.lights, step.lamps, plan.media, step.beam)
+        world, center, fog = load_world(
+            scene, step.lights, step.lamps, plan.media, step.beam, aims_at_sky=step.aims_at_sky
+        )
         pass_seed = len(plan.passes) * int(seed) + number
         if step.first != "any":
             total += step.sign * _part(

@@ -39,6 +39,7 @@ SCENE = {
         },
     ],
     "lights": [{"type": "sky", "horizon": "#ffffff", "zenith": "#ffffff", "radiance": 0.8}],
+    "appearance": {"bounces": 1},
     "cameras": {
         "look_at": [0, 0, 0.8],
         "radius": 3.5,
