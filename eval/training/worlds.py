@@ -298,6 +298,8 @@ class World:
             "title": OBJECTS[self.thing],
             "objects": objects,
             "lights": look.lights,
+            # Direct light, whatever a scene's default becomes: bundled weights were trained on it.
+            "appearance": {"bounces": 1},
             "cameras": {
                 "look_at": [*middle, round(float(rng.uniform(0.38, 0.6)), 2)], "radius": round(float(radius), 2),
                 "fov": round(float(rng.uniform(28, 42)), 1), "size": [size, size],

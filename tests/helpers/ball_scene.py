@@ -36,6 +36,7 @@ def ball_scene(title, radius, colors, cameras, edits, *, objects=()):
             *objects,
         ],
         "lights": [{"type": "sky", "horizon": "#ffffff", "zenith": "#ffffff", "radiance": 0.8}],
+        "appearance": {"bounces": 1},
         "cameras": {**cameras, **views, "targets": targets},
         "edits": edits,
     }

@@ -16,14 +16,14 @@ from attnwarp_eval.statistics.equivalence import welch_interval
 from attnwarp_eval.statistics.intervals import time_ratio
 from attnwarp_eval.truth.llvm import LLVM, variant
 from attnwarp_eval.truth.mitsuba import render_plan
-from attnwarp_eval.truth.plan import Plan, everything_on, plan
+from attnwarp_eval.truth.plan import Plan, bounces_of, everything_on, plan
 
 Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Cap:
-    """Light that a scene's cap on bounces removes, and the cost of everything on within it.
+    """What a scene's cap on bounces cuts off, pinned or measured, and what everything on costs.
 
     Attributes:
         bounces: the cap.
@@ -117,7 +117,8 @@ def measure(
 ) -> Cost:
     """Render plan and everything on in turn and time both, after one unmeasured picture each.
 
-    Where the scene caps its bounces, everything on within the cap is a third.
+    Where the scene caps its bounces or the number is measured, everything on within the cap is a
+    third, unless it is what the plan says.
 
     Args:
         size, spp: of the picture; if left out as large as needed for tracing, not starting, to take
@@ -132,9 +133,12 @@ def measure(
     size, spp = size or (96 if variant() == LLVM else 48), spp or (64 if variant() == LLVM else 16)
     small = scene.with_size(size, size)
     contestants = [plan(small, spp), everything_on(small, spp, capped=False)]
-    bounces = scene.spec.appearance.bounces
-    if bounces != "unlimited":
-        contestants.append(everything_on(small, spp))
+    bounces = bounces_of(scene)
+    within = everything_on(small, spp)
+    # In fog the plan is everything on within the cap: the same computation costs the same.
+    same = within.identity() == contestants[0].identity()
+    if bounces != "unlimited" and not same:
+        contestants.append(within)
 
     def rendered(made: Plan) -> Callable[[int], Any]:
         # Both runs of the plan in a round have one seed: only their seconds are compared.
@@ -150,13 +154,16 @@ def measure(
     interval = _ratio_interval(taken[0], taken[1], seconds[0], seconds[1])
     cap = None
     if bounces != "unlimited":
-        faster = _slower(seconds[0], seconds[2])
         bias, between = _cut(taken[0].mean(1), taken[1].mean(1))
-        cap = Cap(
-            bounces, bias, between, medians[2], variance[2], faster,
-            faster * variance[2] / variance[0] if variance[0] > 0 else float("inf"),
-            _ratio_interval(taken[0], taken[2], seconds[0], seconds[2]),
-        )  # fmt: skip
+        if same:
+            cap = Cap(bounces, bias, between, medians[0], variance[0], 1.0, 1.0, (1.0, 1.0))
+        else:
+            faster = _slower(seconds[0], seconds[2])
+            cap = Cap(
+                bounces, bias, between, medians[2], variance[2], faster,
+                faster * variance[2] / variance[0] if variance[0] > 0 else float("inf"),
+                _ratio_interval(taken[0], taken[2], seconds[0], seconds[2]),
+            )  # fmt: skip
     faster = _slower(seconds[0], seconds[1])
     return Cost(
         size,

@@ -18,6 +18,7 @@ from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import Equivalence
+from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.plan import everything_on, plan
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def measure_entry(
         "content": scene.content_hash,
         "variant": variant(),
         "needed": [name for name, one in findings.items() if one.needed and one.simulated],
-        "left_out": [name for name, one in findings.items() if one.source == "said"],
+        "left_out": [name for name, one in findings.items() if one.source in ("said", "measured")],
         "not_simulated": [
             name for name, one in findings.items() if one.needed and not one.simulated
         ],
@@ -95,6 +96,8 @@ def measure_entry(
         "everything_on": everything_on(scene, capped=False).to_dict(),
         "picture": f"{scene.name}.jpg",
     }
+    if scene.spec.appearance.bounces == "auto":
+        entry["bounces"] = answer(scene).words
     if settings.rounds:
         progress(f"{scene.name}: time against everything on")
         entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
@@ -279,15 +282,27 @@ def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
             f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in"
             f" turn, {costs[0]['rounds']} rounds. Everything on follows light until roulette ends"
             " it. **At equal noise**: the same times the ratio of variances. Where a scene caps"
-            " its bounces the plan leaves light out by the scene's own word, so that the two"
-            " pictures have other means and equal noise is not equal error: the **light changed by"
-            " the cap** is the mean of the plan's pictures against that of everything on without a"
-            " cap. **At equal error** is therefore against everything on within the cap, whose"
+            " its bounces, by its own word or as measured below, the plan leaves light out, so that"
+            " the two pictures have other means and equal noise is not equal error: the **light"
+            " changed by the cap** is the mean of the plan's pictures against that of everything"
+            " on without a cap. **At equal error** is therefore against everything on within the"
+            " cap, which is 1 where the plan is that, and whose"
             " pictures have the plan's mean. Intervals are 95 %, by bootstrap over rounds (of the"
             " light by Welch's test); above 1 the plan saves. An interval that holds 1 says that"
             " nothing was seen to be saved."
         )
     sections = [Section("Every scene", tables=[replace(table(entries), timed=())])]
+    words = [f"- {e['scene']}: {e['bounces']}" for e in entries if e.get("bounces")]
+    if words:
+        text = [
+            (
+                "Of scenes that say `bounces: auto`: the light that the number taken leaves out in"
+                " the view where it is the least certain, and that one bounce fewer leaves out"
+                " (docs/bounces.md)."
+            ),
+            "\n".join(words),
+        ]
+        sections.append(Section("Measured numbers of bounces", text))
     drawn = [entry for entry in entries if "largest_difference" in entry]
     if drawn:
         text = [

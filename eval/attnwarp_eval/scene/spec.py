@@ -178,11 +178,12 @@ class CamerasSpec(Spec):
 class AppearanceSpec(Spec):
     """How pictures are made: light bounces (1 is direct light only) and samples a pixel.
 
-    ``bounces: unlimited`` follows light until it is gone; every surface and every scattering counts
-        as a bounce.
+    ``bounces: auto`` takes the fewest bounces that hold every view's light within 1 %, measured by
+    :mod:`attnwarp_eval.truth.bounces`. ``bounces: unlimited`` follows light until it is gone. Every
+    surface and every scattering counts as a bounce.
     """
 
-    bounces: Annotated[int, Field(ge=1, le=64)] | Literal["unlimited"] = 1
+    bounces: Annotated[int, Field(ge=1, le=64)] | Literal["auto", "unlimited"] = "auto"
     spp: int = Field(default=16, ge=1, le=65536)
 
 

@@ -162,7 +162,7 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
                 ("objects", k, "material"),
             )
         needed, why = _bounces_needed(item.material)
-        if not item.emission and bounces != "unlimited" and bounces < needed:
+        if not item.emission and isinstance(bounces, int) and bounces < needed:
             yield (
                 (
                     f"appearance.bounces: got {bounces}, but object {item.name!r} is"
@@ -170,6 +170,12 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
                 ),
                 ("objects", k, "material"),
             )
+
+
+def fewest_bounces(spec: SceneSpec) -> int:
+    """The least number of bounces that shows what every object of a scene is made of."""
+    shown = (item.material for item in spec.objects if not item.emission)
+    return max((_bounces_needed(material)[0] for material in shown), default=1)
 
 
 def _bounces_needed(material: Material) -> tuple[int, str]:

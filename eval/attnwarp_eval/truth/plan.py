@@ -1,13 +1,14 @@
 """The cheapest rendering that is faithful to a scene.
 
-:func:`plan` follows from what the scene file says, without loading anything. docs/effects.md has
-the reasons.
+:func:`plan` follows from what the scene file says, without loading anything, but for the number of
+bounces where the file leaves it open (:mod:`attnwarp_eval.truth.bounces`). docs/effects.md has the
+reasons.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,12 @@ from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
 from attnwarp_eval.scene.spec import SkySpec
 
+if TYPE_CHECKING:
+    from attnwarp_eval.truth.bounces import Answer
+
 Array = npt.NDArray[np.float64]
 Integrator = Literal["direct", "path", "volpath", "ptracer"]
+Bounces = int | Literal["unlimited"]
 
 SMALL = 0.15
 """A lamp counts as small when its radius is below this share of its distance from the glass. Paths
@@ -66,6 +71,8 @@ class Pass:
         beam: light only what lies in the direction of the smooth objects (a point light becomes a
             spot upon them).
         sign: -1 for a pass that is taken away.
+        aims_at_sky: whether points are connected to the sky as to other lights; without it only
+            rays spread by the materials find the sky.
     """
 
     lights: tuple[int, ...]
@@ -79,6 +86,7 @@ class Pass:
     first: Literal["any", "smooth", "rough"] = "any"
     beam: bool = False
     sign: Literal[1, -1] = 1
+    aims_at_sky: bool = True
 
 
 @dataclass(frozen=True)
@@ -149,13 +157,18 @@ def sampler(spp: int) -> str:
 
 
 def plan(
-    scene: Scene, spp: int | None = None, *, want: Literal["appearance", "geometry"] = "appearance"
+    scene: Scene,
+    spp: int | None = None,
+    *,
+    want: Literal["appearance", "geometry"] = "appearance",
+    bounces: Bounces | None = None,
 ) -> Plan:
     """The cheapest rendering that shows what ``scene`` calls for.
 
     Args:
         spp: samples a pixel; the scene's own number if left out.
         want: "geometry" (depth, normals, ids, visibility) needs no rendering, only rays.
+        bounces: in place of the scene's own.
 
     Raises:
         ValueError: spp below 1.
@@ -178,17 +191,21 @@ def plan(
     for message, _ in transport.contradictions(scene.spec):
         raise SceneError(message, scene.path)
 
+    reasons: list[str] = []
+    if bounces is None:
+        bounces = bounces_of(scene)
+        if wanted.bounces == "auto":
+            reasons.append(f"bounces: auto: {_measured(scene).words}")
     needed = transport.called_for(scene.spec)
     lights = scene.spec.lights
     everything = tuple(range(len(lights)))
     lamps = any(item.emission for item in scene.spec.objects)
     media = "medium" in needed or "subsurface" in needed
     lens = scene.spec.cameras.lens
-    reasons: list[str] = []
     optic = Lens(lens.aperture, lens.focus) if lens else None
     if optic:
         reasons.append("cameras.lens has an aperture: a thin lens instead of a pinhole")
-    depth = -1 if wanted.bounces == "unlimited" else wanted.bounces + 1
+    depth = -1 if bounces == "unlimited" else bounces + 1
     # Roulette would end paths at random: unbiased, but noise that a short path is not worth.
     roulette = ROULETTE if depth < 0 else depth + 1
     if depth != 2 and not media and convex(scene):
@@ -203,7 +220,8 @@ def plan(
             "light passes through a medium"
             f" ({needed.get('medium') or needed['subsurface']}): volpath"
         )
-        return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, roulette))
+        # Scattered light takes many short steps, of which roulette saves more than its noise costs.
+        return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, ROULETTE))
     if not {"specular", "glossy", "refraction"} & set(needed):
         reasons.append(
             "every material is diffuse and opaque: no path passes through glass or a medium, and"
@@ -211,12 +229,21 @@ def plan(
         )
     if depth != 2:
         reasons.append(
-            f"the scene asks for {wanted.bounces} bounces: paths "
+            f"{bounces} bounces: paths "
             + ("until roulette ends them" if depth < 0 else f"of up to {depth} edges")
         )
         small = small_lights(scene) if "caustics" in needed and optic is None else None
         if small is None:
-            return finish(Pass(everything, "path", depth, 1, 1, spp, lamps, roulette))
+            only = Pass(everything, "path", depth, 1, 1, spp, lamps, roulette)
+            others = lamps or any(not isinstance(light, SkySpec) for light in lights)
+            sky = any(isinstance(light, SkySpec) for light in lights)
+            if sky and others and not {"specular", "refraction"} & set(needed):
+                only = replace(only, aims_at_sky=False)
+                reasons.append(
+                    "the sky is smooth: rays spread by the materials find it with less noise than"
+                    " rays toward it, which are left to the other lights"
+                )
+            return finish(only)
         reasons.append(
             f"light of {small} is bent by {needed['caustics'].split(',')[0]}: paths from the light"
             " find its caustic"
@@ -251,9 +278,7 @@ def plan(
             passes.append(Pass(skies, "path", depth, 1, 1, spp, False, roulette))
         return finish(*passes)
 
-    reasons.append(
-        "the scene asks for one bounce: light sampled at each visible point is the whole sum"
-    )
+    reasons.append("one bounce: light sampled at each visible point is the whole sum")
     glossy = "glossy" in needed
     passes = []
     # One direction or one point is one sample: its own pass has no noise but that of the pixel's
@@ -284,6 +309,23 @@ def plan(
     return finish(*passes)
 
 
+def bounces_of(scene: Scene) -> Bounces:
+    """How many bounces a scene's pictures have: the number that its file pins, or with ``bounces:
+    auto`` the measured one.
+    """
+    wanted = scene.spec.appearance.bounces
+    if wanted != "auto":
+        return wanted
+    return _measured(scene).bounces
+
+
+def _measured(scene: Scene) -> Answer:
+    # Measuring renders plans of given numbers of bounces, which come from here.
+    from attnwarp_eval.truth.bounces import answer
+
+    return answer(scene)
+
+
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
     """What a renderer does that knows nothing of the scene: volpath for all lights at once, a lens
     where one is said.
@@ -293,13 +335,14 @@ def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) 
 
     Args:
         spp: samples a pixel; the scene's own number if left out.
-        capped: keep the scene's own cap on bounces, which is part of what its truth means. Without
-            it light is followed until roulette ends it: what the cap saves.
+        capped: keep the scene's own cap on bounces, which is part of what its truth means, or with
+            ``bounces: auto`` the measured one. Without it light is followed until roulette ends it:
+            what the cap saves.
     """
     ours = plan(scene, spp)
     spp = spp or scene.spec.appearance.spp
-    bounces = scene.spec.appearance.bounces
-    depth = -1 if bounces == "unlimited" or not capped else bounces + 1
+    bounces = bounces_of(scene) if capped else "unlimited"
+    depth = -1 if bounces == "unlimited" else bounces + 1
     everything = tuple(range(len(scene.spec.lights)))
     lamps = any(item.emission for item in scene.spec.objects)
     if any(step.integrator == "ptracer" for step in ours.passes):

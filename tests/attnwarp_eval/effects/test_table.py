@@ -8,7 +8,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from effect_scenes import FLOOR, SKY, SUN, ball, make
+from effect_scenes import FLOOR, SCENES, SKY, SUN, ball, make
 from scipy import stats
 from typer.testing import CliRunner
 
@@ -21,7 +21,7 @@ from attnwarp_eval.experiments import effects
 from attnwarp_eval.experiments.effects import collect
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.truth import mitsuba
-from attnwarp_eval.truth.plan import plan
+from attnwarp_eval.truth.plan import everything_on, plan
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 
@@ -99,6 +99,22 @@ def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(
         and "pixel" in smallest
     )
     assert times == ["–"] * 5
+
+
+def test_in_fog_the_plan_is_everything_on_within_the_cap_and_never_loses(monkeypatch):
+    scene = SCENES["medium"]()
+    assert plan(scene).identity() == everything_on(scene).identity()
+    rendered = []
+
+    def render(scene, camera, made, seed):
+        rendered.append(made)
+        return 1 + 0.02 * np.random.default_rng(seed).standard_normal((8, 8, 3))
+
+    monkeypatch.setattr(saving, "render_plan", render)
+    measured = saving.measure(scene, size=8, spp=4, rounds=3)
+    assert measured.cap.at_equal_error == measured.cap.faster == 1.0
+    # The plan twice a round, and everything on without a cap; one more round comes first.
+    assert len(rendered) == 3 * 4
 
 
 def test_what_the_cap_cuts_off_is_told_and_equal_error_is_within_the_cap(monkeypatch):

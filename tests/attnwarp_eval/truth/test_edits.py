@@ -149,6 +149,7 @@ objects:
 lights:
   - {type: sky, horizon: '#ffffff', zenith: '#ffffff'}
 cameras: {look_at: [0, 0, 0], radius: 3, source: {yaw: 0, height: 1}, targets: [{yaw: 30, height: 1}]}
+appearance: {bounces: 1}
 edits:
   - name: blue
     instruction: Make it blue
@@ -189,7 +190,7 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
         (
             "object: ball",
             "object: bal",
-            r"small.yaml:11: edits\[0\]: edit 'blue': there is no object 'bal'.* ball",
+            r"small.yaml:12: edits\[0\]: edit 'blue': there is no object 'bal'.* ball",
         ),
         ("{'#c04020'", "{'#c04021'", r"recolor: 'ball' has no colour '#c04021'; it has #c04020"),
         (

@@ -11,6 +11,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.truth import Geometry, appearance, mitsuba
+from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.plan import Pass, Plan, plan
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
 
@@ -31,7 +32,7 @@ def world(lights, objects=None, **appearance_):
         "title": "t",
         "objects": objects or [FLOOR],
         "lights": lights,
-        "appearance": appearance_,
+        "appearance": {"bounces": 1} | appearance_,
         "cameras": {
             "look_at": [0, 0, 0],
             "radius": 3,
@@ -178,6 +179,10 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
     appearance(scene, scene.targets[0])
     appearance(world([SUN | {"azimuth": 51}, SKY], spp=1).with_size(16, 16), scene.source)
     assert len(calls) == 5
+    # Fewer texels a texture make another picture.
+    monkeypatch.setattr(build, "TEXELS", 4)
+    coarse = appearance(scene, scene.source)
+    assert len(calls) == 6 and not np.array_equal(coarse, first)
 
 
 def test_the_plan_follows_from_the_scene_and_says_why():

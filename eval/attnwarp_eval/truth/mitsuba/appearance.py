@@ -21,6 +21,7 @@ from attnwarp.camera import Camera
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth.llvm import SCALAR, variant
+from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.mitsuba.build import (
     library,
     load_sensor,
@@ -73,6 +74,7 @@ def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int =
         variant(),
         scene.world_hash,
         texel_size(scene),
+        build.TEXELS,
         # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
         (
             scene.spec.cameras.model_dump(mode="json", exclude={"size"})
@@ -140,7 +142,9 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
         if step.integrator == "ptracer":
             # Lamps, seen directly, are the other pass's.
             options |= {"hide_emitters": True}
-        world, center, fog = load_world(scene, step.lights, step.lamps, plan.media, step.beam)
+        world, center, fog = load_world(
+            scene, step.lights, step.lamps, plan.media, step.beam, aims_at_sky=step.aims_at_sky
+        )
         pass_seed = len(plan.passes) * int(seed) + number
         if step.first != "any":
             total += step.sign * _part(

@@ -97,16 +97,19 @@ def load_world(
     media: bool,
     narrow: bool = False,
     texel: float | None = None,
+    *,
+    aims_at_sky: bool = True,
 ) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and
     the fog or None.
 
     Args:
         texel: size of a baked texel in scene units; :func:`texel_size` if left out.
+        aims_at_sky: see :class:`~attnwarp_eval.truth.plan.Pass`.
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel
-    base = (mi.variant(), scene.world_hash, texel)
+    base = (mi.variant(), scene.world_hash, texel, TEXELS)
     forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
     shone = {
         f"light_{k}": _beam(scene, k, center)
@@ -114,6 +117,10 @@ def load_world(
         else light_form(scene.spec.lights[k], center)
         for k in lights
     }
+    if not aims_at_sky:
+        for k in lights:
+            if isinstance(scene.spec.lights[k], SkySpec):
+                shone[f"light_{k}"] |= {"sampling_weight": 0.0}
     # Asked for or not: what is not there does not make another world.
     lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (
@@ -161,7 +168,7 @@ def load_world(
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
     cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
-    return cached((*base, lights, lamps, media, narrow, cameras), make)
+    return cached((*base, lights, lamps, media, narrow, cameras, aims_at_sky), make)
 
 
 def interior(item: ObjectSpec) -> InteriorSpec | None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth.llvm import variant
+from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.mitsuba.build import (
     cached,
     interior,
@@ -29,7 +30,7 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     everything = tuple(range(len(scene.spec.lights)))
     world, center, fog = load_world(scene, everything, True, True)
     forms, _, plugins = cached(
-        (mi.variant(), scene.world_hash, texel_size(scene)),
+        (mi.variant(), scene.world_hash, texel_size(scene), build.TEXELS),
         lambda: load_shapes(scene, texel_size(scene)),
     )
     names = {key: f"objects[{owner}]" for key, (_, owner, _) in forms.items()}

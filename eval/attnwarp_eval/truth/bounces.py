@@ -1,0 +1,284 @@
+"""How many bounces of light a scene calls for, measured: what ``bounces: auto`` means.
+
+The fewest bounces whose pictures are shown to have, in every view, the light of pictures without
+an end of bounces within :data:`MARGIN`: |d| + t SE of the mean over pairs of pictures of one seed,
+with t the 99 % quantile of Student's distribution (two one-sided tests, Schuirmann 1987). Every
+view must pass, so that no correction for their number is needed; a number that is too small passes
+with a chance of at most 1 % for each of the :data:`SAMPLES` tried. Where noise or light leaves no
+number up to :data:`MOST` that passes, light has no end.
+
+Answers of the package's scenes are recorded beside them (``scenes/bounces.json``), those of other
+scenes in the cache. :func:`attnwarp_eval.effects.proof.prove` measures with other seeds again.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp.camera import Camera
+from attnwarp_eval.cache import content_key, read_arrays, write_arrays
+from attnwarp_eval.scene import transport
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.statistics.equivalence import paired_test
+from attnwarp_eval.truth.llvm import variant
+from attnwarp_eval.truth.plan import Bounces, convex, plan
+
+Array = npt.NDArray[np.float64]
+
+MARGIN = 0.01
+"""Light that a cap may take off a view's picture, as a share of its mean: that of the proofs."""
+
+CONFIDENCE = 0.99
+
+SIZE, BLOCK = 32, 8
+"""Pixels along a side of the measured pictures, and of their blocks."""
+
+SEEDS = 16
+
+SAMPLES = (16, 64, 256)
+"""Samples a pixel, more where fewer cannot tell."""
+
+MOST = 12
+"""Most bounces that are tried."""
+
+PROTOCOL = 1
+"""Raised whenever the same scene would be measured otherwise."""
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """Light that a number of bounces leaves out, in the view where the least certain.
+
+    Attributes:
+        bounces: the number.
+        view: name of the view.
+        spp: samples a pixel.
+        difference, error: light without an end less that of the pictures, and its standard error,
+            as shares of the mean.
+        bound: |difference| + t SE.
+        block: the largest difference of the mean of an 8 x 8 block, as a share of the picture's
+            mean; most of it may be noise.
+    """
+
+    bounces: int
+    view: str
+    spp: int
+    difference: float
+    error: float
+    bound: float
+    block: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the light is shown to be complete within the margin."""
+        return self.bound < MARGIN
+
+
+@dataclass(frozen=True)
+class Answer:
+    """How many bounces hold a scene's pictures, and the evidence.
+
+    Attributes:
+        bounces: the number; "unlimited" where none up to :data:`MOST` is shown to suffice.
+        held: what that number leaves out, in the view where its bound is the largest; None where
+            nothing was measured.
+        fewer: what one bounce fewer leaves out, in the view that refused it; None where there is
+            none.
+        made_by: Mitsuba's version and variant; None where nothing was measured.
+
+    Example:
+        >>> held = Shortfall(3, "source", 16, 0.004, 0.0005, 0.0053, 0.02)
+        >>> fewer = Shortfall(2, "yaw030", 16, 0.019, 0.001, 0.0216, 0.06)
+        >>> print(Answer(3, held, fewer, "3.9.1 llvm_ad_rgb").words)
+        3 leave out 0.40 % of a view's light (source; below 0.53 %), 2 leave out 1.90 % (yaw030)
+    """
+
+    bounces: Bounces
+    held: Shortfall | None
+    fewer: Shortfall | None
+    made_by: str | None
+
+    @property
+    def words(self) -> str:
+        """The number and the evidence, for a person."""
+        if self.made_by is None:
+            return "a single convex surface never lights itself"
+        out = []
+        if self.held is not None:
+            out.append(
+                f"{self.held.bounces} {_leave(self.held)} {self.held.difference:.2%} of a view's"
+                f" light ({self.held.view}; below {self.held.bound:.2%})"
+            )
+        if self.fewer is not None:
+            out.append(
+                f"{self.fewer.bounces} {_leave(self.fewer)} {self.fewer.difference:.2%}"
+                f" ({self.fewer.view})"
+            )
+        # A space before the sign, as everywhere.
+        words = ", ".join(out).replace("%", " %")
+        return words if self.held else f"no number suffices, light has no end: {words}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(data: dict[str, Any]) -> Answer:
+        """What :meth:`to_dict` made."""
+        held, fewer = (Shortfall(**data[k]) if data[k] else None for k in ("held", "fewer"))
+        return Answer(data["bounces"], held, fewer, data["made_by"])
+
+
+def _leave(shortfall: Shortfall) -> str:
+    return "leaves out" if shortfall.bounces == 1 else "leave out"
+
+
+def answer(scene: Scene) -> Answer:
+    """How many bounces ``scene`` calls for, whatever its file says: recorded, cached, or measured.
+
+    Measuring renders some hundred pictures of 32 x 32, which takes some ten seconds.
+
+    Example:
+        A single ball on nothing never lights itself, so nothing is measured.
+
+        >>> from attnwarp_eval.scene.spec import SceneSpec
+        >>> view = {"yaw": 0, "height": 1}
+        >>> ball = {"type": "sphere", "center": [0, 0, 0], "radius": 1}
+        >>> spec = SceneSpec.model_validate({
+        ...     "name": "ball", "title": "A ball",
+        ...     "objects": [{"name": "ball", "shape": ball,
+        ...                  "texture": {"type": "plain", "color": "#808080"}}],
+        ...     "lights": [{"type": "sun", "elevation": 40, "azimuth": 0, "irradiance": 2}],
+        ...     "cameras": {"look_at": [0, 0, 0], "radius": 3, "source": view,
+        ...                 "targets": [{"yaw": 90, "height": 1}]}})
+        >>> answer(Scene(spec)).bounces
+        1
+    """
+    import mitsuba
+
+    if convex(scene) and scene.spec.medium is None:
+        return Answer(1, None, None, None)
+    recorded = _recorded().get(key(scene))
+    if recorded is not None:
+        return recorded
+    from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, build
+
+    place = content_key(
+        key(scene), APPEARANCE_PROTOCOL, mitsuba.__version__, variant(), build.TEXELS
+    )
+    stored = read_arrays("bounces", place)
+    if stored is None:
+        stored = {"answer": np.array(json.dumps(search(scene).to_dict()))}
+        write_arrays("bounces", place, stored)
+    return Answer.from_dict(json.loads(str(stored["answer"])))
+
+
+def key(scene: Scene) -> str:
+    """SHA-256 of what the answer follows from: all that is lit and seen, from every view, and how
+    it is measured. Size and samples of the scene's pictures are not among it.
+    """
+    return content_key(
+        "bounces",
+        PROTOCOL,
+        [MARGIN, CONFIDENCE, SIZE, SEEDS, *SAMPLES, MOST],
+        scene.world_hash,
+        scene.spec.cameras.model_dump(mode="json", exclude={"size"}),
+    )
+
+
+RECORD = "bounces.json"
+"""Beside the package's scenes: name -> key and answer. scripts/record_bounces.py writes it."""
+
+
+@functools.cache
+def _recorded() -> dict[str, Answer]:
+    path = Path(__file__).parents[1] / "scenes" / RECORD
+    entries = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return {entry["key"]: Answer.from_dict(entry["answer"]) for entry in entries.values()}
+
+
+# Measuring
+# --------------------------------------------------------------------------------------------------
+
+Pictures = Callable[[Bounces, Camera, int], Array]
+"""(SEEDS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
+
+
+def search(scene: Scene) -> Answer:
+    """Measure how many bounces ``scene`` calls for; nothing is read from record or cache."""
+    import mitsuba
+
+    from attnwarp_eval.truth.mitsuba import comparable
+
+    small = scene.with_size(SIZE, SIZE)
+    made_by = f"{mitsuba.__version__} {comparable(small)}"
+    pictures = pictures_of(small)
+    views = list(small.cameras)
+    fewer = None
+    for bounces in range(transport.fewest_bounces(scene.spec), MOST + 1):
+        worst: Shortfall | None = None
+        for view in list(views):
+            tried = shortfall(pictures, bounces, view)
+            if not tried.holds:
+                # The view that refused is asked first about the next number.
+                views.remove(view)
+                views.insert(0, view)
+                fewer, worst = tried, None
+                break
+            if worst is None or tried.bound > worst.bound:
+                worst = tried
+        if worst is not None:
+            return Answer(bounces, worst, fewer, made_by)
+    return Answer("unlimited", None, fewer, made_by)
+
+
+def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
+    """What a number of bounces leaves out of a view, with as many samples as it takes to tell.
+
+    Example:
+        >>> def pictures(bounces, view, spp):
+        ...     noise = np.random.default_rng(spp).normal(0, 0.01, (SEEDS, 8, 8, 3))
+        ...     return noise + (1.0 if bounces == "unlimited" else 1 - 0.05**bounces)
+        >>> view = Camera.look_at((0, 0, 3), (0, 0, 0), width=8, height=8, fov_y=45, up=(0, 1, 0))
+        >>> [shortfall(pictures, bounces, view).holds for bounces in (1, 2)]
+        [False, True]
+    """
+    from scipy import stats
+
+    for spp in SAMPLES:
+        ours, endless = (pictures(b, view, spp) for b in (bounces, "unlimited"))
+        test = paired_test(ours, endless)
+        reach = float(stats.t.ppf(CONFIDENCE, SEEDS - 1)) * test.error
+        bound = abs(test.difference) + reach
+        apart = (endless - ours).mean((0, 3))
+        blocks = apart.reshape(len(apart) // BLOCK, BLOCK, -1, BLOCK).mean((1, 3))
+        block = float(np.abs(blocks).max()) / max(float(endless.mean()), 1e-300)
+        if bound < MARGIN or abs(test.difference) - reach >= MARGIN:
+            break
+    return Shortfall(bounces, view.name, spp, test.difference, test.error, bound, block)
+
+
+def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
+    """Pictures of ``scene`` for :func:`shortfall`, from ``seed`` on; those made are kept."""
+    from attnwarp_eval.truth.mitsuba import comparable, render_plan
+
+    made_by = comparable(scene)
+
+    @functools.cache
+    def pictures(bounces: Bounces, name: str, spp: int) -> Array:
+        # Both of a pair have one seed: in a variant that gives each sample random numbers of its
+        # own the light of the first bounces is then the same.
+        planned, camera = plan(scene, spp, bounces=bounces), scene.camera(name)
+        return np.stack(
+            [render_plan(scene, camera, planned, seed + k, made_by=made_by) for k in range(SEEDS)]
+        ).astype(np.float64)
+
+    return lambda bounces, view, spp: pictures(bounces, view.name, spp)

@@ -1,0 +1,57 @@
+"""Measure how many bounces the package's scenes with ``bounces: auto``, and their edits, call for.
+
+``python -m scripts.record_bounces`` writes ``scenes/bounces.json``, from which
+:mod:`attnwarp_eval.truth.bounces` answers without measuring. Entries whose scene is what it was
+stay as they are; ``--all`` measures these, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from attnwarp.io.file import write_atomically
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.truth import bounces
+from attnwarp_eval.truth.mitsuba import forget
+
+SCENES = Path(__file__).parents[1] / "scenes"
+
+
+def worlds(folder: Path = SCENES) -> Iterator[Scene]:
+    """Every scene of a folder that says ``bounces: auto``, and what its edits make of it."""
+    for path in sorted(folder.glob("*.yaml")):
+        scene = load_scene(path)
+        if scene.spec.appearance.bounces != "auto":
+            continue
+        yield scene
+        for edit in scene.edits:
+            for one in edit.answers or (None,):
+                yield scene.edited(edit.name, one.name if one else None)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m scripts.record_bounces", description=__doc__)
+    parser.add_argument("--all", action="store_true", help="measure every scene again")
+    options = parser.parse_args(arguments)
+    path = SCENES / bounces.RECORD
+    former = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    entries = {}
+    for scene in worlds():
+        key = bounces.key(scene)
+        entry = former.get(scene.name)
+        if options.all or entry is None or entry["key"] != key:
+            entry = {"key": key, "answer": bounces.search(scene).to_dict()}
+            forget()
+        entries[scene.name] = entry
+        print(f"{scene.name}: {bounces.Answer.from_dict(entry['answer']).words}", flush=True)
+    text = json.dumps(entries, indent=1) + "\n"
+    write_atomically(path, lambda stream: stream.write(text.encode()))
+
+
+if __name__ == "__main__":
+    main()
