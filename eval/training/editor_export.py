@@ -18,7 +18,7 @@ from training.editor import STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
 def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
     """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
     tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
-    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size)
+    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size, draws=STAGES[stage].draws)
     return net, tokenizer, *_load(net, out / f"{stage}.pt")
 
 

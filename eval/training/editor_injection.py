@@ -21,13 +21,28 @@ from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
 from training.editing_pairs import SIZE
-from training.editor import Batch, EditorNet, Pairs, Row, loss_of, noised, picked
+from training.editor import (
+    Batch,
+    EditorNet,
+    Pairs,
+    Row,
+    draw_steps,
+    loss_of,
+    noised,
+    picked,
+)
 
 LEAST_WEIGHT = 0.2
 """Features are mixed in with a weight drawn from here to 1."""
 
 MOST_ALPHA = 0.3
-"""Largest alpha-bar of a step: later the answer is decided."""
+"""Largest alpha-bar of a step at which B's state may still show its own answer: later that is decided."""
+
+CARRIED = 0.5
+"""Share of the pairs whose state of B already shows what earlier steps carried over, at any step."""
+
+NO_TEXT = 0.1
+"""Share of the pairs whose runs both have no text, as guidance's other branch has."""
 
 WAYS = {"same": 0.35, "mirrored": 0.15, "shifted": 0.15, "other view": 0.25, "unrelated": 0.1}
 """Where run A's features come from, and how often."""
@@ -43,9 +58,9 @@ def region(cells: int, rng: np.random.Generator) -> Mask:
     """(h, w) where features go over: everything, a half, or a box."""
     mask = np.zeros((cells, cells), dtype=bool)
     draw = rng.uniform()
-    if draw < 0.3:
+    if draw < 0.4:
         mask[:] = True
-    elif draw < 0.65:
+    elif draw < 0.7:
         half = cells // 2
         rows = [mask[:half], mask[half:], mask[:, :half], mask[:, half:]]
         rows[int(rng.integers(4))][:] = True
@@ -163,8 +178,8 @@ def _shifted(
 
 
 def injected_loss(
-    pairs: Pairs, net: EditorNet, alphas: Tensor, count: int, rng: np.random.Generator, generator: torch.Generator,
-    *, inject: bool = True,
+    pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor, count: int, rng: np.random.Generator,
+    generator: torch.Generator, *, inject: bool = True,
 ) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """The loss of ``count`` pairs of runs, each against its own target; the runs share their steps.
 
@@ -172,12 +187,14 @@ def injected_loss(
         pairs: to draw from.
         net: being trained.
         alphas: alpha-bar of the steps.
+        empty: tokens of no text.
         count: of pairs; twice as many pictures go through the network.
         rng, generator: to draw from.
         inject: False is the control: the same runs, nothing goes over, B's target is its own answer.
     """
     noisy = np.flatnonzero(alphas.numpy() < MOST_ALPHA)
-    t = torch.from_numpy(rng.choice(noisy, count))
+    carried = torch.from_numpy(rng.uniform(size=count) < CARRIED)
+    t = torch.where(carried, draw_steps(count, rng), torch.from_numpy(rng.choice(noisy, count)))
     b = pairs.batch(count, rng, generator, t=t, kinds=INJECTED_KINDS, unclear=1.0)
     sources, ways, index, mask = draw_moves(pairs, b.rows, rng)
     # "Other view" needs the whole picture, so B's rows may have changed with A's.
@@ -186,6 +203,8 @@ def injected_loss(
         for r, s, way in zip(b.rows, sources, ways, strict=True)
     ]
     b = _rebuilt(pairs, b, rows)
+    no_text = torch.from_numpy(rng.uniform(size=count) < NO_TEXT)
+    b = replace(b, tokens=torch.where(no_text[:, None], empty, b.tokens))
     noise = torch.randn(b.noise.shape, generator=generator)
     sources = [_answered(pairs, s, n) for s, n in zip(sources, noise, strict=True)]
     a = replace(_rebuilt(pairs, b, sources), noise=noise)
@@ -206,17 +225,15 @@ def injected_loss(
     with hooked(net.unet, layers, keep):
         first = net(noised(a.after, a.noise, alpha), a.before, t, a.tokens)
     loss_a = loss_of(first, a.after, a.weight, alpha)
-    state = noised(b.after, b.noise, alpha)
-    target = b.after
+    target = shown = b.after
     if inject:
         answers = [replace(r, target=s.target) for r, s in zip(rows, sources, strict=True)]
         wanted = pairs.latents([pairs.picture(r, r.target) if k else pairs.picture(o, o.target) for r, o, k in zip(answers, rows, related.tolist(), strict=True)])  # fmt: skip
         warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
         target = torch.where(warped, wanted, b.after)
-        with hooked(net.unet, layers, blend):
-            second = net(state, b.before, t, b.tokens)
-    else:
-        second = net(state, b.before, t, b.tokens)
+        shown = torch.where(carried[:, None, None, None], target, b.after)
+    with hooked(net.unet, layers, blend if inject else keep):
+        second = net(noised(shown, b.noise, alpha), b.before, t, b.tokens)
     loss_b = loss_of(second, target, b.weight, alpha)
     return loss_a + loss_b, {"recorded": float(loss_a.detach()), "injected": float(loss_b.detach())}
 
