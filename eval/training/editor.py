@@ -118,7 +118,7 @@ class Stage:
 
 STAGES = {
     "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False),
-    "drawn-64": Stage(64, 2_000, 4e-4, 200, start="plain-64", seed=5, unclear=0.5),
+    "drawn-64": Stage(64, 1_000, 3e-4, 200, start="plain-64", seed=5, unclear=0.5),
     "features-64": Stage(64, 4_000, 4e-4, 200, start="drawn-64", inject="features", seed=2),
     "control-64": Stage(64, 4_000, 4e-4, 200, start="drawn-64", inject="control", seed=2),
     "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),

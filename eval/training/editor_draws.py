@@ -21,10 +21,10 @@ from training.editing_pairs import (
 )
 from training.editor import CHANNELS, TOKENS, EditorNet, Tensor, codes, tokens_of
 
-DRAW_STEPS = 2_000
+DRAW_STEPS = 3_000
 """Of the layers alone."""
 
-DRAW_GAIN = 8.0
+DRAW_GAIN = 12.0
 """By how much, at first, a noise's nearness to an answer's direction counts: the nearest gets nearly all."""
 
 BATCH = 512
@@ -93,7 +93,7 @@ def teach_draws(
         draw[0].weight[:, :CHANNELS] = 0
         draw[0].weight[:LOOKS, :CHANNELS] = DRAW_GAIN * directions
         draw[2].weight[:, :LOOKS] = shifts.T
-    optimizer = torch.optim.AdamW(draw.parameters(), lr=1e-2, weight_decay=0.0)
+    optimizer = torch.optim.AdamW(draw.parameters(), lr=5e-3, weight_decay=0.0)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     kinds, losses = list(AMBIGUOUS), []
     for step in range(steps):
