@@ -39,8 +39,8 @@ class EditUNet(UNet2DConditionModel):
 
     draw: torch.nn.Module | None
 
-    # The configuration's names are read from this signature.
-    @functools.wraps(UNet2DConditionModel.__init__)
+    # diffusers reads the configuration's names from this signature; it has no types.
+    @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
         text = self.config.cross_attention_dim
