@@ -20,6 +20,13 @@ ANSWERS = 64
 """How many answers a noise can draw."""
 
 
+SETTLED, OPEN = 600, 800
+"""Time steps (of 1000): below the first the noise draws nothing more, above the second all it can.
+
+In between the noisy picture itself comes to show the answer.
+"""
+
+
 class EditUNet(UNet2DConditionModel):
     """A conditional UNet whose output is added to the source picture's latents.
 
@@ -68,6 +75,9 @@ class EditUNet(UNet2DConditionModel):
             cells = noisy.shape[2] * noisy.shape[3]
             mean = noisy.mean(dim=(2, 3)) * cells**0.5
             drawn = self.draw(torch.cat([mean, encoder_hidden_states[:, -1]], dim=1))
+            time = torch.as_tensor(timestep, dtype=sample.dtype, device=sample.device)
+            share = ((time - SETTLED) / (OPEN - SETTLED)).clamp(0, 1)
+            drawn = share.reshape(-1, 1) * drawn
             encoder_hidden_states = encoder_hidden_states + drawn[:, None]
         change = super().forward(
             sample, timestep, encoder_hidden_states, *args, return_dict=False, **more

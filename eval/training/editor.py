@@ -27,7 +27,7 @@ from tokenizers import (
 )
 
 from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
-from attnwarp.editing.small_unet import EditUNet
+from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
 from training.common import Run, groups
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -75,7 +75,7 @@ MOST_THING_WEIGHT = 8.0
 """Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
 be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
 
-INJECTED_SHARE = 0.6
+INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
 CONSTANTS = (
@@ -433,11 +433,13 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         from training import editor_draws
 
         constants |= {key: getattr(editor_draws, key) for key in ("DRAW_STEPS", "DRAW_GAIN")}
+        constants["SETTLED"], constants["OPEN"] = SETTLED, OPEN
     if stage.inject != "none":
         from training import editor_injection
 
         names = (
-            "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "NO_TEXT", "WAYS", "INJECTED_KINDS",
+            "FIRST_WEIGHT", "WEIGHT_SPREAD", "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "MOST_OWN", "NO_TEXT", "WAYS",
+            "INJECTED_KINDS",
         )  # fmt: skip
         constants |= {key: getattr(editor_injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE

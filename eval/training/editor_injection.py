@@ -22,6 +22,7 @@ from attnwarp.editing.latents import BLOCK
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
 from training.editing_pairs import SIZE
 from training.editor import (
+    T_STEPS,
     Batch,
     EditorNet,
     Pairs,
@@ -32,14 +33,21 @@ from training.editor import (
     picked,
 )
 
-LEAST_WEIGHT = 0.2
-"""Features are mixed in with a weight drawn from here to 1."""
+FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05
+"""Features are mixed in with the paper's falling weight at that step, give or take the spread.
 
-MOST_ALPHA = 0.3
-"""Largest alpha-bar of a step at which B's state may still show its own answer: later that is decided."""
+A weight that does not follow the step asks for what no network can give: of two features mixed by halves,
+each would have to win.
+"""
+
+MOST_ALPHA = 0.1
+"""Largest alpha-bar of a step at which B's state may still show its own answer: later that is visible."""
 
 CARRIED = 0.5
-"""Share of the pairs whose state of B already shows what earlier steps carried over, at any step."""
+"""Share of the pairs whose state of B shows what earlier steps carried over, at any step."""
+
+MOST_OWN = 0.35
+"""Largest share of B's own answer in such a state: earlier steps do not carry all."""
 
 NO_TEXT = 0.1
 """Share of the pairs whose runs both have no text, as guidance's other branch has."""
@@ -177,6 +185,12 @@ def _shifted(
     return replace(row, corner=corner), index, inside
 
 
+def falling_weight(t: Tensor, rng: np.random.Generator) -> Tensor:
+    """(B,) weights of the features at (B,) time steps, near the paper's decay."""
+    spread = torch.from_numpy(rng.uniform(-WEIGHT_SPREAD, WEIGHT_SPREAD, len(t))).float()
+    return (FIRST_WEIGHT * (t + 1) / T_STEPS + spread).clamp(LEAST_WEIGHT, 1)
+
+
 def injected_loss(
     pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor, count: int, rng: np.random.Generator,
     generator: torch.Generator, *, inject: bool = True,
@@ -210,7 +224,7 @@ def injected_loss(
     a = replace(_rebuilt(pairs, b, sources), noise=noise)
     related = torch.tensor([way != "unrelated" for way in ways])
     cells = pairs.size // BLOCK
-    weight = torch.from_numpy(rng.uniform(LEAST_WEIGHT, 1, count)).float()
+    weight = falling_weight(t, rng)
     moves = Moves(cells, index, mask, weight)
     recorded: dict[str, Tensor] = {}
 
@@ -231,7 +245,9 @@ def injected_loss(
         wanted = pairs.latents([pairs.picture(r, r.target) if k else pairs.picture(o, o.target) for r, o, k in zip(answers, rows, related.tolist(), strict=True)])  # fmt: skip
         warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
         target = torch.where(warped, wanted, b.after)
-        shown = torch.where(carried[:, None, None, None], target, b.after)
+        own = torch.from_numpy(rng.uniform(0, MOST_OWN, count)).float()
+        own = torch.where(carried, own, 1.0)[:, None, None, None]
+        shown = torch.lerp(target, b.after, own)
     with hooked(net.unet, layers, blend if inject else keep):
         second = net(noised(shown, b.noise, alpha), b.before, t, b.tokens)
     loss_b = loss_of(second, target, b.weight, alpha)

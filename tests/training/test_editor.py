@@ -10,10 +10,11 @@ import yaml
 from diffusers import StableDiffusionInstructPix2PixPipeline
 
 import attnwarp_eval
+from attnwarp.editing.attention import decay
 from attnwarp.editing.editor import edit
 from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import load_editor
-from training import editing_pairs, editor, editor_draws
+from training import editing_pairs, editor, editor_draws, editor_injection
 from training.data import SPLITS
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -251,6 +252,17 @@ def test_moved_cells_of_the_recorded_picture_show_what_the_targets_cells_show(pa
     assert (halves == 1).any() and ((halves > 0) & (halves < 1)).any()
 
 
+def test_the_weight_of_features_falls_as_the_papers_does():
+    alone = decay(0.9)
+    t = torch.arange(999, -1, -50).repeat_interleave(500)
+    weight = editor_injection.falling_weight(t, np.random.default_rng(0)).reshape(20, 500)
+    for step, drawn in enumerate(weight):
+        # Uniform by 0.15: 500 draws have a standard error of 0.004; the least weight moves the last ones.
+        paper = alone(step, 20)
+        assert float(drawn.mean()) == pytest.approx(max(paper, 0.1), abs=0.05), step
+        assert float((drawn - paper).abs().max()) < 0.2
+
+
 def test_the_blend_moves_masks_and_mixes_tokens():
     generator = torch.Generator().manual_seed(0)
     new, recorded = (torch.randn((2, 16, 3), generator=generator) for _ in range(2))
@@ -307,7 +319,7 @@ def test_layers_of_the_noise_learn_what_the_answer_it_picks_adds_to_an_open_sent
     settled = torch.randn(1, 128) + 0.1 * torch.randn(300, 128)
     shifts = torch.randn(editing_pairs.LOOKS, 128)
     monkeypatch.setattr(editor_draws, "differences", lambda *_: (kinds, settled, shifts))
-    editor_draws.teach_draws(net, tokenizer, None, seed=3, steps=150)
+    editor_draws.teach_draws(net, tokenizer, None, seed=3, steps=400)
     noise = np.random.default_rng(4).normal(size=(200, 48))
 
     def drawn(text, rows):
@@ -358,11 +370,16 @@ def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
     result = net(sample, 700, encoder_hidden_states=text).sample
     # The mean of 96 cells has a standard deviation of 1 / sqrt(96).
     mean = sample[:, :48].flatten(2).sum(dim=2) / 96**0.5
-    drawn = net.draw(torch.cat([mean, text[:, 4]], dim=1))
-    net.draw = None
+    # Half of the way from where the answer is settled to where it is open.
+    drawn = 0.5 * net.draw(torch.cat([mean, text[:, 4]], dim=1))
+    draw, net.draw = net.draw, None
     expected = net(sample, 700, encoder_hidden_states=text + drawn[:, None]).sample
     assert torch.allclose(result, expected, rtol=0, atol=1e-10)
     assert not torch.allclose(result, net(sample, 700, text).sample, rtol=0, atol=1e-4)
+    net.draw = draw
+    late = net(sample, torch.tensor([600, 500]), text).sample
+    net.draw = None
+    assert torch.equal(late, net(sample, torch.tensor([600, 500]), text).sample)
 
 
 def test_the_schedule_ends_in_pure_noise_and_the_rate_falls_at_the_end():
