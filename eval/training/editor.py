@@ -60,6 +60,10 @@ NOISY_FROM = 600
 NOISY_SHARE = 0.6
 """Share of the steps drawn from the noisier 40 %, where the answer is decided."""
 MOST_WEIGHT = 5.0
+SD_BETAS = (0.00085, 0.012)
+"""Stable Diffusion's: on these small latents a colour shows in the noisy picture only after half of the steps."""
+EARLY_BETAS = (0.0001, 0.002)
+"""Seven times its signal at t = 800: the picture shows an answer while features still have most of their weight."""
 COARSE = 12
 """The first channels of the latents are means and coarse details (:func:`attnwarp.editing.latents.haar_basis`)."""
 DROP = 0.05
@@ -100,7 +104,8 @@ class Stage:
             "control" (the same pairs and steps without the injection).
         seed: of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
-        draws: whether the noise's mean has a token of its own (:class:`attnwarp.editing.small_unet.EditUNet`).
+        draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
+        betas: of the noise schedule, first and last.
     """
 
     size: int
@@ -114,13 +119,14 @@ class Stage:
     parts: int = 0
     unclear: float = UNCLEAR
     draws: bool = True
+    betas: tuple[float, float] = EARLY_BETAS
 
 
 STAGES = {
-    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False),
-    "drawn-64": Stage(64, 1_000, 3e-4, 200, start="plain-64", seed=5, unclear=0.5),
-    "features-64": Stage(64, 4_000, 4e-4, 200, start="drawn-64", inject="features", seed=2),
-    "control-64": Stage(64, 4_000, 4e-4, 200, start="drawn-64", inject="control", seed=2),
+    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False, betas=SD_BETAS),
+    "drawn-64": Stage(64, 2_500, 6e-4, 200, start="plain-64", seed=5, unclear=0.5),
+    "features-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="features", seed=2),
+    "control-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="control", seed=2),
     "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),
     "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
     "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
@@ -161,12 +167,12 @@ class EditorNet(torch.nn.Module):
         return self.unet(torch.cat([noisy, before], dim=1), t, context, return_dict=False)[0]
 
 
-def scheduler() -> Any:
+def scheduler(betas: tuple[float, float] = SD_BETAS) -> Any:
     """The noise schedule and the sampler, as diffusers' pipelines load them."""
     from diffusers import DDIMScheduler
 
     return DDIMScheduler(
-        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012,
+        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=betas[0], beta_end=betas[1],
         rescale_betas_zero_snr=True, timestep_spacing="trailing", prediction_type="sample", clip_sample=False,
         set_alpha_to_one=True, steps_offset=0,
     )  # fmt: skip
@@ -445,7 +451,12 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         constants["INJECTED_SHARE"] = INJECTED_SHARE
     fields = asdict(stage)
     # Checkpoints from before a field existed do not name it.
-    for key, before in (("parts", 0), ("unclear", UNCLEAR), ("draws", False)):
+    for key, before in (
+        ("parts", 0),
+        ("unclear", UNCLEAR),
+        ("draws", False),
+        ("betas", SD_BETAS),
+    ):
         if fields[key] == before:
             del fields[key]
     return {"stage": name, **fields, "constants": constants, "pairs": PAIRS_PROTOCOL}
@@ -491,7 +502,7 @@ def train_stage(
             teach_draws(net, tokenizer, pairs.worlds, seed=stage.seed)
     average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
     optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
-    alphas = scheduler().alphas_cumprod
+    alphas = scheduler(stage.betas).alphas_cumprod
     empty = tokens_of(tokenizer, [""])[0]
     step_loss = _step(stage, pairs, net, alphas, empty)
 

@@ -40,7 +40,7 @@ A weight that does not follow the step asks for what no network can give: of two
 each would have to win.
 """
 
-MOST_ALPHA = 0.1
+MOST_ALPHA = 0.25
 """Largest alpha-bar of a step at which B's state may still show its own answer: later that is visible."""
 
 CARRIED = 0.5

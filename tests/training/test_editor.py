@@ -382,11 +382,19 @@ def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
     assert torch.equal(late, net(sample, torch.tensor([600, 500]), text).sample)
 
 
-def test_the_schedule_ends_in_pure_noise_and_the_rate_falls_at_the_end():
-    scheduler = editor.scheduler()
+@pytest.mark.parametrize("betas", [editor.SD_BETAS, editor.EARLY_BETAS])
+def test_the_schedule_ends_in_pure_noise(betas):
+    scheduler = editor.scheduler(betas)
+    root = np.cumprod(1 - np.linspace(betas[0] ** 0.5, betas[1] ** 0.5, 1000) ** 2) ** 0.5
+    # Lin et al. 2024, algorithm 1: the root is shifted so that it ends in 0, and scaled so that it begins as before.
+    expected = ((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2
+    assert np.allclose(scheduler.alphas_cumprod.numpy(), expected, atol=1e-5)
     assert float(scheduler.alphas_cumprod[-1]) == 0
     scheduler.set_timesteps(20)
     assert scheduler.timesteps[0] == 999
+
+
+def test_the_rate_falls_at_the_end():
     rates = [editor.falling_rate(step, 1000, 1.0, warm=100) for step in range(1000)]
     assert rates[0] == 0.01 and rates[99] == 1 and rates[600] == 1
     assert np.all(np.diff(rates[100:]) <= 0)
