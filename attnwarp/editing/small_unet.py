@@ -5,14 +5,26 @@ It is a class of its own so that diffusers' pipelines load it from a folder as i
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+import torch
 from diffusers import UNet2DConditionModel
 
 # diffusers' pipelines know a component's kind by the base class of that name in its module.
 from diffusers.models.modeling_utils import ModelMixin  # noqa: F401
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionOutput
 from torch import Tensor
+
+ANSWERS = 64
+"""How many answers a noise can draw."""
+
+
+SETTLED, OPEN = 600, 800
+"""Time steps (of 1000): below the first the noise draws nothing more, above the second all it can.
+
+In between the noisy picture itself comes to show the answer.
+"""
 
 
 class EditUNet(UNet2DConditionModel):
@@ -21,11 +33,54 @@ class EditUNet(UNet2DConditionModel):
     Half of the input channels are the noisy latents, the other half the latents of the picture
     before the edit (InstructPix2Pix). Its prediction is the edited picture ("sample" in diffusers),
     and most of that is the picture before.
+
+    Where the text leaves the answer open, the noise draws it: the mean of the noisy latents over
+    the picture, seen together with the text, is added to the text's tokens. So the first step
+    settles the answer, as low frequencies of the noise do in large models, and cross-attention is
+    what the answer acts through.
+
+    Attributes:
+        draw: from the mean, at unit variance where all is noise, and the text's last token to what
+            is added to all tokens; None adds nothing.
     """
 
-    def forward(self, sample: Tensor, *args: Any, return_dict: bool = True, **more: Any) -> Any:
-        """As the base class, with the source's latents (the second half of ``sample``) added."""
-        before = sample[:, sample.shape[1] - self.config.out_channels :]
-        change = super().forward(sample, *args, return_dict=False, **more)[0]
+    draw: torch.nn.Module | None
+
+    # diffusers reads the configuration's names from this signature; it has no types.
+    @functools.wraps(UNet2DConditionModel.__init__)  # type: ignore[misc]
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        text = self.config.cross_attention_dim
+        self.draw = torch.nn.Sequential(
+            torch.nn.Linear(self.config.out_channels + text, ANSWERS),
+            torch.nn.Softmax(dim=-1),
+            torch.nn.Linear(ANSWERS, text),
+        )
+
+    def forward(
+        self, sample: Tensor, timestep: Any, encoder_hidden_states: Tensor, *args: Any,
+        return_dict: bool = True, **more: Any,
+    ) -> Any:  # fmt: skip
+        """As the base class, with the source's latents (the second half of ``sample``) added.
+
+        Args:
+            sample: (B, 2C, h, w).
+            timestep: of the noisy latents.
+            encoder_hidden_states: (B, L, D) tokens of the text.
+            args, more: of the base class.
+            return_dict: False gives a tuple.
+        """
+        noisy, before = sample.split(self.config.out_channels, dim=1)
+        if self.draw is not None:
+            cells = noisy.shape[2] * noisy.shape[3]
+            mean = noisy.mean(dim=(2, 3)) * cells**0.5
+            drawn = self.draw(torch.cat([mean, encoder_hidden_states[:, -1]], dim=1))
+            time = torch.as_tensor(timestep, dtype=sample.dtype, device=sample.device)
+            share = ((time - SETTLED) / (OPEN - SETTLED)).clamp(0, 1)
+            drawn = share.reshape(-1, 1) * drawn
+            encoder_hidden_states = encoder_hidden_states + drawn[:, None]
+        change = super().forward(
+            sample, timestep, encoder_hidden_states, *args, return_dict=False, **more
+        )[0]
         result = before + change
         return UNet2DConditionOutput(sample=result) if return_dict else (result,)

@@ -92,7 +92,7 @@ class DepthNet(torch.nn.Module):
         super().__init__()
         from diffusers import ControlNetModel, UNet2DConditionModel
 
-        first = EditorNet(vocabulary, size) if first is None else first
+        first = EditorNet(vocabulary, size, draws=False) if first is None else first
         self.text = first.text
         shape = {
             "down_block_types": ("DownBlock2D",) * len(WIDTHS), "mid_block_type": "UNetMidBlock2D", "block_out_channels": WIDTHS,
@@ -212,7 +212,7 @@ def recipe_of(name: str, stage: DepthStage) -> dict[str, Any]:
 def first_net(tokenizer: Tokenizer, stage: DepthStage, out: Path) -> DepthNet:
     """The networks that a stage starts from."""
     size = tokenizer.get_vocab_size()
-    first = EditorNet(size, stage.size)
+    first = EditorNet(size, stage.size, draws=False)
     stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
     first.load_state_dict(
         {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}

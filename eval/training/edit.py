@@ -35,7 +35,7 @@ def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
 
 @app.command()
 def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
-    """Train a stage: plain-64, features-64, control-64, parts-64, parts-128, features-128, control-128, depth-64."""
+    """Train a stage: plain-64, drawn-64, features-64, control-64, parts-64, parts-128, features-128, control-128, depth-64."""
     from training.depth_editor import DEPTH_STAGES, train_depth_stage
     from training.editor import STAGES, train_stage
 
@@ -66,6 +66,7 @@ def assess(
     weights: Annotated[Path, typer.Option()] = WEIGHTS,
     worlds: Annotated[int | None, typer.Option(help="Test worlds; all if left out.")] = None,
     rounds: Annotated[int, typer.Option(min=0, help="Of swapped features; 0 for none.")] = 0,
+    scenes: Annotated[bool, typer.Option(help="Judge it on the package's scenes too.")] = False,
 ) -> None:  # fmt: skip
     """Measure an exported editor on what it has never seen, and write its card."""
     from training.depth_assess import assess_depth_editor
@@ -77,7 +78,9 @@ def assess(
         card = assess_depth_editor(weights / name, data, depth_facts_of(stage, out), worlds=worlds)
     else:
         facts = facts_of(stage, out)
-        card = assess_editor(weights / name, data, facts, worlds=worlds, rounds=rounds)
+        card = assess_editor(
+            weights / name, data, facts, worlds=worlds, rounds=rounds, scenes=scenes
+        )
     (weights / name / "card.md").write_text(card)
     typer.echo(card)
 

@@ -27,7 +27,7 @@ from tokenizers import (
 )
 
 from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
-from attnwarp.editing.small_unet import EditUNet
+from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
 from training.common import Run, groups
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -60,6 +60,12 @@ NOISY_FROM = 600
 NOISY_SHARE = 0.6
 """Share of the steps drawn from the noisier 40 %, where the answer is decided."""
 MOST_WEIGHT = 5.0
+SD_BETAS = (0.00085, 0.012)
+"""Stable Diffusion's: on these small latents a colour shows in the noisy picture only after half of the steps."""
+EARLY_BETAS = (0.0001, 0.002)
+"""Seven times its signal at t = 800: the picture shows an answer while features still have most of their weight."""
+COARSE = 12
+"""The first channels of the latents are means and coarse details (:func:`attnwarp.editing.latents.haar_basis`)."""
 DROP = 0.05
 """Probability that the text, the picture or both are left out, each."""
 UNCLEAR = 0.35
@@ -73,7 +79,7 @@ MOST_THING_WEIGHT = 8.0
 """Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
 be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
 
-INJECTED_SHARE = 0.6
+INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
 CONSTANTS = (
@@ -97,6 +103,9 @@ class Stage:
         inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
             "control" (the same pairs and steps without the injection).
         seed: of everything random.
+        unclear: share of pairs whose instruction leaves the answer to the noise.
+        draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
+        betas: of the noise schedule, first and last.
     """
 
     size: int
@@ -108,13 +117,17 @@ class Stage:
     batch: int = 8
     seed: int = 0
     parts: int = 0
+    unclear: float = UNCLEAR
+    draws: bool = True
+    betas: tuple[float, float] = EARLY_BETAS
 
 
 STAGES = {
-    "plain-64": Stage(64, 24_000, 1e-3, 200),
-    "features-64": Stage(64, 4_000, 4e-4, 200, start="plain-64", inject="features", seed=2),
-    "control-64": Stage(64, 4_000, 4e-4, 200, start="plain-64", inject="control", seed=2),
-    "parts-64": Stage(64, 16_000, 6e-4, 200, start="plain-64", seed=4, parts=595),
+    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False, betas=SD_BETAS),
+    "drawn-64": Stage(64, 2_500, 6e-4, 200, start="plain-64", seed=5, unclear=0.5),
+    "features-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="features", seed=2),
+    "control-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="control", seed=2),
+    "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),
     "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
     "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
     "control-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="control", seed=3, parts=595),
@@ -125,7 +138,7 @@ STAGES = {
 class EditorNet(torch.nn.Module):
     """The UNet and the text encoder, trained together."""
 
-    def __init__(self, vocabulary: int, size: int) -> None:
+    def __init__(self, vocabulary: int, size: int, *, draws: bool = True) -> None:
         super().__init__()
         from transformers import CLIPTextConfig, CLIPTextModel
 
@@ -135,6 +148,8 @@ class EditorNet(torch.nn.Module):
             up_block_types=("CrossAttnUpBlock2D",) * len(WIDTHS), block_out_channels=WIDTHS, layers_per_block=LAYERS,
             cross_attention_dim=TEXT_WIDTH, attention_head_dim=HEADS, norm_num_groups=16,
         )  # fmt: skip
+        if not draws:
+            self.unet.draw = None
         self.text = CLIPTextModel(
             CLIPTextConfig(
                 vocab_size=vocabulary, hidden_size=TEXT_WIDTH, intermediate_size=2 * TEXT_WIDTH,
@@ -152,12 +167,12 @@ class EditorNet(torch.nn.Module):
         return self.unet(torch.cat([noisy, before], dim=1), t, context, return_dict=False)[0]
 
 
-def scheduler() -> Any:
+def scheduler(betas: tuple[float, float] = SD_BETAS) -> Any:
     """The noise schedule and the sampler, as diffusers' pipelines load them."""
     from diffusers import DDIMScheduler
 
     return DDIMScheduler(
-        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=0.00085, beta_end=0.012,
+        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=betas[0], beta_end=betas[1],
         rescale_betas_zero_snr=True, timestep_spacing="trailing", prediction_type="sample", clip_sample=False,
         set_alpha_to_one=True, steps_offset=0,
     )  # fmt: skip
@@ -202,10 +217,16 @@ def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
 
 
 def codes() -> Tensor:
-    """(LOOKS, 48) orthonormal directions, one an answer: rows of the cosine transform, without the constant one."""
+    """(LOOKS, 48) orthonormal directions, one an answer, in the channels of fine details.
+
+    A picture's own mean there is nearly 0, so noise mixed with a picture still tells which it picks.
+    Rows of the cosine transform, without the constant one.
+    """
+    fine = CHANNELS - COARSE
     k = torch.arange(1, LOOKS + 1, dtype=torch.float64)[:, None]
-    c = torch.arange(CHANNELS, dtype=torch.float64)[None]
-    return ((2 / CHANNELS) ** 0.5 * torch.cos(math.pi * (c + 0.5) * k / CHANNELS)).float()
+    c = torch.arange(fine, dtype=torch.float64)[None]
+    rows = (2 / fine) ** 0.5 * torch.cos(math.pi * (c + 0.5) * k / fine)
+    return torch.cat([torch.zeros((LOOKS, COARSE)), rows.float()], dim=1)
 
 
 def picked(noise: Tensor, candidates: Sequence[int]) -> int:
@@ -414,15 +435,30 @@ def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
     constants = {key: globals()[key] for key in CONSTANTS}
+    if stage.draws:
+        from training import editor_draws
+
+        constants |= {key: getattr(editor_draws, key) for key in ("DRAW_STEPS", "DRAW_GAIN")}
+        constants["SETTLED"], constants["OPEN"] = SETTLED, OPEN
     if stage.inject != "none":
         from training import editor_injection
 
-        names = ("LEAST_WEIGHT", "MOST_ALPHA", "WAYS", "INJECTED_KINDS")
+        names = (
+            "FIRST_WEIGHT", "WEIGHT_SPREAD", "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "MOST_OWN", "NO_TEXT", "WAYS",
+            "INJECTED_KINDS",
+        )  # fmt: skip
         constants |= {key: getattr(editor_injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
     fields = asdict(stage)
-    if not stage.parts:  # checkpoints from before there were parts name none
-        del fields["parts"]
+    # Checkpoints from before a field existed do not name it.
+    for key, before in (
+        ("parts", 0),
+        ("unclear", UNCLEAR),
+        ("draws", False),
+        ("betas", SD_BETAS),
+    ):
+        if fields[key] == before:
+            del fields[key]
     return {"stage": name, **fields, "constants": constants, "pairs": PAIRS_PROTOCOL}
 
 
@@ -452,15 +488,21 @@ def train_stage(
     if stage.parts:
         counts["parts-train"] = stage.parts
     pairs = Pairs(load_mixed(data, counts), stage.size, tokenizer)
-    net = EditorNet(tokenizer.get_vocab_size(), stage.size)
+    net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
     if stage.start is not None:
         stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
-        net.load_state_dict(
-            {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
-        )
+        weights = {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
+        begins = stage.draws and not STAGES[stage.start].draws
+        if begins:
+            weights |= {k: v for k, v in net.state_dict().items() if k.startswith("unet.draw.")}
+        net.load_state_dict(weights)
+        if begins and not (out / f"{name}.pt").exists():
+            from training.editor_draws import teach_draws
+
+            teach_draws(net, tokenizer, pairs.worlds, seed=stage.seed)
     average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
     optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
-    alphas = scheduler().alphas_cumprod
+    alphas = scheduler(stage.betas).alphas_cumprod
     empty = tokens_of(tokenizer, [""])[0]
     step_loss = _step(stage, pairs, net, alphas, empty)
 
@@ -496,7 +538,7 @@ def _step(
     def plain(
         rng: np.random.Generator, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, float]]:
-        batch = pairs.batch(stage.batch, rng, generator)
+        batch = pairs.batch(stage.batch, rng, generator, unclear=stage.unclear)
         before, tokens = dropped(batch, empty, rng)
         a = alphas[batch.t]
         prediction = net(noised(batch.after, batch.noise, a), before, batch.t, tokens)
@@ -518,6 +560,8 @@ def _step(
             loss, parts = plain(rng, generator)
             return loss, {f"plain {key}": value for key, value in parts.items()}
         inject = stage.inject == "features"
-        return injected_loss(pairs, net, alphas, stage.batch // 2, rng, generator, inject=inject)
+        return injected_loss(
+            pairs, net, alphas, empty, stage.batch // 2, rng, generator, inject=inject
+        )
 
     return injected

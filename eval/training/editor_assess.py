@@ -170,9 +170,17 @@ def _mask(pairs: Pairs, row: Row, what: int) -> npt.NDArray[np.bool_]:
 
 def editor_card(
     name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any],
-    carried: Sequence[Figure] = (),
+    carried: Sequence[Figure] = (), scenes: Sequence[Figure] = (),
 ) -> str:  # fmt: skip
-    """A bundled editor's card in Markdown; ``carried`` are figures of :mod:`training.editor_carries`."""
+    """A bundled editor's card in Markdown.
+
+    Args:
+        name: of the editor.
+        figures, control: of it and of an editor that changes nothing.
+        facts: of its training.
+        carried: figures of :mod:`training.editor_carries`.
+        scenes: figures of :mod:`training.editor_scenes`.
+    """
     known, unknown = "", "parts of things (a jacket, a pot), "
     if facts["parts"]:
         known, unknown = (
@@ -213,15 +221,30 @@ def editor_card(
             lines.append(
                 f"| {f.what} | **{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f}) | {asked} | {f.count} |"
             )
-    short = [f.what for f in (*figures, *carried) if f.asked is not None and f.value < f.asked]
+    if scenes:
+        lines += [
+            "", "## On the package's own scenes and sentences", "",
+            "Six scenes of the studies, three views each, every sentence of theirs (`training/editor_scenes.py`). Intervals are over scenes.",
+            "", "| question | share | chance | asked for | answers |", "|---|---|---|---|---|",
+        ]  # fmt: skip
+        for f in scenes:
+            asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
+            lines.append(
+                f"| {f.what} | **{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f})"
+                f" | {100 * (f.chance or 0):.0f} % | {asked} | {f.count} |"
+            )
+    short = [
+        f.what for f in (*figures, *carried, *scenes) if f.asked is not None and f.value < f.asked
+    ]
     if short:
         lines += ["", "Short of what was asked for: " + "; ".join(short) + "."]
     return "\n".join([*lines, ""])
 
 
 def assess_editor(
-    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, rounds: int = 0
-) -> str:
+    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, rounds: int = 0,
+    scenes: bool = False,
+) -> str:  # fmt: skip
     """The card of an exported editor.
 
     Args:
@@ -230,9 +253,11 @@ def assess_editor(
         facts: of its training.
         worlds: of each test split; all if left out.
         rounds: pairs of noises a picture for the figures of swapped features; 0 leaves these out.
+        scenes: whether to judge it on the package's own scenes too.
     """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
     from training.editor_carries import carries
+    from training.editor_scenes import scene_figures
 
     torch.set_num_threads(1)
     editor = load_editor(str(folder), text_guidance=TEXT_GUIDANCE, image_guidance=IMAGE_GUIDANCE)
@@ -259,4 +284,5 @@ def assess_editor(
         "unet": millions(editor.unet), "text": millions(editor.text_encoder), "size": size, "tested": tested,
         "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
     }  # fmt: skip
-    return editor_card(folder.name, own, control, {**given, **facts}, carried)
+    seen = scene_figures(answers_of(editor), size=size) if scenes else []
+    return editor_card(folder.name, own, control, {**given, **facts}, carried, seen)

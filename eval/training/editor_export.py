@@ -12,13 +12,13 @@ from tokenizers import Tokenizer
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
 from training.depth_editor import DEPTH_STAGES, DepthNet
-from training.editor import STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
+from training.editor import SD_BETAS, STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
 
 
 def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
     """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
     tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
-    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size)
+    net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size, draws=STAGES[stage].draws)
     return net, tokenizer, *_load(net, out / f"{stage}.pt")
 
 
@@ -43,7 +43,8 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
     net, tokenizer, _, _ = averaged(stage, out)
     parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
-    return _write(folder, net, tokenizer, "StableDiffusionInstructPix2PixPipeline", parts)
+    pipeline = "StableDiffusionInstructPix2PixPipeline"
+    return _write(folder, net, tokenizer, pipeline, parts, STAGES[stage].betas)
 
 
 def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
@@ -54,12 +55,13 @@ def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     parts = {
         "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
     }  # fmt: skip
-    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts)
+    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts, SD_BETAS)
 
 
 def _write(
-    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]]
-) -> Path:
+    folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]],
+    betas: tuple[float, float],
+) -> Path:  # fmt: skip
     """Write what both kinds have, the list of all parts and their checksums."""
     from transformers import PreTrainedTokenizerFast
 
@@ -67,7 +69,7 @@ def _write(
     net.unet.save_pretrained(folder / "unet")
     net.text.save_pretrained(folder / "text_encoder")
     HaarLatents().save_pretrained(folder / "vae")
-    scheduler().save_pretrained(folder / "scheduler")
+    scheduler(betas).save_pretrained(folder / "scheduler")
     words = PreTrainedTokenizerFast(
         tokenizer_object=tokenizer, pad_token="<pad>", eos_token="<end>", model_max_length=TOKENS
     )

@@ -21,13 +21,36 @@ from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
 from training.editing_pairs import SIZE
-from training.editor import Batch, EditorNet, Pairs, Row, loss_of, noised, picked
+from training.editor import (
+    T_STEPS,
+    Batch,
+    EditorNet,
+    Pairs,
+    Row,
+    draw_steps,
+    loss_of,
+    noised,
+    picked,
+)
 
-LEAST_WEIGHT = 0.2
-"""Features are mixed in with a weight drawn from here to 1."""
+FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05
+"""Features are mixed in with the paper's falling weight at that step, give or take the spread.
 
-MOST_ALPHA = 0.3
-"""Largest alpha-bar of a step: later the answer is decided."""
+A weight that does not follow the step asks for what no network can give: of two features mixed by halves,
+each would have to win.
+"""
+
+MOST_ALPHA = 0.25
+"""Largest alpha-bar of a step at which B's state may still show its own answer: later that is visible."""
+
+CARRIED = 0.5
+"""Share of the pairs whose state of B shows what earlier steps carried over, at any step."""
+
+MOST_OWN = 0.35
+"""Largest share of B's own answer in such a state: earlier steps do not carry all."""
+
+NO_TEXT = 0.1
+"""Share of the pairs whose runs both have no text, as guidance's other branch has."""
 
 WAYS = {"same": 0.35, "mirrored": 0.15, "shifted": 0.15, "other view": 0.25, "unrelated": 0.1}
 """Where run A's features come from, and how often."""
@@ -43,9 +66,9 @@ def region(cells: int, rng: np.random.Generator) -> Mask:
     """(h, w) where features go over: everything, a half, or a box."""
     mask = np.zeros((cells, cells), dtype=bool)
     draw = rng.uniform()
-    if draw < 0.3:
+    if draw < 0.4:
         mask[:] = True
-    elif draw < 0.65:
+    elif draw < 0.7:
         half = cells // 2
         rows = [mask[:half], mask[half:], mask[:, :half], mask[:, half:]]
         rows[int(rng.integers(4))][:] = True
@@ -162,9 +185,15 @@ def _shifted(
     return replace(row, corner=corner), index, inside
 
 
+def falling_weight(t: Tensor, rng: np.random.Generator) -> Tensor:
+    """(B,) weights of the features at (B,) time steps, near the paper's decay."""
+    spread = torch.from_numpy(rng.uniform(-WEIGHT_SPREAD, WEIGHT_SPREAD, len(t))).float()
+    return (FIRST_WEIGHT * (t + 1) / T_STEPS + spread).clamp(LEAST_WEIGHT, 1)
+
+
 def injected_loss(
-    pairs: Pairs, net: EditorNet, alphas: Tensor, count: int, rng: np.random.Generator, generator: torch.Generator,
-    *, inject: bool = True,
+    pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor, count: int, rng: np.random.Generator,
+    generator: torch.Generator, *, inject: bool = True,
 ) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """The loss of ``count`` pairs of runs, each against its own target; the runs share their steps.
 
@@ -172,12 +201,14 @@ def injected_loss(
         pairs: to draw from.
         net: being trained.
         alphas: alpha-bar of the steps.
+        empty: tokens of no text.
         count: of pairs; twice as many pictures go through the network.
         rng, generator: to draw from.
         inject: False is the control: the same runs, nothing goes over, B's target is its own answer.
     """
     noisy = np.flatnonzero(alphas.numpy() < MOST_ALPHA)
-    t = torch.from_numpy(rng.choice(noisy, count))
+    carried = torch.from_numpy(rng.uniform(size=count) < CARRIED)
+    t = torch.where(carried, draw_steps(count, rng), torch.from_numpy(rng.choice(noisy, count)))
     b = pairs.batch(count, rng, generator, t=t, kinds=INJECTED_KINDS, unclear=1.0)
     sources, ways, index, mask = draw_moves(pairs, b.rows, rng)
     # "Other view" needs the whole picture, so B's rows may have changed with A's.
@@ -186,12 +217,14 @@ def injected_loss(
         for r, s, way in zip(b.rows, sources, ways, strict=True)
     ]
     b = _rebuilt(pairs, b, rows)
+    no_text = torch.from_numpy(rng.uniform(size=count) < NO_TEXT)
+    b = replace(b, tokens=torch.where(no_text[:, None], empty, b.tokens))
     noise = torch.randn(b.noise.shape, generator=generator)
     sources = [_answered(pairs, s, n) for s, n in zip(sources, noise, strict=True)]
     a = replace(_rebuilt(pairs, b, sources), noise=noise)
     related = torch.tensor([way != "unrelated" for way in ways])
     cells = pairs.size // BLOCK
-    weight = torch.from_numpy(rng.uniform(LEAST_WEIGHT, 1, count)).float()
+    weight = falling_weight(t, rng)
     moves = Moves(cells, index, mask, weight)
     recorded: dict[str, Tensor] = {}
 
@@ -206,17 +239,17 @@ def injected_loss(
     with hooked(net.unet, layers, keep):
         first = net(noised(a.after, a.noise, alpha), a.before, t, a.tokens)
     loss_a = loss_of(first, a.after, a.weight, alpha)
-    state = noised(b.after, b.noise, alpha)
-    target = b.after
+    target = shown = b.after
     if inject:
         answers = [replace(r, target=s.target) for r, s in zip(rows, sources, strict=True)]
         wanted = pairs.latents([pairs.picture(r, r.target) if k else pairs.picture(o, o.target) for r, o, k in zip(answers, rows, related.tolist(), strict=True)])  # fmt: skip
         warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
         target = torch.where(warped, wanted, b.after)
-        with hooked(net.unet, layers, blend):
-            second = net(state, b.before, t, b.tokens)
-    else:
-        second = net(state, b.before, t, b.tokens)
+        own = torch.from_numpy(rng.uniform(0, MOST_OWN, count)).float()
+        own = torch.where(carried, own, 1.0)[:, None, None, None]
+        shown = torch.lerp(target, b.after, own)
+    with hooked(net.unet, layers, blend if inject else keep):
+        second = net(noised(shown, b.noise, alpha), b.before, t, b.tokens)
     loss_b = loss_of(second, target, b.weight, alpha)
     return loss_a + loss_b, {"recorded": float(loss_a.detach()), "injected": float(loss_b.detach())}
 

@@ -1,6 +1,7 @@
 """Oracles: the scenes' own files, orthogonality, exact geometry, diffusers' own pipeline, a run that was not stopped."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -9,10 +10,11 @@ import yaml
 from diffusers import StableDiffusionInstructPix2PixPipeline
 
 import attnwarp_eval
+from attnwarp.editing.attention import decay
 from attnwarp.editing.editor import edit
 from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import load_editor
-from training import editing_pairs, editor
+from training import editing_pairs, editor, editor_draws, editor_injection
 from training.data import SPLITS
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -28,7 +30,7 @@ from training.editing_pairs import (
 from training.editor import Pairs, Row, Stage, codes, make_tokenizer, picked, train_stage
 from training.editor_export import export_editor
 from training.editor_injection import Moves, draw_moves, injected_loss
-from training.worlds import held_out
+from training.worlds import COLORS, held_out
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
 
@@ -163,7 +165,7 @@ def test_an_unclear_pair_ends_in_the_answer_that_its_noise_picks(pairs):
 
 
 def checkpoint(folder):
-    return torch.load(folder / "plain-64.pt", weights_only=True)
+    return torch.load(folder / "drawn-64.pt", weights_only=True)
 
 
 def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
@@ -173,7 +175,7 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
     for name in ("whole", "halves"):
         (tmp_path / name).mkdir()
         tokenizer.save(str(tmp_path / name / "tokenizer.json"))
-    train_stage("plain-64", data, tmp_path / "whole", stage=TINY)
+    train_stage("drawn-64", data, tmp_path / "whole", stage=TINY)
     original = editor.falling_rate
 
     def stop(step, *more):
@@ -183,20 +185,20 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
 
     monkeypatch.setattr(editor, "falling_rate", stop)
     with pytest.raises(KeyboardInterrupt):
-        train_stage("plain-64", data, tmp_path / "halves", stage=TINY)
+        train_stage("drawn-64", data, tmp_path / "halves", stage=TINY)
     assert checkpoint(tmp_path / "halves")["epoch"] == 1
     monkeypatch.setattr(editor, "falling_rate", original)
-    train_stage("plain-64", data, tmp_path / "halves", stage=TINY)
+    train_stage("drawn-64", data, tmp_path / "halves", stage=TINY)
     one, other = checkpoint(tmp_path / "whole"), checkpoint(tmp_path / "halves")
     for part in ("net", "average"):
         for key, value in one[part].items():
             assert torch.equal(value, other[part][key]), (part, key)
 
-    folder = export_editor("plain-64", tmp_path / "whole", tmp_path / "exported")
+    folder = export_editor("drawn-64", tmp_path / "whole", tmp_path / "exported")
     check_export(folder)
 
     for inject in ("features", "control"):
-        stage = dataclasses.replace(TINY, start="plain-64", inject=inject)
+        stage = dataclasses.replace(TINY, start="drawn-64", inject=inject)
         train_stage(f"{inject}-64", data, tmp_path / "whole", stage=stage)
         after = torch.load(tmp_path / "whole" / f"{inject}-64.pt", weights_only=True)["net"]
         assert all(torch.isfinite(v).all() for v in after.values())
@@ -250,6 +252,17 @@ def test_moved_cells_of_the_recorded_picture_show_what_the_targets_cells_show(pa
     assert (halves == 1).any() and ((halves > 0) & (halves < 1)).any()
 
 
+def test_the_weight_of_features_falls_as_the_papers_does():
+    alone = decay(0.9)
+    t = torch.arange(999, -1, -50).repeat_interleave(500)
+    weight = editor_injection.falling_weight(t, np.random.default_rng(0)).reshape(20, 500)
+    for step, drawn in enumerate(weight):
+        # Uniform by 0.15: 500 draws have a standard error of 0.004; the least weight moves the last ones.
+        paper = alone(step, 20)
+        assert float(drawn.mean()) == pytest.approx(max(paper, 0.1), abs=0.05), step
+        assert float((drawn - paper).abs().max()) < 0.2
+
+
 def test_the_blend_moves_masks_and_mixes_tokens():
     generator = torch.Generator().manual_seed(0)
     new, recorded = (torch.randn((2, 16, 3), generator=generator) for _ in range(2))
@@ -284,6 +297,7 @@ def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pairs, t
             pairs,
             net,
             alphas,
+            editor.tokens_of(tokenizer, [""])[0],
             3,
             np.random.default_rng(2),
             torch.Generator().manual_seed(2),
@@ -295,11 +309,92 @@ def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pairs, t
     assert parts[0]["injected"] != parts[1]["injected"]
 
 
-def test_the_schedule_ends_in_pure_noise_and_the_rate_falls_at_the_end():
-    scheduler = editor.scheduler()
+def test_layers_of_the_noise_learn_what_the_answer_it_picks_adds_to_an_open_sentence(
+    tokenizer, monkeypatch
+):
+    torch.manual_seed(0)
+    net = editor.EditorNet(tokenizer.get_vocab_size(), 64)
+    # What a trained text encoder would give: kinds of sentences far from each other, an own shift for each answer.
+    kinds = {kind: torch.randn(1, 128) + 0.1 * torch.randn(200, 128) for kind in AMBIGUOUS}
+    settled = torch.randn(1, 128) + 0.1 * torch.randn(300, 128)
+    shifts = torch.randn(editing_pairs.LOOKS, 128)
+    monkeypatch.setattr(editor_draws, "differences", lambda *_: (kinds, settled, shifts))
+    editor_draws.teach_draws(net, tokenizer, None, seed=3, steps=400)
+    noise = np.random.default_rng(4).normal(size=(200, 48))
+
+    def drawn(text, rows):
+        both = torch.cat([torch.from_numpy(rows).float(), text[: len(rows)]], dim=1)
+        with torch.no_grad():
+            return net.unet.draw(both)
+
+    for kind in AMBIGUOUS:
+        group = list(GROUPS[kind])
+        scores = noise @ codes()[group].double().numpy().T
+        top = np.sort(scores, axis=1)
+        clear = top[:, -1] - top[:, -2] > 0.5  # near rivals are mixed
+        distance = torch.cdist(drawn(kinds[kind], noise[clear]), shifts)
+        picks = np.array(group)[scores[clear].argmax(axis=1)]
+        assert clear.sum() > 50
+        assert (distance.argmin(dim=1).numpy() == picks).mean() > 0.95, kind
+    assert float(drawn(settled, noise).norm(dim=1).mean()) < 0.2 * float(shifts.norm(dim=1).mean())
+
+
+def test_a_clear_sentence_differs_from_an_open_one_by_its_answer_alone(data, tokenizer):
+    worlds = load_pairs(data, "edit-train", count=2)
+
+    class Words:
+        """Every token is 1 where the sentence has the word "red", else 0."""
+
+        def text(self, tokens):
+            texts = [tokenizer.decode(row.tolist()) for row in tokens]
+            value = torch.tensor([float("red" in text.split()) for text in texts])
+            states = value[:, None, None].expand(-1, editor.TOKENS, 3)
+            return types.SimpleNamespace(last_hidden_state=states)
+
+    opened, clear, shifts = editor_draws.differences(
+        Words(), tokenizer, worlds, np.random.default_rng(0)
+    )
+    assert set(opened) == set(AMBIGUOUS)
+    assert all(float(states.abs().max()) == 0 for states in opened.values())
+    # Others say "red" where their world names two colours; "crimson" is red too.
+    assert int(shifts[:, 0].argmax()) == list(COLORS).index("red")
+    assert float(shifts[list(COLORS).index("green"), 0]) == 0
+    assert float(clear.max()) == 1 and float(clear[0].abs().max()) == 0
+
+
+def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
+    torch.manual_seed(0)
+    net = editor.EditorNet(tokenizer.get_vocab_size(), 64).unet.double()
+    torch.nn.init.normal_(net.conv_out.weight, std=0.05)
+    sample, text = torch.randn((2, 96, 8, 12)).double(), torch.randn((2, 5, 128)).double()
+    result = net(sample, 700, encoder_hidden_states=text).sample
+    # The mean of 96 cells has a standard deviation of 1 / sqrt(96).
+    mean = sample[:, :48].flatten(2).sum(dim=2) / 96**0.5
+    # Half of the way from where the answer is settled to where it is open.
+    drawn = 0.5 * net.draw(torch.cat([mean, text[:, 4]], dim=1))
+    draw, net.draw = net.draw, None
+    expected = net(sample, 700, encoder_hidden_states=text + drawn[:, None]).sample
+    assert torch.allclose(result, expected, rtol=0, atol=1e-10)
+    assert not torch.allclose(result, net(sample, 700, text).sample, rtol=0, atol=1e-4)
+    net.draw = draw
+    late = net(sample, torch.tensor([600, 500]), text).sample
+    net.draw = None
+    assert torch.equal(late, net(sample, torch.tensor([600, 500]), text).sample)
+
+
+@pytest.mark.parametrize("betas", [editor.SD_BETAS, editor.EARLY_BETAS])
+def test_the_schedule_ends_in_pure_noise(betas):
+    scheduler = editor.scheduler(betas)
+    root = np.cumprod(1 - np.linspace(betas[0] ** 0.5, betas[1] ** 0.5, 1000) ** 2) ** 0.5
+    # Lin et al. 2024, algorithm 1: the root is shifted so that it ends in 0, and scaled so that it begins as before.
+    expected = ((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2
+    assert np.allclose(scheduler.alphas_cumprod.numpy(), expected, atol=1e-5)
     assert float(scheduler.alphas_cumprod[-1]) == 0
     scheduler.set_timesteps(20)
     assert scheduler.timesteps[0] == 999
+
+
+def test_the_rate_falls_at_the_end():
     rates = [editor.falling_rate(step, 1000, 1.0, warm=100) for step in range(1000)]
     assert rates[0] == 0.01 and rates[99] == 1 and rates[600] == 1
     assert np.all(np.diff(rates[100:]) <= 0)
