@@ -122,7 +122,7 @@ class Case:
         must_refuse: whether a way must refuse a level.
         required_backward: the last level whose gradients must hold, ``required`` if left out.
         limit: why it ends where it does; empty where it holds at every level.
-        group: which figure shows it.
+        group: which figure shows it; the package of cases sets it.
         version: raise it when the errors change meaning.
 
     Example:

@@ -1,12 +1,13 @@
 """The hard cases, by room of the library."""
 
+from dataclasses import replace
+
 from attnwarp_eval.stability.case import Case
 from attnwarp_eval.stability.cases import editing, metrics, splats, truth, warps
 
 EVERY: list[Case] = [
-    *splats.CASES,
-    *warps.CASES,
-    *truth.CASES,
-    *metrics.CASES,
-    *editing.CASES,
+    replace(case, group=room.__name__.rpartition(".")[2])
+    for room in (splats, warps, truth, metrics, editing)
+    for case in room.CASES
 ]
+"""Grouped by their modules."""

@@ -228,7 +228,6 @@ CASES = [
         ways=ways("reference", "cpu", precisions=HALVES),
         measure=_magnitude,
         limit="1e30 has no float16",
-        group="editing",
     ),
     Case(
         42,
@@ -247,7 +246,6 @@ CASES = [
         },
         ways=tuple(way for way in EVERY_TYPE if way.precision != "float64"),
         measure=_weight,
-        group="editing",
     ),
     Case(
         43,
@@ -262,7 +260,6 @@ CASES = [
         bounds={"forward": exact("changed values")},
         ways=EVERY_TYPE,
         measure=_outside,
-        group="editing",
     ),
     Case(
         44,
@@ -284,7 +281,6 @@ CASES = [
         },
         ways=ways("reference", "cpu"),
         measure=_views_of_a_batch,
-        group="editing",
         version=2,
     ),
     Case(
@@ -300,7 +296,6 @@ CASES = [
         bounds={"forward": exact("wrong tokens")},
         ways=EVERY_TYPE,
         measure=_apart,
-        group="editing",
     ),
     Case(
         46,
@@ -315,6 +310,5 @@ CASES = [
         bounds={"forward": Bound("px of the layer", 1e-4, "numerics of the warp")},
         ways=EVERY_TYPE,
         measure=_latents,
-        group="editing",
     ),
 ]

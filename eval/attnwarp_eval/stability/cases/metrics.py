@@ -134,7 +134,6 @@ CASES = [
         ways=ways("metrics", precisions=("float64", "float32", "float16")),
         measure=_magnitude,
         limit="infinite in that type: refused",
-        group="metrics",
     ),
     Case(
         32,
@@ -149,7 +148,6 @@ CASES = [
         bounds={"forward": COSINE},
         ways=FLOATS,
         measure=_short,
-        group="metrics",
     ),
     Case(
         33,
@@ -164,7 +162,6 @@ CASES = [
         bounds={"forward": COSINE},
         ways=FLOATS,
         measure=_displacement,
-        group="metrics",
     ),
     Case(
         34,
@@ -179,7 +176,6 @@ CASES = [
         bounds={"forward": DECIBELS},
         ways=FLOATS,
         measure=_psnr,
-        group="metrics",
     ),
     Case(
         35,
@@ -194,7 +190,6 @@ CASES = [
         bounds={"forward": DECIBELS},
         ways=FLOATS,
         measure=_masked(_equal),
-        group="metrics",
     ),
     Case(
         36,
@@ -209,7 +204,6 @@ CASES = [
         bounds={"forward": DECIBELS},
         ways=FLOATS,
         measure=_masked(_nothing),
-        group="metrics",
     ),
     Case(
         40,
@@ -224,6 +218,5 @@ CASES = [
         bounds={"forward": DECIBELS},
         ways=FLOATS,
         measure=_masked(_equal),
-        group="metrics",
     ),
 ]

@@ -230,7 +230,6 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_edge_on, ("alpha",)),
         limit="the disc is thinner than 0.01 px; pixels' positions are float32",
-        group="splats",
     ),
     Case(
         2,
@@ -249,7 +248,6 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_edge_on, ("depth",)),
         limit="depth changes by its whole extent within 0.01 px, and pixels' positions are float32",
-        group="splats",
     ),
     Case(
         9,
@@ -265,7 +263,6 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_far_world),
         limit="the camera's translation is rounded: 1e11 is stored to 1.5e-5",
-        group="splats",
     ),
     Case(
         16,
@@ -282,7 +279,6 @@ CASES = [
         measure=against_exact(_quaternion),
         must_refuse=lambda level, way: level == 0,
         limit="the squares of a float32 below 1e-23 underflow, so its length is 0",
-        group="splats",
     ),
     *(
         Case(
@@ -298,7 +294,6 @@ CASES = [
             bounds=render_bounds(),
             ways=RENDERERS,
             measure=against_exact(_opacity(kind)),
-            group="splats",
         )
         for kind in ("2d", "3d")
     ),
@@ -316,7 +311,6 @@ CASES = [
             bounds=render_bounds(),
             ways=RENDERERS,
             measure=against_exact(_opacity(kind)),
-            group="splats",
         )
         for kind in ("2d", "3d")
     ),
@@ -335,7 +329,6 @@ CASES = [
         ),
         ways=RENDERERS,
         measure=against_exact(_faint, ("depth",)),
-        group="splats",
     ),
     Case(
         24,
@@ -350,7 +343,6 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_needle),
-        group="splats",
     ),
     Case(
         10,
@@ -366,7 +358,6 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_scale),
         limit="gradients grow as 1 / scale and leave float32",
-        group="splats",
     ),
     Case(
         20,
@@ -384,7 +375,6 @@ CASES = [
         ),
         ways=RENDERERS,
         measure=_deep_ray,
-        group="splats",
     ),
     Case(
         21,
@@ -399,7 +389,6 @@ CASES = [
         bounds={"forward": Bound("alpha", 1.01e-4, "the declared limit, and rounding of 1 - 1e-4")},
         ways=FORWARD,
         measure=_opaque_stack,
-        group="splats",
     ),
     Case(
         23,
@@ -414,7 +403,6 @@ CASES = [
         bounds={"forward": Bound("of 1", 1e-5, "1/400 of a step of an 8-bit picture")},
         ways=tuple(way for way in FORWARD if way.backend != "cuda"),
         measure=_permuted,
-        group="splats",
         version=2,
     ),
     Case(
@@ -430,7 +418,6 @@ CASES = [
         bounds={"forward": ALPHA},
         ways=FORWARD,
         measure=against_exact(_duplicates),
-        group="splats",
     ),
     Case(
         24,
@@ -446,7 +433,6 @@ CASES = [
         ways=RENDERERS,
         measure=against_exact(_ratio),
         limit="pixels' positions are float32: 1e-6 px count once the disc is thinner than 1e-3 px",
-        group="splats",
     ),
     Case(
         25,
@@ -461,7 +447,6 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_antialiased),
-        group="splats",
     ),
     Case(
         25,
@@ -476,7 +461,6 @@ CASES = [
         bounds={"forward": Bound("share of the integral", 0.01, "a quadrature of 36 places")},
         ways=FORWARD,
         measure=_coverage,
-        group="splats",
     ),
     Case(
         39,
@@ -491,7 +475,6 @@ CASES = [
         bounds=render_bounds(),
         ways=RENDERERS,
         measure=against_exact(_near),
-        group="splats",
     ),
     Case(
         39,
@@ -506,6 +489,5 @@ CASES = [
         bounds=render_bounds(ALPHA),
         ways=RENDERERS,
         measure=against_exact(_floor),
-        group="splats",
     ),
 ]

@@ -126,7 +126,6 @@ CASES = [
         },
         ways=BOTH,
         measure=_grazing,
-        group="truth",
     ),
     Case(
         3,
@@ -141,7 +140,6 @@ CASES = [
         bounds={"forward": Bound("relative", 1e-6, "which of the two is hit does not show")},
         ways=BOTH,
         measure=_coplanar,
-        group="truth",
     ),
     Case(
         3,
@@ -157,7 +155,6 @@ CASES = [
         ways=BOTH,
         measure=_ties,
         limit="Open3D lists one of two triangles that coincide in float32",
-        group="truth",
     ),
     Case(
         37,
@@ -179,7 +176,6 @@ CASES = [
         ways=RAYS,
         measure=_tangent,
         limit="the distance from the axis has 16 digits, and its square root 8",
-        group="truth",
     ),
     Case(
         38,
@@ -194,6 +190,5 @@ CASES = [
         bounds={"forward": Bound("m", 3e-6, "1e-6 of the distance")},
         ways=(Way("embree"),),
         measure=_shared_edge,
-        group="truth",
     ),
 ]

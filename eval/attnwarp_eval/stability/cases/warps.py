@@ -477,7 +477,6 @@ CASES = [
         bounds={"forward": exact("wrong labels")},
         ways=WARPS,
         measure=_behind,
-        group="warps",
     ),
     Case(
         5,
@@ -492,7 +491,6 @@ CASES = [
         bounds={"forward": exact("wrong labels or values")},
         ways=WARPS,
         measure=_undefined_depth,
-        group="warps",
     ),
     Case(
         6,
@@ -507,7 +505,6 @@ CASES = [
         bounds={"forward": LOOSE},
         ways=WARPS,
         measure=position_error(_same_view),
-        group="warps",
     ),
     Case(
         6,
@@ -522,7 +519,6 @@ CASES = [
         bounds={"forward": exact("changed values")},
         ways=ways("reference", "cpu", precisions=("float64", "float32", *HALVES)),
         measure=_identity_bits,
-        group="warps",
     ),
     Case(
         7,
@@ -538,7 +534,6 @@ CASES = [
         ways=WARPS,
         measure=position_error(_baseline_far),
         limit="a world at 1e8 is stored to 1.5e-8, a hundredth of the baseline",
-        group="warps",
     ),
     Case(
         8,
@@ -553,7 +548,6 @@ CASES = [
         bounds={"forward": exact("hidden pixels accepted")},
         ways=WARPS,
         measure=_opposed,
-        group="warps",
     ),
     Case(
         9,
@@ -569,7 +563,6 @@ CASES = [
         ways=WARPS,
         measure=position_error(_far),
         limit="a world at 1e13 is stored to 2e-3",
-        group="warps",
     ),
     Case(
         10,
@@ -585,7 +578,6 @@ CASES = [
         ways=WARPS,
         measure=position_error(_scaled),
         limit="a float32 depth of 2^-300 is 0, and one of 2^300 infinite",
-        group="warps",
     ),
     Case(
         10,
@@ -601,7 +593,6 @@ CASES = [
         ways=WARPS,
         measure=_scaled_rules,
         limit="a float32 depth of 2^-300 is 0, and one of 2^300 infinite",
-        group="warps",
     ),
     Case(
         12,
@@ -617,7 +608,6 @@ CASES = [
         ways=WARPS,
         measure=position_error(_principal_point),
         limit="as for `skew`: rays are almost parallel to the picture",
-        group="warps",
     ),
     Case(
         13,
@@ -633,7 +623,6 @@ CASES = [
         ways=WARPS,
         measure=position_error(_skew),
         limit="rays are almost parallel to the picture: their direction keeps 16 digits of 1e9",
-        group="warps",
     ),
     Case(
         14,
@@ -648,7 +637,6 @@ CASES = [
         bounds={"forward": POSITION},
         ways=WARPS,
         measure=position_error(_small_picture),
-        group="warps",
     ),
     Case(
         15,
@@ -667,7 +655,6 @@ CASES = [
         measure=position_error(_no_rotation),
         must_refuse=lambda level, way: level > 1e-5,
         limit="by design: refused above a deviation of 1e-5",
-        group="warps",
     ),
     Case(
         17,
@@ -683,7 +670,6 @@ CASES = [
         ways=ways("reference"),
         measure=_angle(0),
         limit="1e-30 / |b| squared underflows in float32",
-        group="warps",
     ),
     Case(
         17,
@@ -698,7 +684,6 @@ CASES = [
         bounds={"forward": Bound("degrees", 4e-5, "two steps of a float32 of 180")},
         ways=ways("reference"),
         measure=_angle(180),
-        group="warps",
     ),
     Case(
         26,
@@ -714,7 +699,6 @@ CASES = [
         ways=WARPS,
         measure=_step,
         limit="by design: steps of at most 2 % are a slanted surface, and are blended",
-        group="warps",
     ),
     Case(
         27,
@@ -729,7 +713,6 @@ CASES = [
         bounds={"forward": Bound("relative", 1e-6, "float32 depths are stored to 6e-8")},
         ways=WARPS,
         measure=_slanted,
-        group="warps",
     ),
     Case(
         28,
@@ -744,7 +727,6 @@ CASES = [
         bounds={"forward": Bound("share of the image", 1e-5, "u' = u s; 1/200 px at 512")},
         ways=WARPS,
         measure=_ramp,
-        group="warps",
     ),
     Case(
         29,
@@ -764,7 +746,6 @@ CASES = [
         ways=ways("reference", "cpu", precisions=HALVES),
         measure=_half,
         limit="1e30 has no float16",
-        group="warps",
     ),
     Case(
         30,
@@ -781,7 +762,6 @@ CASES = [
         measure=_grid_type,
         must_refuse=lambda level, way: way.precision in HALVES,
         limit="float32 has steps of 1 px at 1e7; half precision is refused everywhere",
-        group="warps",
     ),
     Case(
         36,
@@ -796,7 +776,6 @@ CASES = [
         bounds={"forward": exact("changed values")},
         ways=ways("reference", "cpu", precisions=("float64", "float32", "float16")),
         measure=_nan_positions,
-        group="warps",
     ),
     Case(
         7,
@@ -811,7 +790,6 @@ CASES = [
         bounds={"forward": LOOSE},
         ways=WARPS,
         measure=position_error(_baseline),
-        group="warps",
     ),
     Case(
         11,
@@ -826,6 +804,5 @@ CASES = [
         bounds={"forward": POSITION},
         ways=WARPS,
         measure=position_error(_focal),
-        group="warps",
     ),
 ]
