@@ -21,6 +21,7 @@ from attnwarp.editing.attention import (
     Recording,
     RecordingPlan,
     choose_layers,
+    constant,
     decay,
     inject,
     record,
@@ -37,6 +38,9 @@ INSTRUCTION = "change its color"
 
 STEPS = 20
 BATCH = 16
+
+CONSTANT = 0.9
+"""The weight of features where it does not fall."""
 
 LEAST_SHARE = 0.03
 """Of the picture: a smaller thing in it, or in a half, is not judged."""
@@ -124,12 +128,12 @@ class Swap:
 
     def injected(
         self, recording: Recording, guides: Sequence[Image], noise: Tensor, *,
-        mask: Mask | None = None, warps: Sequence[Any] | None = None,
+        mask: Mask | None = None, warps: Sequence[Any] | None = None, weight: Any = None,
     ) -> list[Image]:  # fmt: skip
-        """The edited pictures with features of a recording, by the paper's decay."""
+        """The edited pictures with features of a recording, by the paper's decay if no weight is given."""
         with inject(
             self.editor.unet, recording, branches=recording.plan.branches,
-            warps=[None] * len(guides) if warps is None else warps, weight=decay(),
+            warps=[None] * len(guides) if warps is None else warps, weight=weight or decay(),
             mask=None if mask is None else torch.from_numpy(mask),
         ):  # fmt: skip
             return self.run(guides, noise)
@@ -148,6 +152,7 @@ def swap_figures(editor: Any, worlds: Worlds, *, size: int, rounds: int = 4) -> 
     left = np.zeros((size, size), dtype=bool)
     left[:, : size // 2] = True
     same: list[tuple[bool, int]] = []
+    held: list[tuple[bool, int]] = []
     other: list[tuple[bool, int]] = []
     follows: list[tuple[bool, int]] = []
     keeps: list[tuple[bool, int]] = []
@@ -164,12 +169,14 @@ def swap_figures(editor: Any, worlds: Worlds, *, size: int, rounds: int = 4) -> 
             order = [(k + 1) % len(batch) for k in range(len(batch))]
             strange = swap.injected(recording, [guides[k] for k in order], noise_b[order])
             whole = swap.injected(recording, guides, noise_b)
+            constantly = swap.injected(recording, guides, noise_b, weight=constant(CONSTANT))
             half = swap.injected(recording, guides, noise_b, mask=left)
             for k, case in enumerate(batch):
                 a, b = case.answer(run_a[k]), case.answer(run_b[k])
                 if 0 in (a, b) or a == b:
                     continue
                 same.append((case.answer(whole[k]) == a, case.world))
+                held.append((case.answer(constantly[k]) == a, case.world))
                 both = (case.thing & left).mean(), (case.thing & ~left).mean()
                 if min(both) >= LEAST_SHARE and case.answer(run_a[k], left) == a:
                     follows.append((case.answer(half[k], left) == a, case.world))
@@ -185,6 +192,7 @@ def swap_figures(editor: Any, worlds: Worlds, *, size: int, rounds: int = 4) -> 
                     other.append((case.answer(image) == wanted, case.world))
     rows = (
         ("features of the same picture make it their colour", same, 0.8),
+        (f"... with a constant weight of {CONSTANT:g}", held, None),
         ("injected in the left half, that half follows", follows, 0.75),
         ("... and the other half keeps its own", keeps, 0.75),
         ("features of another picture make it their colour (at most 15 % asked)", other, None),

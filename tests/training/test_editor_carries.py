@@ -59,7 +59,7 @@ class Scripted:
     def recorded(self, guides, noise):
         return self.answers(guides, noise), (guides, noise)
 
-    def injected(self, recording, guides, noise, *, mask=None, warps=None):
+    def injected(self, recording, guides, noise, *, mask=None, warps=None, weight=None):
         own, given = self.answers(guides, noise), self.answers(*recording)
         if self.obeys == "ignore":
             return own
@@ -80,7 +80,7 @@ def test_features_that_carry_the_answer_and_where_score_so(
     monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size: cases)
     monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(cases, obeys))
     figures = swap_figures(None, worlds, size=64, rounds=2)
-    assert [f.value for f in figures[:3]] == [same, follows, keeps]
+    assert [f.value for f in figures[:4]] == [same, same, follows, keeps]
 
 
 @pytest.mark.parametrize(("obeys", "clear"), [("carry", 1), ("ignore", 0)])
