@@ -15,6 +15,8 @@ from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp_eval.cli.main import app
 
+pytestmark = pytest.mark.slow
+
 STUDY = {
     "name": "mine",
     "scenes": ["bear"],

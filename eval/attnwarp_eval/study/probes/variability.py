@@ -36,6 +36,9 @@ Image = npt.NDArray[np.float32]
 NOTICED = 1.0
 """CIEDE2000 that is just noticed; below it two pictures are the same to a person."""
 
+AGREES = 0.5
+"""Disagreement within a seed, as a part of the variety between seeds, below which views agree."""
+
 WITHIN, FLOOR, BETWEEN, CHANGE = (
     f"variability.{name}" for name in ("within", "within_floor", "between", "change")
 )
@@ -229,8 +232,9 @@ class VariabilityProbe(Probe[Varied]):
             ),
             (
                 f"A variety below {NOTICED:g} is not noticed: the method always makes the same. A"
-                " method is to vary between seeds and to agree within one; where views of a seed"
-                " disagree as much as seeds do, the variety is that of views drawn one by one."
+                " method is to vary between seeds and to agree within one. Where the disagreement"
+                f" within a seed is at least {AGREES:g} of the variety, it varies within a seed"
+                " too; views drawn one by one have a ratio of about 1."
             ),
         ]
         columns = [
@@ -268,7 +272,7 @@ def described(change: float, between: float, within: float) -> str:
         within: of neighbouring views of a seed, above that before the edit.
 
     >>> described(20.0, 0.2, 0.5), described(20.0, 12.0, 2.0), described(20.0, 12.0, 12.5)
-    ('always the same', 'varies, and agrees within a seed', 'views differ as much as seeds')
+    ('always the same', 'varies, and agrees within a seed', 'varies, within a seed too')
     >>> described(0.3, 0.0, 0.0)
     'changes nothing'
     """
@@ -278,8 +282,8 @@ def described(change: float, between: float, within: float) -> str:
         return "changes nothing"
     if between < NOTICED:
         return "always the same"
-    if math.isfinite(within) and within >= between:
-        return "views differ as much as seeds"
+    if math.isfinite(within) and within >= AGREES * between:
+        return "varies, within a seed too"
     return "varies, and agrees within a seed"
 
 
