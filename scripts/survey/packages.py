@@ -119,7 +119,9 @@ def _unpack(archive: Path, folder: Path) -> None:
             file.extractall(folder, [name for name in file.namelist() if _is_mesh(name)])
     else:
         with tarfile.open(archive) as tar:
-            tar.extractall(folder, [one for one in tar if _is_mesh(one.name)], filter="data")
+            # Python 3.11.3 and before have no filters.
+            tar.extraction_filter = getattr(tarfile, "data_filter", None)
+            tar.extractall(folder, [one for one in tar if _is_mesh(one.name)])
 
 
 def _is_mesh(name: str) -> bool:

@@ -20,12 +20,12 @@ from training.worlds import (
     TIMES,
     Look,
     attributes,
+    captioned,
     change,
     draw_look,
     draw_world,
     held_out,
     sentence,
-    told,
 )
 
 
@@ -79,7 +79,7 @@ def test_what_a_caption_says_is_true_of_its_picture_and_the_wrong_one_is_not():
     for _ in range(400):
         thing = int(rng.integers(len(OBJECTS)))
         shown = attributes(thing, draw_look(thing, rng, pairs="any"))
-        said = told(shown, rng)
+        said = captioned(shown, rng)
         assert true_of(np.array([said]), np.array([shown]))[0, 0]
         false = wrong(said, rng)
         assert false != said

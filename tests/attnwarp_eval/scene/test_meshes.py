@@ -451,6 +451,7 @@ objects:
     shape: {{type: mesh, file: {file}, scale: {scale}}}
     texture: {{type: plain, color: '#c04020'}}
 lights: [{{type: sky, horizon: '#ffffff', zenith: '#ffffff'}}]
+appearance: {{bounces: 1}}
 cameras: {{look_at: [0, 0, 0], radius: 9, source: {{yaw: 0, height: 1}}, targets: [{{yaw: 30, height: 1}}]}}
 """
 
