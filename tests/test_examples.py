@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from few_splats import few_splats
 
-from attnwarp import Camera, Gaussians
+from attnwarp import Camera
 from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp.render import render
 
@@ -98,15 +99,7 @@ def folder(tmp_path, monkeypatch):
     """The working folder of a user: splats, a capture of eight views with points, and pictures."""
     import cv2
 
-    generator = torch.Generator().manual_seed(0)
-    splats = Gaussians(
-        "2d",
-        torch.randn(60, 3, generator=generator) * 0.4,
-        torch.nn.functional.normalize(torch.randn(60, 4, generator=generator), dim=1),
-        torch.full((60, 2), 0.15),
-        torch.full((60,), 0.9),
-        torch.randn(60, 1, 3, generator=generator) * 0.5,
-    )
+    splats = few_splats()
     for name in ("scene.ply", "point_cloud.ply"):
         write_ply(tmp_path / name, splats)
     cameras, paths = [], []

@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import torch
 import yaml
+from few_splats import few_splats
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
 from typer.testing import CliRunner
 
-from attnwarp import Camera, Gaussians
+from attnwarp import Camera
 from attnwarp.io import Dataset, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp_eval.cli.main import app
@@ -37,15 +37,7 @@ STUDY = {
 def folder(tmp_path_factory):
     """A capture of three views of 32 px, in two scales, its splats, and a study."""
     path = tmp_path_factory.mktemp("capture")
-    generator = torch.Generator().manual_seed(0)
-    splats = Gaussians(
-        "2d",
-        torch.randn(60, 3, generator=generator) * 0.4,
-        torch.nn.functional.normalize(torch.randn(60, 4, generator=generator), dim=1),
-        torch.full((60, 2), 0.15),
-        torch.full((60,), 0.9),
-        torch.randn(60, 1, 3, generator=generator) * 0.5,
-    )
+    splats = few_splats()
     write_ply(path / "scene.ply", splats)
     cameras, paths = [], []
     for k, angle in enumerate((-0.4, 0.0, 0.4)):

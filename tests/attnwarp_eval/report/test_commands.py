@@ -67,13 +67,16 @@ def test_views_that_are_no_targets_have_no_command(tmp_path):
 
 
 def test_a_page_has_a_command_beside_each_picture_of_a_variant(tmp_path):
+    text = page(report(tmp_path), tmp_path)
+    assert len(re.findall('class="command"', text)) == 4  # two variants of two scenes
+
+
+def test_a_browser_shows_the_commands_of_the_pages_own_folder_and_of_the_picture_picked(tmp_path):
     if browser.executable() is None:
         pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
     root = tmp_path / "it's here"
     root.mkdir()
-    text = page(report(root), root)
-    assert len(re.findall('class="command"', text)) == 4  # two variants of two scenes
-    (root / "report.html").write_text(text)
+    (root / "report.html").write_text(page(report(root), root))
 
     async def look():
         async with browser.opened((root / "report.html").as_uri()) as tab:
