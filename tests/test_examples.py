@@ -100,7 +100,8 @@ def folder(tmp_path, monkeypatch):
     import cv2
 
     splats = few_splats()
-    for name in ("scene.ply", "point_cloud.ply"):
+    (tmp_path / "fits/mine").mkdir(parents=True)
+    for name in ("scene.ply", "point_cloud.ply", "fits/mine/splats.ply"):
         write_ply(tmp_path / name, splats)
     cameras, paths = [], []
     for index, angle in enumerate(np.linspace(-0.5, 0.5, 8)):
