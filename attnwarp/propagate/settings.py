@@ -301,7 +301,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
 
-``extended``: ``corrected`` with ideas beyond the paper, those that helped against truth.
+``extended``: ``corrected`` with further sources, an idea beyond the paper. Whether it helps, the
+study ``comparison-quick`` can't tell.
 """
 
 

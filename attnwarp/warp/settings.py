@@ -195,7 +195,7 @@ source's own, and the same side of the surface seen, tested on the pixels: a fil
 would open holes through which the target's depth shows the far side. Depth by ray-splat
 intersection, its median along the ray, carried to a feature grid in 1 / z without blending across
 edges. The mask's mean over each feature pixel. The numbers (0.5, 1e-2, 0.05) are for rendered
-splats and come from the measurements in docs/warping.md; exact depth takes
+splats and come from the measurements in reports/warp/choices.md; exact depth takes
 ``attnwarp.warp.rules.EXACT_DEPTH_TOLERANCE`` and ``attnwarp.warp.depth.TAP_SPREAD``.
 """
 

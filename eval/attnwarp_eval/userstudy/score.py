@@ -129,7 +129,7 @@ def report(result: Score) -> Report:
     return Report(
         f"Preferences: {result.title}",
         lead,
-        [_shares(result), _pairs(whole), _agreement(result), _people(result)],
+        [_shares(result), _method_pairs(whole), _agreement(result), _people(result)],
     )
 
 
@@ -154,7 +154,7 @@ def _shares(result: Score) -> Section:
     return Section("Preferences", text, [Table(["method", *result.preferences], rows)])
 
 
-def _pairs(whole: Preferences) -> Section:
+def _method_pairs(whole: Preferences) -> Section:
     place = {name: k for k, name in enumerate(whole.methods)}
     rows = []
     for (a, b), share in whole.pairs.items():
@@ -165,7 +165,7 @@ def _pairs(whole: Preferences) -> Section:
         " other methods; its intervals hold for all pairs together at 95 % (Sidak)."
     ]
     columns = ["method", "against", "chosen", "probability", "verdict"]
-    return Section("Pair by pair", text, [Table(columns, rows)])
+    return Section("Method against method", text, [Table(columns, rows)])
 
 
 def _agreement(result: Score) -> Section:
