@@ -5,9 +5,9 @@ Mitsuba.
 from __future__ import annotations
 
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.truth.correspondence import edge_band, two_view
 from attnwarp_eval.truth.mitsuba import appearance, render_plan
 from attnwarp_eval.truth.raycast import Geometry, RayHits
-from attnwarp_eval.truth.two_view import edge_band, two_view
 from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 __all__ = [
