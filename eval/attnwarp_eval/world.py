@@ -19,7 +19,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.surface import surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
-from attnwarp_eval.twoview import TwoView
+from attnwarp_eval.two_view import TwoView
 
 SPLATS_PROTOCOL = 1
 """Version of the sampling. Raise it when the same settings give other splats."""

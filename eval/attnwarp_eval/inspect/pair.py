@@ -29,7 +29,7 @@ from attnwarp.warp import (
 from attnwarp_eval.inspect.capture import Capture, Edit, rendered
 from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 from attnwarp_eval.world import World
 
 Array = npt.NDArray[np.float64]

@@ -27,7 +27,7 @@ from attnwarp_eval.metrics._pictures import picture, region
 from attnwarp_eval.metrics.arrays import Array, Mask, mean, quantile, share
 
 if TYPE_CHECKING:
-    from attnwarp_eval.twoview import TwoView
+    from attnwarp_eval.two_view import TwoView
 
 FlowMethod = Literal["dis", "farneback"]
 

@@ -19,7 +19,7 @@ from attnwarp_eval.metrics.fidelity import fidelity, nearest_answer
 from attnwarp_eval.metrics.image import Distance, mse
 
 if TYPE_CHECKING:
-    from attnwarp_eval.twoview import TwoView
+    from attnwarp_eval.two_view import TwoView
 
 YAW_EDGES = (0, 15, 30, 60, 90, 120, 150, 180)
 """Ends of the bins in degrees, those of :func:`attnwarp_eval.metrics.by_yaw`."""

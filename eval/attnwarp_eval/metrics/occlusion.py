@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp_eval.metrics.arrays import Mask, mask, share
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 COUNTS = (
     "visible_accepted",

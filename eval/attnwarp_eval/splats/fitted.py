@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Step
     from attnwarp.gaussians import Gaussians
     from attnwarp.warp import Surface, WarpSettings
-    from attnwarp_eval.twoview import Hits
+    from attnwarp_eval.two_view import Hits
 
 
 def fit_scene(

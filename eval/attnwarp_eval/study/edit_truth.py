@@ -17,7 +17,7 @@ from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth import appearance, two_view
 from attnwarp_eval.truth.edits import edit_mask
-from attnwarp_eval.twoview import TwoView
+from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World, world
 
 Image = npt.NDArray[np.float32]

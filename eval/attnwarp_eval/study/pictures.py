@@ -10,7 +10,7 @@ import torch
 
 from attnwarp.io.picture import encode_picture
 from attnwarp.warp import Surface, WarpedView, sample
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 if TYPE_CHECKING:
     from attnwarp_eval.world import World

@@ -8,7 +8,7 @@ from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.correspondence import edge_band, two_view
 from attnwarp_eval.truth.mitsuba import appearance, render_plan
 from attnwarp_eval.truth.raycast import Geometry, RayHits
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, Hits, TwoView
 
 __all__ = [
     "AMBIGUOUS",

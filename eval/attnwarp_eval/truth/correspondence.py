@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from attnwarp.camera import Camera
 from attnwarp_eval.truth.raycast import Geometry
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -20,7 +20,7 @@ from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
 from attnwarp_eval.truth.analytic import nearest_hit
-from attnwarp_eval.twoview import Hits
+from attnwarp_eval.two_view import Hits
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -7,7 +7,7 @@ import pytest
 
 from attnwarp_eval import metrics
 from attnwarp_eval.metrics.occlusion import COUNTS
-from attnwarp_eval.twoview import AMBIGUOUS, HIDDEN, NONE, VISIBLE
+from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE
 
 
 def case(seed=0, shape=(40, 50)):

@@ -13,7 +13,7 @@ from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.geometry import every_triangle, triangles
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.twoview import Hits
+from attnwarp_eval.two_view import Hits
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -30,7 +30,7 @@ from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.warping import warp_figures, warp_truth
 from attnwarp_eval.truth.mitsuba import position_and_shape
-from attnwarp_eval.twoview import TwoView
+from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
 
 MITSUBA_TOLERANCE = 1e-4

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
     from attnwarp.gaussians import Gaussians
-    from attnwarp_eval.twoview import Hits
+    from attnwarp_eval.two_view import Hits
 
 Image = npt.NDArray[np.float32]
 

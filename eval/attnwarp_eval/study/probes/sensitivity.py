@@ -35,7 +35,7 @@ from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Results
-from attnwarp_eval.twoview import TwoView
+from attnwarp_eval.two_view import TwoView
 
 FIDELITY = (
     *(
