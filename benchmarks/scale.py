@@ -25,10 +25,10 @@ from typing import Any, ClassVar
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Registry
-from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Probe, Work
 from attnwarp_eval.study.record import Json, NoExtra
+from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
 

@@ -10,11 +10,11 @@ from pydantic import Field
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.registry import Metric, Registry
-from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.pictures import jpeg
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study, Variant
 
 CHORD = Metric("chord.length", "scene", "lower", 1e-9, 0, "distance of target and source camera")
 

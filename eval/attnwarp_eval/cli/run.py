@@ -12,10 +12,10 @@ from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progr
 
 if TYPE_CHECKING:
     from attnwarp_eval.study.cell import Cell
-    from attnwarp_eval.study.parts import Study
     from attnwarp_eval.study.record import Failure
     from attnwarp_eval.study.results import Results
     from attnwarp_eval.study.run import Plan, Summary
+    from attnwarp_eval.study.schema import Study
     from attnwarp_eval.study.store import Store
 
 

@@ -23,9 +23,9 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.methods import METHODS, EditedScene, Job
-from attnwarp_eval.study.parts import Study, Variant
 from attnwarp_eval.study.probes import editing
 from attnwarp_eval.study.probes.sensitivity import StudyPart as EncodersPart
+from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
 

@@ -27,7 +27,7 @@ from attnwarp_eval.inspect.capture import (
 )
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
-from attnwarp_eval.study.parts import Splats, Variant
+from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import parse_study
 from attnwarp_eval.world import World, splats, world

@@ -7,10 +7,10 @@ from typing import Any, Literal
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, benjamini_hochberg, paired, verdict
-from attnwarp_eval.study.parts import Ablation
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Probe, mean_values
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Ablation
 
 
 def ablations(results: Results) -> list[Section]:

@@ -13,10 +13,10 @@ from attnwarp_eval.report.ablations import contrasts
 from attnwarp_eval.report.claims import Finding as Judged
 from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.statistics.intervals import Interval, verdict
-from attnwarp_eval.study.parts import Ablation
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Ablation
 
 MOST = 6
 

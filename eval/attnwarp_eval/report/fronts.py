@@ -8,10 +8,10 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, Ratio, interval, time_ratio
-from attnwarp_eval.study.parts import Front
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import InTurn, Layout
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Front
 
 
 def fronts(results: Results, layout: Layout) -> list[Section]:

@@ -3,7 +3,7 @@ interruption.
 """
 
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Study, StudyError
+from attnwarp_eval.study.schema import Study, StudyError
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import cells_of, load_study, parse_study
 

@@ -13,8 +13,8 @@ from typing import Any
 from pydantic import Field, model_validator
 
 from attnwarp_eval.canonical_json import digest
-from attnwarp_eval.study.parts import Part
 from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import Part
 
 
 class BudgetPart(Part):

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any
 
 from attnwarp_eval.statistics.intervals import Interval, interval
-from attnwarp_eval.study.parts import Study
 from attnwarp_eval.study.record import Failure, Record
+from attnwarp_eval.study.schema import Study
 
 
 @dataclass(frozen=True)

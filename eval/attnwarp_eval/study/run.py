@@ -16,9 +16,9 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
-from attnwarp_eval.study.parts import Study, StudyError
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.record import Environment, Failure, Record
+from attnwarp_eval.study.schema import Study, StudyError
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write

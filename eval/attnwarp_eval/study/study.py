@@ -13,7 +13,9 @@ from attnwarp_eval.scene import explain
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import YamlError, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
-from attnwarp_eval.study.parts import (
+from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probes.base import Probe
+from attnwarp_eval.study.schema import (
     Front,
     Splats,
     Study,
@@ -21,8 +23,6 @@ from attnwarp_eval.study.parts import (
     Variant,
     did_you_mean,
 )
-from attnwarp_eval.study.probes import probe, probes
-from attnwarp_eval.study.probes.base import Probe
 
 KEYS = "study/shipped/quick.yaml"
 """File of this package that shows the keys of a study, for messages."""

@@ -17,7 +17,7 @@ from attnwarp_eval.inspect.cell import cell_report
 from attnwarp_eval.inspect.export import export
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.scene import State
-from attnwarp_eval.study.parts import Splats
+from attnwarp_eval.study.schema import Splats
 
 SIZE = 64
 STATE = State("corrected", "yaw060")

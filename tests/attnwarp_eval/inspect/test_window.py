@@ -14,7 +14,7 @@ from attnwarp_eval.inspect.cell import CellReport, cell_of, cell_report
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.inspect.window import KEYS, Window
-from attnwarp_eval.study.parts import Splats
+from attnwarp_eval.study.schema import Splats
 
 SIZE = 64
 STATE = State("corrected", "yaw060")

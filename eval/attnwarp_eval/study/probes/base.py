@@ -17,9 +17,9 @@ from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.record import Extra, Json, NoExtra, PictureFile, Record, View
 from attnwarp_eval.study.results import Outcome, Results
+from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.world import World
 
 E = TypeVar("E", bound=Extra)

@@ -22,12 +22,12 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.table import USUAL, plan_words, said_by
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Study
 from attnwarp_eval.study.pictures import of_warp
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Study
 from attnwarp_eval.study.warping import warp_figures, warp_truth
 from attnwarp_eval.truth.mitsuba import position_and_shape
 from attnwarp_eval.two_view import TwoView

@@ -10,11 +10,11 @@ from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Table
 from attnwarp_eval.study import pictures
-from attnwarp_eval.study.parts import Study, Variant
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Probe, Work, mean_values, metrics_of
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.world import splats
 
 PLACES = (

@@ -44,11 +44,11 @@ from attnwarp_eval.study.edit_truth import (
 )
 from attnwarp_eval.study.hand_made import Kind, hand_made
 from attnwarp_eval.study.methods import METHODS, EditedScene, Job
-from attnwarp_eval.study.parts import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record, with_nan
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.warping import warp_truth
 from attnwarp_eval.world import splats
 

@@ -24,11 +24,11 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study import pictures
-from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record, finite, with_nan
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study, Variant
 
 GOOD_PSNR = 28.0
 """dB: a fit counts as good from here on."""

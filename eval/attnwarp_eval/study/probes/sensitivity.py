@@ -30,11 +30,11 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.flaws import CONDITIONS, RIGHT, STRENGTHS, Shot, Task, shots_of, tasks
-from attnwarp_eval.study.parts import Part, Study, StudyError, check_distinct, did_you_mean
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study, StudyError, check_distinct, did_you_mean
 from attnwarp_eval.two_view import TwoView
 
 FIDELITY = (

@@ -24,11 +24,11 @@ from attnwarp_eval.stability import (
     level_name,
 )
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Part, Study
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record, View
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study
 
 
 class Sweep(Part):

@@ -9,11 +9,11 @@ from attnwarp.warp import WarpSettings, render_surface, warp_view
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.parts import Study
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import InTurn, Probe, Work
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
+from attnwarp_eval.study.schema import Study
 from attnwarp_eval.world import splats
 
 

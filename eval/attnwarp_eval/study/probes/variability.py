@@ -25,11 +25,11 @@ from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth, edit_truth, neighbours, pair_of
-from attnwarp_eval.study.parts import Study, Variant
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Study, Variant
 
 Image = npt.NDArray[np.float32]
 

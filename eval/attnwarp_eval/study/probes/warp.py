@@ -17,7 +17,6 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.metrics.occlusion import COUNTS, by_yaw
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study import pictures
-from attnwarp_eval.study.parts import Part, Study, Variant
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import (
     Layout,
@@ -30,6 +29,7 @@ from attnwarp_eval.study.probes.base import (
 from attnwarp_eval.study.probes.depth import surface_spec
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.study.warping import warp_figures, warp_truth
 from attnwarp_eval.world import splats
 
