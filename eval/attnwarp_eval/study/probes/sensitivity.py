@@ -29,7 +29,15 @@ from attnwarp_eval.metrics.arrays import Array
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.flaws import CONDITIONS, RIGHT, STRENGTHS, Shot, Task, shots_of, tasks
+from attnwarp_eval.study.flawed_edits import (
+    CONDITIONS,
+    RIGHT,
+    STRENGTHS,
+    Shot,
+    Task,
+    shots_of,
+    tasks,
+)
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record

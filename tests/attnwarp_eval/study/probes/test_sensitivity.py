@@ -17,7 +17,7 @@ from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
-from attnwarp_eval.study.flaws import CONDITIONS, RIGHT, Shot, Task, opposite_hue, tasks
+from attnwarp_eval.study.flawed_edits import CONDITIONS, RIGHT, Shot, Task, opposite_hue, tasks
 from attnwarp_eval.study.probes import probe, sensitivity
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import appearance

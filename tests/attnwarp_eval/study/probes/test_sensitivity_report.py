@@ -12,7 +12,7 @@ from attnwarp_eval.document.write import markdown
 from attnwarp_eval.report.build import build
 from attnwarp_eval.report.results import lines
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.flaws import CONDITIONS, RIGHT
+from attnwarp_eval.study.flawed_edits import CONDITIONS, RIGHT
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.sensitivity import FLAWS, ROWS, beats, curve, power, share
