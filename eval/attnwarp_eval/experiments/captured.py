@@ -22,7 +22,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Tabl
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.progress import Progress, silent
-from attnwarp_eval.study.methods import METHODS, EditedScene, Job
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
 from attnwarp_eval.study.probes import editing
 from attnwarp_eval.study.probes.sensitivity import StudyPart as EncodersPart
 from attnwarp_eval.study.schema import Study, Variant
@@ -202,7 +202,7 @@ def _edit(
     job = Job(
         splats, views.cameras, images, editor, text, settings, folder, None, {}, budget
     )  # fmt: skip
-    return METHODS[own.method].run(job)
+    return EDITING_METHODS[own.method].run(job)
 
 
 def _write_pictures(

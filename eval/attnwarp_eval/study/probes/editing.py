@@ -42,8 +42,8 @@ from attnwarp_eval.study.edit_truth import (
     neighbours,
     pair_of,
 )
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
 from attnwarp_eval.study.hand_made import Kind, hand_made
-from attnwarp_eval.study.methods import METHODS, EditedScene, Job
 from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.record import Json, Record, with_nan
@@ -243,14 +243,18 @@ class EditingProbe(Probe[EditResult]):
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Settings are refused even where nothing is edited."""
         own = variant.part(VariantPart)
-        check.one_of(own.method, list(METHODS), "method")
-        if own.budget is not None and not METHODS[own.method].takes_budget:
-            able = ", ".join(repr(name) for name, method in METHODS.items() if method.takes_budget)
+        check.one_of(own.method, list(EDITING_METHODS), "method")
+        if own.budget is not None and not EDITING_METHODS[own.method].takes_budget:
+            able = ", ".join(
+                repr(name) for name, method in EDITING_METHODS.items() if method.takes_budget
+            )
             raise ValueError(
                 f"budget: method {own.method!r} runs to its end; methods with a budget are {able}"
             )
-        if own.by_hand is not None and not METHODS[own.method].takes_picture:
-            able = ", ".join(repr(name) for name, method in METHODS.items() if method.takes_picture)
+        if own.by_hand is not None and not EDITING_METHODS[own.method].takes_picture:
+            able = ", ".join(
+                repr(name) for name, method in EDITING_METHODS.items() if method.takes_picture
+            )
             raise ValueError(
                 f"by_hand: method {own.method!r} edits its source itself; methods that take a"
                 f" picture are {able}"
@@ -448,7 +452,7 @@ def run_method(
             budget,
             source_by_hand(work, truth, names[0]),
         )
-        return METHODS[spec["method"]].run(job)
+        return EDITING_METHODS[spec["method"]].run(job)
 
 
 def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
@@ -694,7 +698,7 @@ def settings_of(study: Study, variant: Variant, seed: int) -> dict[str, Any]:
     fields = {**study.part(StudyPart).editing.options, **own.options}
     name = fields.pop("preset", variant.preset)
     warp = {f"warp.{key}": value for key, value in variant.set.items()}
-    return METHODS[own.method].settings(name, {**fields, **warp}, seed)
+    return EDITING_METHODS[own.method].settings(name, {**fields, **warp}, seed)
 
 
 def _reference(variant: Variant) -> str | None:

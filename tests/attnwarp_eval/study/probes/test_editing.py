@@ -20,7 +20,7 @@ from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.budgets import Spent, Stopwatch
 from attnwarp_eval.study.edit_truth import pair_of
-from attnwarp_eval.study.methods import METHODS, EditedScene, Method
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import editing, probe
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.work import compute
@@ -75,7 +75,7 @@ def planned(answers):
         }
         return EditedScene(job.gaussians, edited, {"edit": 1.0}, {"views": len(edited)})
 
-    return Method(METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["propagate"].settings, run)
 
 
 def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_answer(
@@ -98,7 +98,9 @@ def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_
 
 
 def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(METHODS, "true pictures", planned(["green", "red", "green", "blue"]))
+    monkeypatch.setitem(
+        EDITING_METHODS, "true pictures", planned(["green", "red", "green", "blue"])
+    )
     record = record_of(folder, tmp_path)
     assert record.extra.answers["edit"] == {
         "source": "green", "yaw015": "red", "yaw030": "green", "yaw120": "blue",
@@ -115,7 +117,7 @@ def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, mon
 def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_names_the_edit(
     folder, tmp_path, monkeypatch
 ):
-    monkeypatch.setitem(METHODS, "true pictures", planned([None, "red", "red", "red"]))
+    monkeypatch.setitem(EDITING_METHODS, "true pictures", planned([None, "red", "red", "red"]))
     study, store = load(folder), Store(tmp_path / "run")
     summary = runner.execute(runner.plan(study, store), store)
     assert summary.complete, summary.failures
@@ -140,7 +142,7 @@ def test_seconds_are_in_the_record_and_not_in_the_report_without_timings(
         slow = dataclasses.replace(
             method, run=lambda job, m=method, s=seconds: dataclasses.replace(m.run(job), seconds={"edit": s})
         )  # fmt: skip
-        monkeypatch.setitem(METHODS, "true pictures", slow)
+        monkeypatch.setitem(EDITING_METHODS, "true pictures", slow)
         study, store = load(folder), Store(tmp_path / str(seconds))
         assert runner.execute(runner.plan(study, store), store).complete
         records = [store.read(cell.id) for cell in runner.plan(study, store).cells]
@@ -213,7 +215,7 @@ def sleeping(seconds):
     def run(job):
         return dataclasses.replace(planned(["red"] * 4).run(job), seconds={"edit": seconds})
 
-    return Method(METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["propagate"].settings, run)
 
 
 def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_did_not_finish(
@@ -228,10 +230,12 @@ def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_d
         return dataclasses.replace(edited, cut="seconds", counters=counters)
 
     # The first run in a process pays for compilation, and is not taken.
-    monkeypatch.setitem(METHODS, "true pictures", Method(
-        METHODS["propagate"].settings, lambda job: sleeping(next(times)).run(job)))  # fmt: skip
+    monkeypatch.setitem(EDITING_METHODS, "true pictures", Method(
+        EDITING_METHODS["propagate"].settings, lambda job: sleeping(next(times)).run(job)))  # fmt: skip
     monkeypatch.setitem(
-        METHODS, "slow", Method(METHODS["propagate"].settings, cut_short, takes_budget=True)
+        EDITING_METHODS,
+        "slow",
+        Method(EDITING_METHODS["propagate"].settings, cut_short, takes_budget=True),
     )
     monkeypatch.setattr(editing, "STOPWATCH", Stopwatch())
     study = load(
@@ -310,7 +314,9 @@ def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction
         words.append((job.editor.guide, job.instruction))
         return planned(["red"] * 4).run(job)
 
-    monkeypatch.setitem(METHODS, "planned", Method(METHODS["propagate"].settings, run))
+    monkeypatch.setitem(
+        EDITING_METHODS, "planned", Method(EDITING_METHODS["propagate"].settings, run)
+    )
     for name in ("small-depth", "small-plain"):
         own = {"method": "planned", "editor": {"name": name, "text_guidance": 1.5}}
         record_of(folder, tmp_path, variants={"planned": own})

@@ -13,7 +13,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.edit_truth import edit_truth
-from attnwarp_eval.study.methods import METHODS, EditedScene, Method
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import probe
 
 VIEWS = ("source", "yaw015", "yaw030", "yaw120")
@@ -39,7 +39,7 @@ def planned(answer):
             edited[view] = np.rint(255 * image).astype(np.uint8)
         return EditedScene(job.gaussians, edited, {"edit": 1.0}, {"network_rows": 2})
 
-    return Method(METHODS["propagate"].settings, run)
+    return Method(EDITING_METHODS["propagate"].settings, run)
 
 
 PLANS = {
@@ -67,7 +67,7 @@ def measured(folder, tmp_path_factory):
     """(records by variant, the run's folder)."""
     with pytest.MonkeyPatch.context() as patch:
         for name, plan in PLANS.items():
-            patch.setitem(METHODS, name, planned(plan))
+            patch.setitem(EDITING_METHODS, name, planned(plan))
         study, store = study_of(folder), Store(tmp_path_factory.mktemp("run"))
         summary = runner.execute(runner.plan(study, store), store)
         assert summary.complete, summary.failures
@@ -143,7 +143,7 @@ def test_every_seed_has_its_own_settings_and_all_share_the_splats(folder, monkey
         jobs.append((job.settings["seed"], job.gaussians.means.numpy().tobytes()))
         return planned(PLANS["always red"]).run(job)
 
-    monkeypatch.setitem(METHODS, "spy", Method(METHODS["propagate"].settings, run))
+    monkeypatch.setitem(EDITING_METHODS, "spy", Method(EDITING_METHODS["propagate"].settings, run))
     from attnwarp_eval.study.work import compute
 
     study = study_of(

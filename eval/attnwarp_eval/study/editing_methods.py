@@ -1,7 +1,7 @@
 """Methods that edit a scene, by the name that a study's variant gives as ``method``.
 
 A method gets a :class:`Job` and gives an :class:`EditedScene`. A new one is one line in
-:data:`METHODS`.
+:data:`EDITING_METHODS`.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def _baseline(name: str) -> Method:
     return Method(settings, run, takes_budget=True)
 
 
-METHODS: dict[str, Method] = {
+EDITING_METHODS: dict[str, Method] = {
     "propagate": Method(_propagate_settings, _propagate, takes_picture=True),
     "true pictures": Method(_propagate_settings, _true_pictures),
     **{name: _baseline(name) for name in ("by_view", "igs2gs", "dge", "gaussctrl")},
