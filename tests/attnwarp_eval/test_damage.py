@@ -1,7 +1,7 @@
 """Damaged studies, runs and derived files: a right result or one line, in 10 s and 1 GiB.
 
 The run is one that former code computed (``data/runs.tar.xz``), reduced to one scene and sealed. A
-failure is repeated by its label: the name of the format and the seed of :mod:`mutate`.
+failure is repeated by its label: the name of the format and the seed of :mod:`damage_files`.
 """
 
 import contextlib
@@ -9,7 +9,7 @@ import json
 import pathlib
 import tarfile
 
-import mutate
+import damage_files
 import numpy as np
 import pytest
 import yaml
@@ -182,7 +182,7 @@ def run_in(folder, sealed=True):
 def failures(name, folder, seeds):
     form = FORMATS[name](folder)
     form.use(form.whole)  # the undamaged file is read
-    return mutate.failures(
+    return damage_files.failures(
         name, form.whole, form.use, seeds, refusals=(InputError,), text=name != "cache"
     )
 

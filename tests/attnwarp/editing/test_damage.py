@@ -1,12 +1,12 @@
 """Damaged folders of diffusion models: the model in the folder, or one line, in 10 s and 1 GiB.
 
-A failure is repeated by its label: the file and the seed of :mod:`mutate`.
+A failure is repeated by its label: the file and the seed of :mod:`damage_files`.
 """
 
 import json
 import struct
 
-import mutate
+import damage_files
 import numpy as np
 import pytest
 import tiny_editors
@@ -67,7 +67,7 @@ def failures(folder, name, seeds):
     whole = (folder / name).read_bytes()
     try:
         use(folder, name, whole)
-        return mutate.failures(
+        return damage_files.failures(
             name, whole, lambda data: use(folder, name, data), seeds,
             refusals=(InputError,), text=name.endswith(".json"),
         )  # fmt: skip

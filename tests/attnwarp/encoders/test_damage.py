@@ -1,13 +1,13 @@
 """Damaged safetensors: the tensors that the file holds, or one line, in 10 s and 1 GiB.
 
-A failure is repeated by its label: the name of the reader and the seed of :mod:`mutate`.
+A failure is repeated by its label: the name of the reader and the seed of :mod:`damage_files`.
 """
 
 import json
 import shutil
 import struct
 
-import mutate
+import damage_files
 import numpy as np
 import pytest
 import tiny_models
@@ -107,7 +107,7 @@ def failures(name, folder, seeds):
         reader.path.write_bytes(data)
         reader.use(data)
 
-    return mutate.failures(name, whole, read, seeds, refusals=(InputError,))
+    return damage_files.failures(name, whole, read, seeds, refusals=(InputError,))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

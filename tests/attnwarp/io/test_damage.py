@@ -1,7 +1,7 @@
 """Damaged files of every format: a right result or one line, in 10 s and 1 GiB, never a crash.
 
 Each format has an oracle of its own for what is read in spite of the damage. A failure is repeated
-by its label: the name of the format and the seed of :mod:`mutate`.
+by its label: the name of the format and the seed of :mod:`damage_files`.
 """
 
 import io
@@ -10,7 +10,7 @@ import re
 import struct
 import warnings
 
-import mutate
+import damage_files
 import numpy as np
 import pytest
 import torch
@@ -241,7 +241,7 @@ def failures(name, folder, seeds):
             form.use(folder, given)
 
     refusals = (InputError, FileNotFoundError)
-    return mutate.failures(name, data, read, seeds, refusals=refusals, text=name in TEXTS)
+    return damage_files.failures(name, data, read, seeds, refusals=refusals, text=name in TEXTS)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork beside threads of libraries

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from damage_files import mutate_bytes, mutate_text, survey
 from matplotlib.path import Path as Outline
-from mutate import mutate_bytes, mutate_text, survey
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh, read_mesh_file

@@ -1,7 +1,7 @@
 """YAML from people: what cannot be meant is refused in one line, with its place, at once."""
 
 import pytest
-from mutate import mutate_bytes, mutate_text, survey
+from damage_files import mutate_bytes, mutate_text, survey
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import SceneError

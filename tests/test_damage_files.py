@@ -5,7 +5,7 @@ import signal
 import time
 
 import pytest
-from mutate import mutate_bytes, mutate_text, survey
+from damage_files import mutate_bytes, mutate_text, survey
 
 TEXT = '{\n  "w": 8,\n  "frames": [{"file_path": "a.png", "k1": -1.5e-3}]\n}\n'
 
