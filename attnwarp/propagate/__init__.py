@@ -1,9 +1,9 @@
 """An edit of one view, carried through a scene: Algorithm 1. See docs/editing-a-scene.md."""
 
-from attnwarp.propagate.plan import Plan
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.settings import PRESETS, PropagateSettings, preset
+from attnwarp.propagate.stages import Plan
 
 __all__ = [
     "PRESETS",

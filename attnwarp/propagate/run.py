@@ -39,7 +39,6 @@ from attnwarp.propagate.pictures import (
     sight_picture,
     to_bytes,
 )
-from attnwarp.propagate.plan import Plan, choose_chain
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
@@ -51,6 +50,7 @@ from attnwarp.propagate.scene import (
 )
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
+from attnwarp.propagate.stages import Plan, choose_chain
 from attnwarp.propagate.tune import TrainingView, Tuning
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from attnwarp import Camera
-from attnwarp.propagate.plan import choose_chain
 from attnwarp.propagate.sight import Sight, depth_margin, pixel_ratio
+from attnwarp.propagate.stages import choose_chain
 from attnwarp.warp import Surface, preset, resize_mask, warp_surfaces
 
 SIZE = 24
