@@ -32,6 +32,7 @@ from torch import Tensor
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import api, constants, cpu, reference
+from attnwarp.render.interface import Inputs
 
 OUTPUTS = (
     "color",
@@ -70,7 +71,7 @@ px.
 """
 
 
-def prepared(splats: Gaussians, camera: Camera, **options: object) -> reference.Inputs:
+def prepared(splats: Gaussians, camera: Camera, **options: object) -> Inputs:
     """What a backend gets from the door, with the door's defaults."""
     given = dict.fromkeys(("depth", "background", "features", "sh_degree", "antialiased", "pose"))
     given |= {"near": constants.NEAR, "ndc": (constants.NDC_NEAR, constants.NDC_FAR)}
@@ -86,7 +87,7 @@ def mixed_scales(splats: Gaussians, seed: int, ratio: float) -> Gaussians:
     return dataclasses.replace(splats, scales=scales).to(dtype=torch.float32)
 
 
-def displaced(inputs: reference.Inputs, seed: int) -> reference.Inputs:
+def displaced(inputs: Inputs, seed: int) -> Inputs:
     """Each splat moved across the picture by :data:`ROUNDED_PIXELS` in x and in y, to a random
     side."""
     rng = np.random.default_rng(seed)
@@ -99,7 +100,7 @@ def displaced(inputs: reference.Inputs, seed: int) -> reference.Inputs:
     return dataclasses.replace(inputs, means=means + step @ rotation[:2])
 
 
-def bracket(inputs: reference.Inputs, displacements: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
+def bracket(inputs: Inputs, displacements: int = 0) -> dict[str, tuple[Tensor, Tensor]]:
     """Smallest and largest value of each output when every threshold is moved by what float32 may
     round.
 
@@ -139,7 +140,7 @@ def bracket(inputs: reference.Inputs, displacements: int = 0) -> dict[str, tuple
     return result
 
 
-def excess(inputs: reference.Inputs, displacements: int = 0) -> dict[str, float]:
+def excess(inputs: Inputs, displacements: int = 0) -> dict[str, float]:
     """How far each output of the CPU backend lies outside of what it may be.
 
     Raises:

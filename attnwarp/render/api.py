@@ -13,7 +13,7 @@ from attnwarp import check
 from attnwarp.camera import ORTHONORMAL_TOLERANCE, Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import constants
-from attnwarp.render.reference import Inputs, Outputs
+from attnwarp.render.interface import Inputs, Outputs
 
 Tensor = torch.Tensor
 

@@ -10,7 +10,7 @@ import torch
 
 from attnwarp.render import _pool, order
 from attnwarp.render._kernels import binning, layout, ordering, projection
-from attnwarp.render.reference import Inputs
+from attnwarp.render.interface import Inputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 PIECE = 4096

@@ -38,7 +38,7 @@ from attnwarp.render.binned import (
     as_array,
     join,
 )
-from attnwarp.render.reference import Inputs, Outputs
+from attnwarp.render.interface import Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 GRADIENT_ROWS = 1 << 16

@@ -28,7 +28,7 @@ import os
 import torch
 
 from attnwarp.render import harmonics, reference
-from attnwarp.render.reference import Inputs, Outputs
+from attnwarp.render.interface import Inputs, Outputs
 
 Tensor = torch.Tensor
 

@@ -17,6 +17,7 @@ import torch
 
 from attnwarp import Camera
 from attnwarp.render import api, constants, reference, render
+from attnwarp.render.interface import Outputs
 from benchmarks import gsplat_torch
 
 
@@ -116,7 +117,7 @@ def test_an_off_centre_principal_point_agrees(make_splats) -> None:
     assert np.isfinite(judged.seconds)
 
 
-def without_stop(splats, camera) -> reference.Outputs:
+def without_stop(splats, camera) -> Outputs:
     """The reference, its rays going on for ever."""
     ndc = (constants.NDC_NEAR, constants.NDC_FAR)
     inputs = api._prepare(

@@ -11,9 +11,10 @@ import torch
 
 from attnwarp import Camera
 from attnwarp.render import api, constants, cuda, reference, render
+from attnwarp.render.interface import Inputs
 
 
-def prepared(splats, camera, depth: str = "center") -> reference.Inputs:
+def prepared(splats, camera, depth: str = "center") -> Inputs:
     ndc = (constants.NDC_NEAR, constants.NDC_FAR)
     return api._prepare(
         splats, camera, depth, None, None, None, constants.NEAR, None, None, ndc, on_cpu=False
@@ -27,9 +28,7 @@ def square_pixels(camera: Camera) -> Camera:
     return Camera(K, camera.world_to_camera, camera.width, camera.height)
 
 
-def brute_force(
-    inputs: reference.Inputs, features: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def brute_force(inputs: Inputs, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Stands in for gsplat's kernels: the definition, compositing the same features over
     nothing."""
     zero = torch.zeros(features.shape[1], dtype=torch.float64)

@@ -1,0 +1,55 @@
+"""What a backend of the renderer gets and returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a backend gets from the door: checked, and free of defaults. N splats, C channels.
+
+    ``values`` is (N, K, 3) spherical harmonics if ``harmonic``, else (N, C) features. ``K`` is (3,
+    3) and ``pose`` the (4, 4) world-to-camera transform, both float64; ``pose`` and ``background``
+    (C,) may require gradients.
+    """
+
+    kind: str
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    values: Tensor
+    harmonic: bool
+    origin: Tensor
+    K: Tensor
+    pose: Tensor
+    width: int
+    height: int
+    background: Tensor
+    depth: str
+    near: float
+    antialiased: bool
+    ndc: tuple[float, float]
+
+    @property
+    def channels(self) -> int:
+        """Channels of the rendered colour."""
+        return 3 if self.harmonic else int(self.values.shape[1])
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """What a backend returns; the fields are those of :class:`attnwarp.render.Render`."""
+
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    median_depth: Tensor
+    normal: Tensor
+    distortion_l1: Tensor
+    distortion_l2_ndc: Tensor
+    weight: Tensor
+    counters: dict[str, int]
