@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
-from attnwarp.editing.cli import (
+from attnwarp.editing.command import (
     SEGMENTER,
     DeviceOption,
     EditorOption,
