@@ -176,7 +176,7 @@ def recorded():
     return json.loads((SCENES / bounces.RECORD).read_text(encoding="utf-8"))
 
 
-def test_every_scene_that_leaves_the_number_open_and_its_edits_have_their_answers_recorded(
+def test_every_scene_that_leaves_the_number_open_has_its_answer_recorded_and_edits_of_some(
     monkeypatch, tmp_path
 ):
     # An empty cache and nothing to measure with: the record alone answers.
