@@ -176,7 +176,7 @@ def recorded():
     return json.loads((SCENES / bounces.RECORD).read_text(encoding="utf-8"))
 
 
-def test_every_scene_that_leaves_the_number_open_has_its_answer_recorded_and_edits_of_some(
+def test_every_scene_that_leaves_the_number_open_and_every_edit_has_its_answer_recorded(
     monkeypatch, tmp_path
 ):
     # An empty cache and nothing to measure with: the record alone answers.
@@ -185,7 +185,7 @@ def test_every_scene_that_leaves_the_number_open_has_its_answer_recorded_and_edi
     scenes = {scene.name: scene for scene in worlds()}
     pinned = re.compile(r"bounces: (\d+|unlimited)")
     files = [path for path in SCENES.glob("*.yaml") if not pinned.search(path.read_text())]
-    assert files and {path.stem for path in files} <= set(recorded()) <= set(scenes)
+    assert files and {path.stem for path in files} <= set(scenes) == set(recorded())
     for name, entry in recorded().items():
         scene = scenes[name]
         assert entry["key"] == bounces.key(scene)
