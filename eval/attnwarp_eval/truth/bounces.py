@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -41,15 +42,23 @@ CONFIDENCE = 0.99
 SIZE, BLOCK = 32, 8
 """Pixels along a side of the measured pictures, and of their blocks."""
 
-SEEDS = 16
+PAIRS = 16
+"""Pairs of pictures of a view. One rendering makes them all, a cell of each pixel for each, since
+starting a rendering takes longer than so few samples; so it is a square."""
 
-SAMPLES = (16, 64, 256)
+SAMPLES = (4, 16, 64, 256)
 """Samples a pixel, more where fewer cannot tell."""
 
-MOST = 12
-"""Most bounces that are tried."""
+TEXELS = 512
+"""Most texels along a side of a baked texture: four for each cell of the pictures."""
 
-PROTOCOL = 1
+AT_ONCE = 64
+"""Most samples of a rendering: those of more would take gigabytes."""
+
+FIRST, MOST = 2, 12
+"""The number that is tried first, and the most that are tried."""
+
+PROTOCOL = 2
 """Raised whenever the same scene would be measured otherwise."""
 
 
@@ -188,7 +197,7 @@ def key(scene: Scene) -> str:
     return content_key(
         "bounces",
         PROTOCOL,
-        [MARGIN, CONFIDENCE, SIZE, SEEDS, *SAMPLES, MOST],
+        [MARGIN, CONFIDENCE, SIZE, TEXELS, PAIRS, *SAMPLES, MOST],
         scene.world_hash,
         scene.spec.cameras.model_dump(mode="json", exclude={"size"}),
     )
@@ -209,7 +218,7 @@ def _recorded() -> dict[str, Answer]:
 # --------------------------------------------------------------------------------------------------
 
 Pictures = Callable[[Bounces, Camera, int], Array]
-"""(SEEDS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
+"""(PAIRS, H, W, 3) pictures of a number of bounces, a view and samples a pixel."""
 
 
 def search(scene: Scene) -> Answer:
@@ -222,22 +231,37 @@ def search(scene: Scene) -> Answer:
     made_by = f"{mitsuba.__version__} {comparable(small)}"
     pictures = pictures_of(small)
     views = list(small.cameras)
-    fewer = None
-    for bounces in range(transport.fewest_bounces(scene.spec), MOST + 1):
+
+    def try_all(bounces: int) -> Shortfall:
+        """The view where the number is the least certain, or the first that refuses it."""
         worst: Shortfall | None = None
         for view in list(views):
             tried = shortfall(pictures, bounces, view)
             if not tried.holds:
-                # The view that refused is asked first about the next number.
+                # It is asked first about the next number.
                 views.remove(view)
                 views.insert(0, view)
-                fewer, worst = tried, None
-                break
+                return tried
             if worst is None or tried.bound > worst.bound:
                 worst = tried
-        if worst is not None:
-            return Answer(bounces, worst, fewer, made_by)
-    return Answer("unlimited", None, fewer, made_by)
+        assert worst is not None
+        return worst
+
+    least = transport.fewest_bounces(scene.spec)
+    number = max(least, FIRST)
+    last, fewer = try_all(number), None
+    # Fewer bounces leave out more light, so numbers below one that is refused are not tried.
+    while not last.holds and number < MOST:
+        number, fewer, last = number + 1, last, try_all(number + 1)
+    if not last.holds:
+        return Answer("unlimited", None, last, made_by)
+    while fewer is None and number > least:
+        below = try_all(number - 1)
+        if below.holds:
+            number, last = number - 1, below
+        else:
+            fewer = below
+    return Answer(number, last, fewer, made_by)
 
 
 def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
@@ -245,7 +269,7 @@ def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
 
     Example:
         >>> def pictures(bounces, view, spp):
-        ...     noise = np.random.default_rng(spp).normal(0, 0.01, (SEEDS, 8, 8, 3))
+        ...     noise = np.random.default_rng(spp).normal(0, 0.01, (PAIRS, 8, 8, 3))
         ...     return noise + (1.0 if bounces == "unlimited" else 1 - 0.05**bounces)
         >>> view = Camera.look_at((0, 0, 3), (0, 0, 0), width=8, height=8, fov_y=45, up=(0, 1, 0))
         >>> [shortfall(pictures, bounces, view).holds for bounces in (1, 2)]
@@ -256,7 +280,7 @@ def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
     for spp in SAMPLES:
         ours, endless = (pictures(b, view, spp) for b in (bounces, "unlimited"))
         test = paired_test(ours, endless)
-        reach = float(stats.t.ppf(CONFIDENCE, SEEDS - 1)) * test.error
+        reach = float(stats.t.ppf(CONFIDENCE, PAIRS - 1)) * test.error
         bound = abs(test.difference) + reach
         apart = (endless - ours).mean((0, 3))
         blocks = apart.reshape(len(apart) // BLOCK, BLOCK, -1, BLOCK).mean((1, 3))
@@ -268,17 +292,45 @@ def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
 
 def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
     """Pictures of ``scene`` for :func:`shortfall`, from ``seed`` on; those made are kept."""
-    from attnwarp_eval.truth.mitsuba import comparable, render_plan
+    from attnwarp_eval.truth.mitsuba import build, comparable, render_plan
 
     made_by = comparable(scene)
+    side = math.isqrt(PAIRS)
 
     @functools.cache
     def pictures(bounces: Bounces, name: str, spp: int) -> Array:
         # Both of a pair have one seed: in a variant that gives each sample random numbers of its
         # own the light of the first bounces is then the same.
-        planned, camera = plan(scene, spp, bounces=bounces), scene.camera(name)
-        return np.stack(
-            [render_plan(scene, camera, planned, seed + k, made_by=made_by) for k in range(SEEDS)]
-        ).astype(np.float64)
+        parts = max(1, spp // AT_ONCE)
+        planned, camera = plan(scene, spp // parts, bounces=bounces), scene.camera(name)
+        fine = camera.resize(side * camera.width, side * camera.height)
+        with build.at_most_texels(TEXELS):
+            rendered = [
+                render_plan(scene, fine, planned, seed + k, made_by=made_by) for k in range(parts)
+            ]
+        return dealt(np.mean(rendered, axis=0, dtype=np.float64))
 
     return lambda bounces, view, spp: pictures(bounces, view.name, spp)
+
+
+def dealt(fine: Array) -> Array:
+    """(PAIRS, H, W, 3) pictures from one whose pixels have PAIRS cells each.
+
+    Which cell of a pixel falls to which picture is chance, the same at each call. So all of them
+    expect the same pixels, and the spread of their means overstates the error of their mean a
+    little, if anything: cells of one pixel differ more than samples of it would.
+
+    Args:
+        fine: (H * side, W * side, 3), side the square root of PAIRS.
+
+    Example:
+        >>> pictures = dealt(np.arange(8 * 8 * 3.0).reshape(8, 8, 3))
+        >>> pictures.shape, bool((np.sort(pictures[:, 0, 0, 0]) == 3 * np.array(
+        ...     [[8 * row + column for column in range(4)] for row in range(4)]).ravel()).all())
+        ((16, 2, 2, 3), True)
+    """
+    side = math.isqrt(PAIRS)
+    height, width = fine.shape[0] // side, fine.shape[1] // side
+    cells = fine.reshape(height, side, width, side, 3).transpose(1, 3, 0, 2, 4)
+    order = np.random.default_rng(0).random((PAIRS, height, width, 1)).argsort(axis=0)
+    return np.take_along_axis(cells.reshape(PAIRS, height, width, 3), order, axis=0)

@@ -584,11 +584,11 @@ def test_the_command_line_prints_effects_and_plan_for_people_and_as_json(monkeyp
         saving, "measure", functools.partial(saving.measure, size=16, spp=4, rounds=2)
     )
     runner = CliRunner()
-    out = json.loads(runner.invoke(app, ["scenes", "effects", "spheres", "--json"]).stdout)
+    out = json.loads(runner.invoke(app, ["scenes", "effects", "opposed", "--json"]).stdout)
     assert out["effects"]["textures"]["needed"] and not out["effects"]["medium"]["needed"]
     assert out["plan"]["integrator"] == "direct" and out["plan"]["sensor"]["type"] == "perspective"
     assert out["everything_on"]["integrator"] == "volpath" and out["cost"]["seconds"][0] > 0
-    text = runner.invoke(app, ["scenes", "effects", "spheres", "--prove"]).stdout
+    text = runner.invoke(app, ["scenes", "effects", "opposed", "--prove"]).stdout
     assert (
         "plan: direct" in text
         and "because the sky is smooth" in text

@@ -41,13 +41,13 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
         effects, "measure_entry", lambda scene, *a: made.append(scene.name) or real(scene, *a)
     )
     quick = Settings(prove=False, rounds=2)
-    collect(["spheres", "glass"], tmp_path, quick)
-    collect(["spheres", "glass", "mirror"], tmp_path, quick)
-    assert made == ["spheres", "glass", "mirror"]
+    collect(["opposed", "glass"], tmp_path, quick)
+    collect(["opposed", "glass", "mirror"], tmp_path, quick)
+    assert made == ["opposed", "glass", "mirror"]
     data = json.loads((tmp_path / "effects.json").read_text())
     by_name = {entry["scene"]: entry for entry in data["scenes"]}
     assert "refraction" in by_name["glass"]["needed"] and "specular" in by_name["mirror"]["needed"]
-    assert by_name["spheres"]["left_out"] == ["interreflection"]
+    assert by_name["opposed"]["left_out"] == ["interreflection"]
     text = (tmp_path / "effects.md").read_text()
     assert (
         "| mirror | interreflection, specular, environment | " in text
@@ -89,7 +89,7 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
 
 def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
     # A budget for a busy machine; a quiet one needs a few seconds of it.
-    (entry,) = collect(["spheres"], tmp_path, Settings(rounds=0, pictures=False, budget=240))
+    (entry,) = collect(["opposed"], tmp_path, Settings(rounds=0, pictures=False, budget=240))
     assert entry["proof"]["verdict"] == "certified", entry["proof"]
     ((_, _, _, _, verdict, bound, smallest, *times),) = table.table([entry]).rows
     assert (

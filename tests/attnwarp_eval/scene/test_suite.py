@@ -34,9 +34,9 @@ HARD = [
 # Reference results name these scenes by their content, so a change of the format must leave it
 # alone.
 CONTENT = {
-    "bear": "2a212860d0ae6abab2c330fc3c6e347c977316867887cb80ca1416d90b3424a8",
-    "fence": "27d870bed7391a4fedef54712586295bd5c0d4ef2ae7bd1d221e71f336cc7ca2",
-    "spheres": "0ef637ca87740f94ad3456a6a7d586d8e38391343b8044b5b06d169c28b5f0b5",
+    "bear": "1c1e03095740358fd737e13049f890e04c1740a1ba2e58af34c13046a93c02c4",
+    "fence": "cf89c30ba251005450e7531552e4e7e32e23c0960108f205211a9641998abd63",
+    "spheres": "33bd897d5f5f40242b7703e8872797d2751e840df3a58a7c743cd07b845bf08c",
 }
 
 

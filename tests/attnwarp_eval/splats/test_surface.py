@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from direct_light import direct
 from scipy.spatial import cKDTree
 
 from attnwarp_eval.colors import to_srgb
@@ -150,7 +151,8 @@ def test_the_same_seed_gives_the_same_splats_and_another_seed_others(scene, geom
 
 @pytest.mark.parametrize("name", ["bear", "fence"])
 def test_colours_are_those_of_rendered_views_that_see_the_splats(name):
-    scene = load_scene(name).with_size(128, 128)
+    # Splats have the colours of direct light.
+    scene = direct(name).with_size(128, 128)
     geometry = Geometry(scene)
     g = surface_splats(scene, "2d", 6000, geometry=geometry)
     camera = scene.source

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from direct_light import direct
 
 from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.effects import detect
 from attnwarp_eval.scene.base import linear_rgb
-from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.materials import DiffuseMaterial, PlasticMaterial
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SphereSpec
@@ -33,7 +33,8 @@ LARGE = 80  # pixels that a ball covers; on smaller ones a highlight is less tha
 
 @functools.lru_cache(maxsize=6)
 def world(name):
-    scene = load_scene(name).with_size(SIZE, SIZE)
+    # One bounce, so that the sun has a pass of its own.
+    scene = direct(name).with_size(SIZE, SIZE)
     return scene, Geometry(scene)
 
 

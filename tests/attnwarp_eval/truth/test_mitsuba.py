@@ -4,6 +4,7 @@ import importlib
 
 import numpy as np
 import pytest
+from direct_light import direct
 
 from attnwarp.camera import Camera
 from attnwarp_eval.scene.base import linear_rgb
@@ -125,7 +126,7 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
     # Catches textures that are flipped or turned in one of the two, shadows that fall elsewhere,
     # light counted twice.
     size, fine = 96, 3
-    scene = load_scene(name).with_size(size, size)
+    scene = direct(name).with_size(size, size)
     geometry, camera = Geometry(scene), scene.camera("yaw030")
     image = appearance(scene, camera, spp=36)
     dense = camera.resize(size * fine, size * fine)
@@ -205,7 +206,7 @@ def test_the_plan_follows_from_the_scene_and_says_why():
 
 def test_the_plan_of_one_bounce_and_a_path_tracer_of_one_bounce_agree():
     # The two passes add up to what one path-traced picture of all lights converges to.
-    scene = load_scene("fence").with_size(48, 48)
+    scene = direct("fence").with_size(48, 48)
     path = Plan((Pass((0, 1), "path", 2, 1, 1, 64),), ())
     reference = np.stack([mitsuba.render_plan(scene, scene.source, path, k) for k in range(4)])
     ours = np.stack(

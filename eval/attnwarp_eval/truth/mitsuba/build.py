@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 import tempfile
@@ -47,6 +48,19 @@ TEXEL_SIZE = 0.5
 """Size of a texel as a share of a pixel's footprint at the distance that the cameras keep from the
 middle.
 """
+
+
+@contextlib.contextmanager
+def at_most_texels(number: int) -> Iterator[None]:
+    """Bake textures of at most ``number`` texels along the longer side, for pictures so small that
+    more are never seen.
+    """
+    global TEXELS
+    former, TEXELS = TEXELS, min(number, TEXELS)
+    try:
+        yield
+    finally:
+        TEXELS = former
 
 
 def owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
