@@ -47,8 +47,9 @@ def describe(case, way, outcome):
 @pytest.mark.parametrize("case", CASES)
 def test_a_hard_case_holds_where_it_must(case):
     # Of every backend the way with the fewest digits, at the hardest level that must hold, and what
-    # must be refused.
-    ways = {way.backend: way for way in here(case) if way.direction == "forward"}
+    # must be refused. Gradients of splats have tests of their own.
+    first = case.ways[0].direction
+    ways = {way.backend: way for way in here(case) if way.direction == first}
     refused = [level for level in case.levels if case.must_refuse(level, here(case)[0])]
     for way in ways.values():
         for level in {case.required, *refused[:1]}:
@@ -80,7 +81,7 @@ def test_the_document_names_every_case_by_its_number_and_tests_that_there_are():
     root = Path(__file__).parents[3]
     text = (root / "docs/hard-cases.md").read_text("utf-8")
     rows = re.findall(r"^\| (\d+) \| [^|]+ \| ([^|]+) \| (.+) \|$", text, re.MULTILINE)
-    assert [int(number) for number, _, _ in rows] == list(range(1, 47))
+    assert [int(number) for number, _, _ in rows] == list(range(1, 55))
     for number, sweeps, held in rows:
         named = {case.name for case in hard_cases().values() if case.number == int(number)}
         assert named and set(re.findall(r"`(\w+)`", sweeps)) == named, number

@@ -87,7 +87,7 @@ def _outside(share: float, way: Way) -> float:
     )
 
 
-class _Unet(torch.nn.Module):
+class Unet(torch.nn.Module):
     """What hooks need of a UNet: an attention module by its name, called with latents and a
     timestep.
     """
@@ -102,23 +102,29 @@ class _Unet(torch.nn.Module):
             self.attn1.bias.copy_(values[:, -1])
 
     def forward(self, sample: torch.Tensor, timestep: float) -> torch.Tensor:
+        """(B, H W, C) tokens of (B, C, H, W) latents."""
         tokens: torch.Tensor = self.attn1(sample.flatten(2).transpose(1, 2))
         return tokens
 
 
-def one_view_tokens(count: int, way: Way) -> tuple[_Unet, torch.Tensor]:
+def one_view_tokens(count: int, way: Way) -> tuple[Unet, torch.Tensor]:
     """The network of ``one_view``, and (count + 1, C, H, W) latents: of the targets, and of the
     source.
     """
     generator = torch.Generator().manual_seed(1)
     shape = (count + 1, CHANNELS, SIZE, SIZE)
     latents = torch.randn(shape, generator=generator, dtype=torch.float64)
-    return _Unet(CHANNELS, way.dtype), latents.to(way.dtype)
+    return Unet(CHANNELS, way.dtype), latents.to(way.dtype)
 
 
-def exact_tokens(unet: _Unet, latents: torch.Tensor) -> Extended:
+def layer_weights(unet: Unet) -> tuple[Extended, Extended]:
+    """(C, C) matrix and (C,) bias of the layer."""
+    return extended(unet.attn1.weight), extended(unet.attn1.bias)
+
+
+def exact_tokens(unet: Unet, latents: torch.Tensor) -> Extended:
     """(B, H W, C) what the layer gives, in long double."""
-    weights, bias = (extended(value) for value in (unet.attn1.weight, unet.attn1.bias))
+    weights, bias = layer_weights(unet)
     values: Extended = extended(latents.flatten(2).transpose(1, 2)) @ weights.T + bias
     return values
 
