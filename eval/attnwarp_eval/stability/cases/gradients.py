@@ -279,7 +279,7 @@ CASES = [
             "backward": Bound(
                 STEPS,
                 lambda count: 0.5 + (count + 1) * 2.0**-14,
-                "rounded once, after as many sums in float32, each to 2^-14 steps of float16",
+                "rounded once, after as many sums in float32, each off by 2^-14 steps of float16",
             )
         },
         ways=HALF,
