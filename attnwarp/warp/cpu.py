@@ -230,7 +230,10 @@ class _BlendTokens(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             source = _scatter(upstream, ctx.taps, share.numpy(), ctx.shape)
         if ctx.needs_input_grad[1]:
-            own = (upstream * (1 - share)[:, None]).to(upstream.dtype)
+            # Not 1 - share: where a is almost 1, its rounding is a large part of the difference.
+            one = share.new_ones(())
+            rest = torch.where(ctx.mask, one * (1 - ctx.alpha), one)
+            own = (upstream * rest[:, None]).to(upstream.dtype)
         return source, own, None, None, None
 
 

@@ -132,10 +132,12 @@ def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
         taps: of N positions, with weights of :func:`work_type`, on the maps' device.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=maps.device)
+    # Converted before it is read: the gradient sums what reads a pixel in this type too, and is
+    # rounded once.
+    values = maps.to(total.dtype)
     for index, share in zip(taps.index, taps.weight, strict=True):
-        value = maps[..., index].to(total.dtype)
         # A tap of weight 0 may hold anything, an infinity included.
-        total = total + torch.where(share > 0, value * share, 0)
+        total = total + torch.where(share > 0, values[..., index] * share, 0)
     return total.to(maps.dtype)
 
 
@@ -147,9 +149,9 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
         taps: as in :func:`sample_maps`.
     """
     total = torch.zeros((), dtype=taps.weight.dtype, device=tokens.device)
+    values = tokens.to(total.dtype)  # as in sample_maps
     for index, share in zip(taps.index, taps.weight[..., None], strict=True):
-        value = tokens[:, index].to(total.dtype)
-        total = total + torch.where(share > 0, value * share, 0)
+        total = total + torch.where(share > 0, values[:, index] * share, 0)
     return total
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -306,6 +307,9 @@ def render_surface(
     """Depth, normals, alpha and colour of splats as ``settings`` wants them rendered, on the
     CPU.
 
+    Nothing nearer than the renderer's default near plane is drawn, or than a hundredth of the
+    splats' median distance where that is less: a world in small units has a surface too.
+
     Example:
         >>> import torch
         >>> from attnwarp import Camera, Gaussians
@@ -323,11 +327,21 @@ def render_surface(
     depth = settings.depth
     how = "peak" if depth == "intersection" and gaussians.kind == "3d" else depth
     with torch.no_grad():
-        seen = render(gaussians, camera, backend=backend, depth=how)
+        near = _near_plane(gaussians, camera)
+        seen = render(gaussians, camera, backend=backend, depth=how, near=near)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)
     )
+
+
+def _near_plane(gaussians: Gaussians, camera: Camera) -> float:
+    from attnwarp.render.constants import NEAR
+
+    if not len(gaussians):
+        return NEAR
+    distances = np.linalg.norm(gaussians.world_means() - camera.position, axis=1)
+    return min(NEAR, float(np.median(distances)) / 100)
 
 
 def _normal_rule(

@@ -15,7 +15,7 @@ import operator
 from collections.abc import Callable
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
@@ -268,6 +268,14 @@ def fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
     return kind(kind, kind, kind), codegen
 
 
+def _has_avx512(context: Any) -> bool:
+    """Whether numba compiles for a processor with AVX-512, which need not be this one: see
+    NUMBA_CPU_NAME, NUMBA_CPU_FEATURES and NUMBA_ENABLE_AVX.
+    """
+    _, _, features = context.codegen().magic_tuple()
+    return "+avx512f" in features.split(",")
+
+
 def _approach(builder: Any, x: Any, name: str) -> tuple[Any, Any]:
     """The processor's estimate, to 14 bits, of 1 / x ("rcp14") or of 1 / sqrt(x) ("rsqrt14"), with
     AVX-512; and the function that fuses a product and a sum."""
@@ -294,7 +302,7 @@ def reciprocal(typing: Any, x: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x, one = args[0], ir.Constant(args[0].type, [1.0] * args[0].type.count)
-        if not binding.get_host_cpu_features().get("avx512f"):
+        if not _has_avx512(context):
             return builder.fdiv(one, x)
         r, fused = _approach(builder, x, "rcp14")
         for _ in range(1 if x.type == FLOATS else 2):
@@ -312,7 +320,7 @@ def reciprocal_sqrt(typing: Any, x: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]
         one, half = (ir.Constant(DOUBLES, [value] * 8) for value in (1.0, 0.5))
-        if not binding.get_host_cpu_features().get("avx512f"):
+        if not _has_avx512(context):
             kind = ir.FunctionType(DOUBLES, [DOUBLES])
             return builder.fdiv(
                 one,
@@ -337,7 +345,7 @@ def approximate_sqrt(typing: Any, x: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         x = args[0]
-        if not binding.get_host_cpu_features().get("avx512f"):
+        if not _has_avx512(context):
             kind = ir.FunctionType(FLOATS, [FLOATS])
             return builder.call(
                 cgutils.get_or_insert_function(builder.module, kind, "llvm.sqrt.v16f32"), [x]

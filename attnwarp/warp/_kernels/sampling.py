@@ -27,6 +27,55 @@ PLANES = 8
 HALF, BRAIN = types.uint16, types.int16
 
 
+def _converts_half(context: Any) -> bool:
+    """Whether the processor that numba compiles for converts float16: all do but for x86 without
+    F16C. LLVM would call functions there that this process need not have.
+    """
+    triple, _, features = context.codegen().magic_tuple()
+    return not triple.startswith(("x86", "i686", "i386")) or "+f16c" in features.split(",")
+
+
+def _from_half(builder: Any, bits: Any) -> Any:
+    """float16 to float32, by integers; exact."""
+    word, number = ir.IntType(32), ir.FloatType()
+    wide = builder.zext(bits, word)
+    magnitude = builder.and_(wide, word(0x7FFF))
+    shifted = builder.shl(magnitude, word(13))
+    # Exponents are biased by 15 there and by 127 here.
+    normal = builder.add(shifted, word((127 - 15) << 23))
+    tiny = builder.fmul(builder.uitofp(magnitude, number), ir.Constant(number, 2.0**-24))
+    value = builder.select(
+        builder.icmp_unsigned("<", magnitude, word(0x400)), builder.bitcast(tiny, word), normal
+    )
+    endless = builder.or_(shifted, word(0x7F800000))
+    value = builder.select(builder.icmp_unsigned(">=", magnitude, word(0x7C00)), endless, value)
+    sign = builder.shl(builder.and_(wide, word(0x8000)), word(16))
+    return builder.bitcast(builder.or_(value, sign), number)
+
+
+def _to_half(builder: Any, value: Any) -> Any:
+    """float32 to float16 by integers, rounded to the nearest, ties to even."""
+    word, number = ir.IntType(32), ir.FloatType()
+    bits = builder.bitcast(value, word)
+    magnitude = builder.and_(bits, word(0x7FFFFFFF))
+    odd = builder.and_(builder.lshr(magnitude, word(13)), word(1))
+    rebiased = builder.sub(magnitude, word((127 - 15) << 23))
+    normal = builder.lshr(builder.add(rebiased, builder.add(odd, word(0xFFF))), word(13))
+    # A sum with 2^23 has no place for halves, so it is rounded as float16's last bit is.
+    scaled = builder.fmul(builder.bitcast(magnitude, number), ir.Constant(number, 2.0**24))
+    whole = builder.fadd(scaled, ir.Constant(number, 2.0**23))
+    tiny = builder.sub(builder.bitcast(whole, word), word(0x4B000000))
+    rounded = builder.select(
+        builder.icmp_unsigned("<", magnitude, word((127 - 14) << 23)), tiny, normal
+    )
+    large = builder.icmp_unsigned(">=", magnitude, word(0x47800000))
+    rounded = builder.select(large, word(0x7C00), rounded)
+    nan = builder.or_(word(0x7E00), builder.lshr(builder.and_(bits, word(0x7FFFFF)), word(13)))
+    rounded = builder.select(builder.icmp_unsigned(">", magnitude, word(0x7F800000)), nan, rounded)
+    sign = builder.and_(builder.lshr(bits, word(16)), word(0x8000))
+    return builder.trunc(builder.or_(rounded, sign), ir.IntType(16))
+
+
 def _from_brain(builder: Any, bits: Any) -> Any:
     word = ir.IntType(32)
     return builder.bitcast(builder.shl(builder.zext(bits, word), word(16)), ir.FloatType())
@@ -47,6 +96,8 @@ def _wide(typing: Any, value: Any) -> Any:
     """A stored value as a number: float64 of float64, float32 of all else."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if value == HALF and not _converts_half(context):
+            return _from_half(builder, args[0])
         if value == HALF:
             return builder.fpext(builder.bitcast(args[0], ir.HalfType()), ir.FloatType())
         return _from_brain(builder, args[0]) if value == BRAIN else args[0]
@@ -59,6 +110,8 @@ def _narrow(typing: Any, row: Any, value: Any) -> Any:
     """A number as ``row`` stores it, rounded to the nearest, ties to even."""
 
     def build(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        if row.dtype == HALF and not _converts_half(context):
+            return _to_half(builder, args[1])
         if row.dtype == HALF:
             return builder.bitcast(builder.fptrunc(args[1], ir.HalfType()), ir.IntType(16))
         return _to_brain(builder, args[1]) if row.dtype == BRAIN else args[1]

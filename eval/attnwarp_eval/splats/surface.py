@@ -22,6 +22,17 @@ Array = npt.NDArray[np.float64]
 CANDIDATES = 4
 """Random points drawn for each one that stays. Yuksel 2015 recommends 3 to 5."""
 
+PATCH = 1 / 4
+"""Longest edge of a patch, which has one density, in units of the focus."""
+
+FAR = 32.0
+"""Beyond this distance, in units of the focus, a patch's edge is at most an eighth of its distance
+instead, so that the density within it changes by a quarter: a plane out to 2,800 would have
+4,600,000,000 patches of one size. The scenes of the package reach out to 12, but for grazing."""
+
+MOST_CELLS = 10_000_000
+"""Cells of a sphere: about a gigabyte."""
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
@@ -206,7 +217,7 @@ def sample_surface(
     def weight(points: Array) -> Array:
         return 1 / (1 + ((points - center) ** 2).sum(-1) / focus**2)
 
-    corners, flat_id = _split(*geometry.flat_patches(), limit=focus / 4)
+    corners, flat_id = _split(*geometry.flat_patches(), center, focus)
     edge_a, edge_b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(edge_a, edge_b)
     area = np.linalg.norm(normal, axis=-1) / 2
@@ -216,7 +227,7 @@ def sample_surface(
     # Spheres in cells of equal area: z and longitude are independent and uniform on a sphere
     # (Archimedes).
     sphere_center, radius, sphere_id = geometry.spheres()
-    cells = [_sphere_cells(c, r, focus / 4) for c, r in zip(sphere_center, radius, strict=True)]
+    cells = [_sphere_cells(r, focus * PATCH) for r in radius]
     cell_sphere = np.repeat(np.arange(len(cells)), [len(c[0]) for c in cells]).astype(np.int64)
     cell_low = np.concatenate([c[0] for c in cells] or [np.zeros((0, 2))])
     cell_size = np.concatenate([c[1] for c in cells] or [np.zeros((0, 2))])
@@ -258,15 +269,16 @@ def sample_surface(
 
 
 def _split(
-    corners: Array, ids: npt.NDArray[np.int64], limit: float
+    corners: Array, ids: npt.NDArray[np.int64], center: Array, focus: float
 ) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Triangles cut into four until no edge is longer than ``limit``, so that a patch has one
-    density.
+    """Triangles cut into four until they are small (:data:`PATCH`, :data:`FAR`), so that a patch
+    has one density.
     """
     done, done_ids = [], []
     while len(corners):
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
-        small = longest <= limit
+        nearest = np.linalg.norm(corners.mean(axis=1) - center, axis=-1) - longest
+        small = longest <= np.where(nearest < FAR * focus, PATCH * focus, nearest / 8)
         done.append(corners[small])
         done_ids.append(ids[small])
         a, b, c = (corners[~small, k] for k in range(3))
@@ -277,9 +289,16 @@ def _split(
     return np.concatenate(done or [corners]), np.concatenate(done_ids or [ids])
 
 
-def _sphere_cells(center: Array, radius: float, limit: float) -> tuple[Array, Array]:
+def _sphere_cells(radius: float, limit: float) -> tuple[Array, Array]:
     rows = max(4, int(np.ceil(np.pi * radius / limit)))
     columns = 2 * rows
+    if rows * columns > MOST_CELLS:
+        raise ValueError(
+            f"focus: got {limit / PATCH:g} for a sphere of radius {radius:g}, which makes"
+            f" {rows * columns:,} cells of {limit:g}; expected at most {MOST_CELLS:,}: give a focus"
+            f" of at least {np.pi * radius / PATCH / np.sqrt(MOST_CELLS / 2):.3g}, or bring the"
+            " cameras further out"
+        )
     z, phi = np.meshgrid(
         np.linspace(-1, 1, rows + 1)[:-1], np.linspace(0, 2 * np.pi, columns + 1)[:-1]
     )

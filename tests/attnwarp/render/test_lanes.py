@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -43,6 +46,37 @@ def test_estimates_made_better_and_sums_in_another_order() -> None:
         a, b, c, d = x[16:].reshape(4, 16).sum(axis=1, dtype=float)
         assert y[32:48] == pytest.approx([a, b, c, d, b, c, d, a, c, d, a, b, d, a, b, c], rel=1e-6)
         assert y[48:] == pytest.approx([a, b, c, d, d, c, b, a] * 2, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["NUMBA_CPU_NAME=generic", "NUMBA_ENABLE_AVX=0"])
+def test_another_processor_than_this_one_gets_no_instructions_that_it_lacks(target: str) -> None:
+    name, value = target.split("=")
+    program = """
+import numba
+import numpy as np
+from attnwarp.render._kernels import lanes
+
+@numba.njit
+def work(x, y, z):
+    lanes.store(y, 0, lanes.reciprocal(lanes.load(x, 0)))
+    lanes.store(y, 16, lanes.approximate_sqrt(lanes.load(x, 0)))
+    lanes.store8(z, 8, lanes.reciprocal_sqrt(lanes.load8(z, 0)))
+
+x, y, z = np.linspace(1, 2, 16).astype(np.float32), np.zeros(32, np.float32), np.linspace(1, 2, 16)
+exact = x.astype(float)
+root = np.sqrt(z[:8])
+work(x, y, z)
+assert abs(y[:16] * exact - 1).max() < 2e-7
+assert abs(y[16:] / np.sqrt(exact) - 1).max() < 1.4e-4
+assert abs(z[8:] * root - 1).max() < 1e-15
+assert "zmm" not in "".join(work.inspect_asm().values())
+"""
+    environment = {**os.environ, name: value}
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr[-500:]
 
 
 def test_eight_float64_to_the_last_bits() -> None:

@@ -6,6 +6,9 @@ masks must be equal, but where a rule lies within rounding of its threshold.
 
 import dataclasses
 import itertools
+import os
+import subprocess
+import sys
 
 import mpmath
 import numpy as np
@@ -307,3 +310,53 @@ def test_the_door_says_what_came_and_what_was_expected(changes, message):
         warp_surfaces(camera, camera, dataclasses.replace(good, **changes), good, EVERYTHING)
     with pytest.raises(ValueError, match=r"backend: got 'numba', expected one of 'auto'"):
         warp_surfaces(camera, camera, good, good, backend="numba")
+
+
+@pytest.mark.slow
+def test_half_precision_is_rounded_as_by_numpy_where_the_processor_converts_none():
+    program = """
+import numba
+import numpy as np
+
+from attnwarp.warp._kernels import sampling
+
+
+@numba.njit
+def widen(bits, values):
+    for k in range(bits.size):
+        values[k] = sampling._wide(bits[k])
+
+
+@numba.njit
+def narrow(values, bits):
+    for k in range(values.size):
+        bits[k] = sampling._narrow(bits, values[k])
+
+
+bits = np.arange(1 << 16, dtype=np.uint16)
+values = np.empty(bits.size, np.float32)
+widen(bits, values)
+exact = bits.view(np.float16).astype(np.float32)
+assert ((values.view(np.uint32) == exact.view(np.uint32)) | np.isnan(exact)).all()
+assert (np.isnan(values) == np.isnan(exact)).all()
+
+finite = np.sort(exact[np.isfinite(exact)])
+between = (finite[1:] + finite[:-1]) / 2  # exact: ties
+up, down = (np.nextafter(between, np.float32(end)) for end in (np.inf, -np.inf))
+ends = np.float32([65519.996, 65520, 65536, 1e30, np.inf, -np.inf, np.nan, 1e-45, 2.0**-25, -0.0])
+values = np.concatenate([finite, between, up, down, ends])
+result = np.empty(values.size, np.uint16)
+narrow(values, result)
+with np.errstate(over="ignore"):
+    expected = values.astype(np.float16)
+undefined = np.isnan(expected)
+assert (np.isnan(result.view(np.float16)) == undefined).all()
+assert (result == expected.view(np.uint16))[~undefined].all()
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "NUMBA_CPU_NAME": "generic"},
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stderr[-500:]

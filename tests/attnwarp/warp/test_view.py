@@ -7,7 +7,7 @@ import pytest
 import torch
 from closed_forms import faces, orbit, plane_depth, shell, sphere
 
-from attnwarp import Camera
+from attnwarp import Camera, Gaussians
 from attnwarp.warp.depth import resize_depth
 from attnwarp.warp.rules import (
     gaussian_filter,
@@ -56,6 +56,31 @@ def test_the_scale_of_the_scene_changes_no_rule(scale):
         assert (rule != there.rules[name]).sum() <= 1, name
     assert not here.rules["depth_agrees"].all()
     assert here.mask.sum() > 1000
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_a_world_in_millimetres_has_the_depth_of_its_plane(backend):
+    # All of it lies before the renderer's default near plane of 0.01. The cameras stand side by
+    # side before a facing disc at depth 0.003, a millimetre wide: 25 px.
+    K = np.array([[75.0, 0, 16], [0, 75.0, 16], [0, 0, 1]])
+    beside = np.eye(4)
+    beside[0, 3] = 2 * 0.003 / 75  # 2 px at that depth
+    target, source = Camera(K, np.eye(4), 32, 32), Camera(K, beside, 32, 32)
+    disc = Gaussians(
+        "2d",
+        torch.tensor([[0, 0, 0.003]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 2), 5e-4),
+        torch.full((1,), 0.99),
+        torch.zeros(1, 1, 3),
+    )
+    surface = render_surface(disc, target, backend=backend)
+    middle = (slice(12, 20), slice(12, 20))
+    assert surface.depth[middle].numpy() == pytest.approx(0.003, rel=1e-6)
+    view = warp_view(disc, source, target, backend=backend)
+    expected = target.pixel_centers()[middle] + [2.0, 0]
+    assert np.abs(view.correspondence.xy[middle].numpy() - expected).max() < 1e-4
+    assert view.mask[middle].all()
 
 
 def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():

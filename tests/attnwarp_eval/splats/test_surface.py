@@ -66,6 +66,28 @@ def test_the_density_falls_from_the_middle_outward_as_documented():
     assert np.allclose(s.spacing**-2, density / (1 + (r / 1.5) ** 2), rtol=0.02)
 
 
+def test_a_plane_to_the_horizon_is_sampled_by_its_density():
+    # Patches of a quarter of the focus would be 200 million.
+    plane = Rectangle(np.array([1000.0, 0, 0]), np.array([900.0, 0, 0]), np.array([0, 900.0, 0]))
+    s = sample_surface(Geometry([plane]), 2000, center=(0, 0, 0), focus=1.0, seed=0)
+    x = 100 + (np.arange(1800) + 0.5)
+    # Of 1 / (1 + r^2) over y from -900 to 900.
+    reach = np.sqrt(1 + x**2)
+    mass = 2 * np.arctan(900 / reach) / reach
+    edges = np.array([100, 200, 400, 800, 1900])
+    share, _ = np.histogram(x, edges, weights=mass / mass.sum())
+    count, _ = np.histogram(s.point[:, 0], edges)
+    assert np.allclose(count / 2000, share, atol=0.015)
+
+
+def test_a_sphere_that_takes_too_many_cells_is_refused_with_what_to_do():
+    planet = Sphere(np.array([0.0, 0, -6e6]), 6e6)
+    with pytest.raises(
+        ValueError, match="focus: got 1 for a sphere of radius 6e.06.*at least 3.37e"
+    ):
+        sample_surface(Geometry([planet]), 100, center=(0, 0, 0), focus=1.0, seed=0)
+
+
 def _mass(focus, half):
     x = (np.arange(800) + 0.5) / 800 * 2 * half - half
     return (1 / (1 + (x[:, None] ** 2 + x**2) / focus**2)).sum() * (2 * half / 800) ** 2

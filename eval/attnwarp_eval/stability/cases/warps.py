@@ -30,6 +30,7 @@ from attnwarp.warp import (
 from attnwarp.warp.features import Backend
 from attnwarp_eval.stability.case import Bound, Case, Way, exact, ways
 from attnwarp_eval.stability.closed_forms import orbit, plane_depth, sphere
+from attnwarp_eval.stability.visibility import Labels, exact_labels
 
 DIGITS = 60
 
@@ -67,6 +68,9 @@ BOUNDS_ONLY = WarpSettings.from_dict(
     }
 )
 """Positions alone: no rule needs a surface."""
+
+SCALED_RULES = preset("corrected", depth_relative=1e-4)
+"""Every rule, with the tolerance of exact depth."""
 
 
 def positions(pair: Pair, way: Way) -> Correspondence:
@@ -317,34 +321,54 @@ def _opposed(yaw: float, way: Way) -> float:
     return float((view.mask.numpy() & hidden).sum())
 
 
-def _scaled_rules(exponent: float, way: Way) -> float:
-    """Pixels whose label by any rule changes with the unit."""
-    scale = 2.0**exponent
-
-    def surface(camera: Camera, size: float) -> Surface:
+def _rules_of_scale(exponent: float, way: Way) -> tuple[tuple[Camera, Surface], ...]:
+    """Source and target, each with what it sees: a sphere before a wall, in other units, with a
+    hole in each depth map.
+    """
+    size = 2.0**exponent
+    views = []
+    for camera in (orbit(0, height=1, size=48), orbit(40, height=1, size=48)):
         depth, normal = sphere(camera)
         wall = plane_depth(camera, (1, 0, 0), -1.5)
         on = ~(depth > np.nan_to_num(wall, nan=np.inf)) & np.isfinite(depth)
-        z = size * np.where(on, depth, wall)
-        return Surface(
-            torch.from_numpy(z.astype(way.numpy)), np.where(on[..., None], normal, [1.0, 0, 0])
-        )
+        z = size * np.where(on, depth, wall).astype(way.numpy).astype(np.float64)
+        z[20:26, 8:14] = np.nan
+        stored = torch.from_numpy(z.astype(way.numpy))
+        surface = Surface(stored, np.where(on[..., None], normal, [1.0, 0, 0]))
+        views.append((_in_units(camera, size), surface))
+    return tuple(views)
 
-    source, target = orbit(0, height=1, size=48), orbit(40, height=1, size=48)
-    views = [
-        warp_surfaces(
-            _in_units(source, size),
-            _in_units(target, size),
-            surface(target, size),
-            surface(source, size),
-            preset("corrected", depth_relative=1e-4),
-            backend=engine_of(way),
-        )
-        for size in (1.0, scale)
-    ]
-    return float(
-        sum(int((rule != views[1].rules[name]).sum()) for name, rule in views[0].rules.items())
+
+@cache
+def _labels_of_rules(precision: str) -> Labels:
+    """Of the scene in its own units. Each rule compares lengths with lengths and shares with
+    shares, and a power of two scales lengths exactly: in any units the labels are these.
+    """
+    (source, seen), (target, surface) = _rules_of_scale(0, Way("reference", precision))
+    return exact_labels(
+        source,
+        target,
+        np.asarray(seen.depth),
+        np.asarray(surface.depth),
+        np.asarray(surface.normal),
+        relative=SCALED_RULES.depth_relative,
+        slope=SCALED_RULES.depth_slope,
+        spread=float(SCALED_RULES.depth_spread or np.inf),
     )
+
+
+def _scaled_rules(exponent: float, way: Way) -> float:
+    """Pixels whose label by any rule is not the exact one."""
+    (source, seen), (target, surface) = _rules_of_scale(exponent, way)
+    backend = engine_of(way)
+    view = warp_surfaces(source, target, surface, seen, SCALED_RULES, backend=backend)
+    exact_rules = _labels_of_rules(way.precision)
+    # Nothing has an alpha here, so every pixel is opaque.
+    wrong = int((~view.rules["opaque"]).sum())
+    for name, expected in exact_rules.rules.items():
+        differs = view.rules[name].numpy() != expected
+        wrong += int((differs & ~exact_rules.undecided[name]).sum())
+    return float(wrong)
 
 
 def _angle(near: float) -> Callable[[float, Way], float]:
@@ -583,15 +607,16 @@ CASES = [
         10,
         "scene_scale_rules",
         "The rules of visibility in a world in other units",
-        input="a sphere before a wall, so that every rule rejects something",
-        oracle="the labels at scale 1",
+        input="a sphere before a wall, holes in both depth maps; four rules reject something",
+        oracle="each rule's definition in long double, in the scene's own units",
         hardness="log2 of the scale",
         levels=(0, -20, 20, -60, 60, -100, 100, -120, 120, -300, 300),
         required=100,
-        quick=(-60, 60),
-        bounds={"forward": exact("changed labels", "a power of two rounds nothing")},
+        quick=(0, -60, 60),
+        bounds={"forward": exact("wrong labels", "a power of two rounds nothing")},
         ways=WARPS,
         measure=_scaled_rules,
+        version=2,
         limit="a float32 depth of 2^-300 is 0, and one of 2^300 infinite",
     ),
     Case(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import ClassVar
 
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
-from attnwarp_eval.document.model import Table
+from attnwarp_eval.document.model import Finding, Section, Table
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probes import register
-from attnwarp_eval.study.probes.base import Probe, Work, mean_values, metrics_of
+from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, mean_values, metrics_of
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study, Variant
@@ -83,6 +83,35 @@ class Depth(Probe[NoExtra]):
                 )
             work.add(name, figures, partial(pictures.of_depth, surface, hits))
         return NoExtra()
+
+    def findings(self, results: Results) -> Iterator[Finding]:
+        """Views without any depth: in tables their figures are dashes, which do not say why."""
+        sentence, count = self._without_depth(results)
+        if sentence:
+            yield Finding(sentence, count, "their `depth.coverage` is 0", "fails")
+
+    def sections(self, results: Results, layout: Layout) -> Iterator[tuple[Place, Section]]:
+        """The same in words; none where every view has a depth."""
+        sentence, count = self._without_depth(results)
+        if sentence:
+            yield Place.RESULT, Section("Views without depth", [f"{sentence} That is {count}."])
+
+    def _without_depth(self, results: Results) -> tuple[str, str]:
+        """A sentence that names them, and how many there are; both empty where there are none."""
+        empty, views, places = 0, 0, []
+        for cell, record in results.finished(self.name):
+            names = [v.name for v in record.views if v.metrics.get("depth.coverage") == 0]
+            empty, views = empty + len(names), views + len(record.views)
+            if names:
+                which = "every view" if len(names) == len(record.views) else ", ".join(names)
+                places.append(f"{cell.scene} / {cell.variants[0]} ({which})")
+        if not empty:
+            return "", ""
+        listed = "; ".join(dict.fromkeys(places))
+        return (
+            f"No splat is drawn on any surface, so depth is undefined, in {listed}.",
+            f"{empty} of {views} views",
+        )
 
     def details(self, results: Results, names: Sequence[str]) -> list[Table]:
         """Inside surfaces and at edges apart."""

@@ -358,6 +358,8 @@ def _figures(swept: Sequence[Swept], layout: Layout) -> Section:
 
 def _panel(axes: Any, swept: Sequence[Swept]) -> None:
     hard = swept[0].case
+    # Where a case has values and gradients, the legend names the values.
+    named = swept[0].way.direction
     levels = [outcome.level for outcome in swept[0].outcomes]
     sides = list(dict.fromkeys((s.way.backend, s.way.precision) for s in swept))
     for sweep in swept:
@@ -374,7 +376,7 @@ def _panel(axes: Any, swept: Sequence[Swept]) -> None:
             marker=charts.MARKERS[index],
             markersize=3 if forward else 2,
             linewidth=1,
-            label=" ".join(side) if forward else None,
+            label=" ".join(side) if sweep.way.direction == named else None,
         )
         refused = [place for place, o in zip(x, sweep.outcomes, strict=True) if o.refusal]
         axes.plot(refused, [DECADES] * len(refused), "x", color=charts.PALETTE[index], markersize=5)

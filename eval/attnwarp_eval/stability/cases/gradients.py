@@ -1,0 +1,378 @@
+"""Hard cases of gradients: through warped features, blended tokens and injected attention."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import torch
+
+from attnwarp.camera import Camera
+from attnwarp.editing.attention import Layer, RecordingPlan, constant, inject, record
+from attnwarp.warp import Correspondence, FeatureWarp, Surface, preset, warp_surfaces
+from attnwarp_eval.stability.bilinear import Extended, extended, sampling_matrix
+from attnwarp_eval.stability.case import Bound, Case, Way
+from attnwarp_eval.stability.cases.editing import Unet, layer_weights
+from attnwarp_eval.stability.cases.warps import HALVES, engine_of, random_features
+from attnwarp_eval.stability.closed_forms import orbit
+
+SIZE = 16
+CHANNELS = 3
+
+
+def backward(*precisions: str) -> tuple[Way, ...]:
+    """Gradients by the definition in torch and by the kernels."""
+    return tuple(
+        Way(backend, precision, "backward")
+        for backend in ("reference", "cpu")
+        for precision in precisions
+    )
+
+
+WHOLE, HALF = backward("float64", "float32"), backward(*HALVES)
+
+
+def _camera(height: int, width: int) -> Camera:
+    """Whose grid is all that a warp takes of it."""
+    return orbit(0, size=height, width=width)
+
+
+def _warp(xy: torch.Tensor, size: tuple[int, int], way: Way) -> FeatureWarp:
+    """The warp of positions (H, W, 2) on a source grid of ``size``."""
+    target, source = _camera(*xy.shape[:2]), _camera(*size)
+    points, depth = torch.zeros(*xy.shape[:2], 3).double(), torch.ones(xy.shape[:2]).double()
+    result = Correspondence(source, target, xy, points, depth)
+    return FeatureWarp(result, result.defined, engine_of(way))
+
+
+def _shifted(share: float) -> torch.Tensor:
+    """Pixel centres moved by a share of a pixel along both axes; those of the last two rows and
+    columns are NaN, so that no position lies beyond the border.
+    """
+    xy = torch.from_numpy(_camera(SIZE, SIZE).pixel_centers()) + share
+    xy[-2:] = torch.nan
+    xy[:, -2:] = torch.nan
+    return xy
+
+
+def steps_between(result: torch.Tensor, expected: Extended, way: Way) -> float:
+    """The largest error in steps of the type; where a value is subnormal its step is that of the
+    smallest normal number. Where nothing is expected a 0 must come.
+    """
+    kind = torch.finfo(way.dtype)
+    values = extended(result).reshape(expected.shape)
+    if not np.isfinite(values).all() or (values[expected == 0] != 0).any():
+        return math.inf
+    step = kind.eps * np.maximum(np.abs(expected), kind.smallest_normal)
+    return float((np.abs(values - expected) / step).max(initial=0.0))
+
+
+def _of_maps(
+    warp: FeatureWarp, features: torch.Tensor, upstream: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gradients (C, h w) in the features (C, h, w), sampled as maps and as tokens.
+
+    Args:
+        upstream: (C, H, W) gradient in what is warped.
+    """
+    leaves = [features.clone().requires_grad_() for _ in range(2)]
+    warp.warp(leaves[0]).backward(upstream)
+    tokens = warp.warp_tokens(leaves[1].flatten(1).T[None])
+    tokens.backward(upstream.flatten(1).T[None].contiguous())
+    maps, rows = (leaf.grad for leaf in leaves)
+    assert maps is not None and rows is not None
+    return maps.flatten(1), rows.flatten(1)
+
+
+def _gradient_error(
+    xy: torch.Tensor, size: tuple[int, int], upstream: torch.Tensor, way: Way
+) -> float:
+    """Of features of which those that no position reads are infinite or NaN; the gradient in what
+    has no position is NaN.
+    """
+    shares = sampling_matrix(extended(xy), *size)
+    undefined = torch.isnan(xy).any(-1)
+    expected = extended(torch.where(undefined, 0, upstream)).reshape(CHANNELS, -1) @ shares
+    features = random_features((CHANNELS, *size), way, seed=3)
+    unread = torch.from_numpy(~(shares > 0).any(0).reshape(size))
+    features[:, unread] = torch.nan
+    features[0, unread] = torch.inf
+    upstream = torch.where(undefined, torch.nan, upstream)
+    results = _of_maps(_warp(xy, size, way), features, upstream)
+    return max(steps_between(result, expected, way) for result in results)
+
+
+def _taps(share: float, way: Way) -> float:
+    upstream = random_features((CHANNELS, SIZE, SIZE), way, seed=4)
+    return _gradient_error(_shifted(share), (SIZE, SIZE), upstream, way)
+
+
+def _magnitude(magnitude: float, way: Way) -> float:
+    upstream = random_features((CHANNELS, SIZE, SIZE), way, seed=4, magnitude=magnitude)
+    return _gradient_error(_shifted(0.375), (SIZE, SIZE), upstream, way)
+
+
+def _holes(share: float, way: Way) -> float:
+    xy = _shifted(0.375)
+    chosen = np.random.default_rng(0).permutation(SIZE**2)[: round(SIZE**2 * share)]
+    xy.reshape(-1, 2)[torch.from_numpy(chosen)] = torch.nan
+    upstream = random_features((CHANNELS, SIZE, SIZE), way, seed=4)
+    return _gradient_error(xy, (SIZE, SIZE), upstream, way)
+
+
+def _readers(count: float, way: Way) -> float:
+    """Of the four inner pixels of 4 x 4, which share all positions."""
+    generator = torch.Generator().manual_seed(5)
+    xy = 1.5 + torch.rand(int(count), 1, 2, generator=generator, dtype=torch.float64)
+    upstream = random_features((CHANNELS, int(count), 1), way, seed=4, magnitude=1 / count)
+    return _gradient_error(xy, (4, 4), upstream, way)
+
+
+def _blend_error(layer: FeatureWarp, weight: float, way: Way, upstream: torch.Tensor) -> float:
+    """Of the gradients in source and target tokens of a blend."""
+    source, new = (
+        values[None].clone().requires_grad_()
+        for values in random_features((2, SIZE**2, CHANNELS), way, seed=6)
+    )
+    layer.blend_tokens(source, new, weight).backward(upstream[None])
+    assert source.grad is not None and new.grad is not None
+    share = np.longdouble(weight) * layer.mask.numpy().reshape(-1, 1)
+    shares = sampling_matrix(extended(layer.correspondence.xy), SIZE, SIZE)
+    gradient = extended(upstream)
+    return max(
+        steps_between(source.grad, shares.T @ (share * gradient), way),
+        steps_between(new.grad, (1 - share) * gradient, way),
+    )
+
+
+def _half_masked(share: float, way: Way) -> FeatureWarp:
+    """A layer whose mask holds a share of the tokens that have a position."""
+    layer = _warp(_shifted(0.375), (SIZE, SIZE), way)
+    chosen = np.random.default_rng(0).permutation(SIZE**2)[: round(SIZE**2 * share)]
+    mask = torch.zeros(SIZE**2, dtype=torch.bool)
+    mask[torch.from_numpy(chosen)] = True
+    return FeatureWarp(layer.correspondence, mask.reshape(SIZE, SIZE) & layer.mask, layer.backend)
+
+
+def _blend_weight(weight: float, way: Way) -> float:
+    upstream = random_features((SIZE**2, CHANNELS), way, seed=4)
+    return _blend_error(_half_masked(0.5, way), weight, way, upstream)
+
+
+def _mask(share: float, way: Way) -> float:
+    upstream = random_features((SIZE**2, CHANNELS), way, seed=4)
+    return _blend_error(_half_masked(share, way), 1.0, way, upstream)
+
+
+def _near_equal_depth(gap: float, way: Way) -> float:
+    """Of a blend at a = 1 where the source sees a wall before the target's by a share of its
+    depth; the cameras stand side by side.
+    """
+    K = np.array([[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[0, 3] = 4 * 0.375 / 20  # 0.375 px at depth 4
+    source, target = Camera(K, pose, SIZE, SIZE), Camera(K, np.eye(4), SIZE, SIZE)
+    normal = np.broadcast_to([0.0, 0, -1], (SIZE, SIZE, 3))
+    kind = np.dtype("float32" if way.precision == "float32" else "float64")
+    depths = [np.full((SIZE, SIZE), z).astype(kind) for z in (4 * (1 - gap), 4)]
+    settings = preset("corrected", depth_relative=1e-4)
+    seen, own = (Surface(torch.from_numpy(depth), normal) for depth in depths)
+    view = warp_surfaces(source, target, own, seen, settings, backend=engine_of(way))
+    before, behind = (Fraction(float(depth[0, 0])) for depth in depths)
+    agrees = behind - before <= Fraction(settings.depth_relative) * behind
+    layer = view.at((SIZE, SIZE))
+    inside = layer.correspondence.xy[..., 0] <= SIZE
+    if not torch.equal(layer.mask, inside & agrees):
+        return math.inf
+    return _blend_error(layer, 1.0, way, random_features((SIZE**2, CHANNELS), way, seed=4))
+
+
+def _injected(weight: float, way: Way) -> float:
+    """Of the gradient in a target's latents, through a layer into which features are injected, in
+    steps of the type at the sum of magnitudes; a token that is replaced whole must have none.
+    """
+    unet = Unet(CHANNELS, way.dtype)
+    layer = Layer("attn1", "self", 0, CHANNELS)
+    latents = random_features((2, CHANNELS, SIZE, SIZE), way, seed=7)
+    upstream = random_features((SIZE**2, CHANNELS), way, seed=4)
+    warp = _half_masked(0.5, way)
+    plan = RecordingPlan((layer,), (SIZE, SIZE), ("text",), ("text",), 1, dtype=way.dtype)
+    with torch.no_grad(), record(unet, plan) as recording:
+        unet(latents[:1], 0.0)
+    target = latents[1:].clone().requires_grad_()
+    with inject(unet, recording, branches=("text",), warps=[_At(warp)], weight=constant(weight)):
+        unet(target, 0.0).backward(upstream[None])
+    assert target.grad is not None
+    share = 1 - np.longdouble(weight) * warp.mask.numpy().reshape(-1, 1)
+    matrix, gradient = layer_weights(unet)[0], share * extended(upstream)
+    errors = np.abs(extended(target.grad[0].flatten(1)).T - gradient @ matrix)
+    magnitudes = np.abs(gradient) @ np.abs(matrix)
+    if not np.isfinite(errors).all() or (errors[magnitudes == 0] != 0).any():
+        return math.inf
+    some = magnitudes > 0
+    return float((errors[some] / magnitudes[some]).max(initial=0.0) / torch.finfo(way.dtype).eps)
+
+
+class _At:
+    """A layer's warp where :func:`attnwarp.editing.attention.inject` asks for a view's."""
+
+    def __init__(self, layer: FeatureWarp) -> None:
+        self.layer = layer
+
+    def at(
+        self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
+    ) -> FeatureWarp:
+        """The one layer."""
+        return self.layer
+
+
+STEPS = "steps of the type"
+ROUNDED_ONCE = Bound(STEPS, 0.51, "summed in float32, rounded once to half precision")
+# Each rounding is at most half a step of the sum, all of whose terms are positive. In float64 the
+# share 1 - f is rounded on each axis, and their product; float32 rounds them once, from float64.
+# Then come the product with the gradient, and the sum of at most four.
+WARPED = Bound(STEPS, 3.5, "three roundings of a weight, one of its product, three of the sum")
+BLENDED = Bound(STEPS, 4, "as for a warp, and the product with a")
+
+CASES = [
+    Case(
+        47,
+        "gradient_of_taps",
+        "Gradients of features read near the centres of pixels",
+        input="positions beside pixel centres; what no position reads is NaN or infinite",
+        oracle="the transpose of the hat functions in long double",
+        hardness="distance from the centre, px",
+        levels=(0.5, 0.1, 1e-3, 1e-6, 1e-8, 0),
+        required=0,
+        quick=(0.5, 1e-6, 0),
+        bounds={"backward": WARPED},
+        ways=WHOLE,
+        measure=_taps,
+    ),
+    Case(
+        48,
+        "half_gradient",
+        "Gradients of warped features in half precision",
+        input="gradients between half of a magnitude and the whole",
+        oracle="the transpose of the hat functions in long double",
+        hardness="magnitude",
+        levels=(1e-3, 1, 1e2, 1e4, 6e4, 1e30),
+        required=6e4,
+        quick=(1, 6e4),
+        bounds={"backward": ROUNDED_ONCE},
+        ways=HALF,
+        measure=_magnitude,
+        limit="1e30 has no float16",
+    ),
+    Case(
+        49,
+        "many_readers",
+        "Gradients of a pixel that many positions read",
+        input="positions between four pixels, whose gradients sum to less than 1",
+        oracle="the transpose of the hat functions in long double",
+        hardness="positions",
+        levels=(1, 4, 16, 64, 256, 1024, 4096),
+        required=4096,
+        quick=(16, 4096),
+        bounds={
+            "backward": Bound(
+                STEPS,
+                lambda count: 0.5 + (count + 1) * 2.0**-14,
+                "rounded once, after as many sums in float32, each off by 2^-14 steps of float16",
+            )
+        },
+        ways=HALF,
+        measure=_readers,
+    ),
+    Case(
+        50,
+        "gradient_of_holes",
+        "Gradients of features where positions are NaN",
+        input="positions of which some are NaN; the gradient that comes to those is NaN",
+        oracle="the transpose of the hat functions in long double",
+        hardness="share of positions that are NaN",
+        levels=(0, 0.1, 0.5, 0.9, 1),
+        required=1,
+        quick=(0.5, 1),
+        bounds={"backward": WARPED},
+        ways=WHOLE + HALF,
+        measure=_holes,
+    ),
+    Case(
+        51,
+        "blend_gradient",
+        "Gradients of blends whose weight goes to 0 and 1",
+        input="tokens of a 16 x 16 layer, half of them in the mask",
+        oracle="a M and 1 - a M, and the transpose of the hat functions, in long double",
+        hardness="a",
+        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
+        required=0,
+        quick=(0.5, 0.999999, 1, 0),
+        bounds={"backward": BLENDED},
+        ways=WHOLE,
+        measure=_blend_weight,
+    ),
+    Case(
+        51,
+        "half_blend_gradient",
+        "Gradients of blends in half precision whose weight goes to 0 and 1",
+        input="tokens of a 16 x 16 layer, half of them in the mask",
+        oracle="a M and 1 - a M, and the transpose of the hat functions, in long double",
+        hardness="a",
+        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
+        required=0,
+        quick=(0.5, 0.999999, 1, 0),
+        bounds={"backward": ROUNDED_ONCE},
+        ways=HALF,
+        measure=_blend_weight,
+    ),
+    Case(
+        52,
+        "gradient_of_masks",
+        "Gradients under masks of a few tokens, and of none",
+        input="tokens of a 16 x 16 layer, blended at a = 1",
+        oracle="M and 1 - M, and the transpose of the hat functions, in long double",
+        hardness="share of tokens in the mask",
+        levels=(1, 0.5, 0.1, 0.01, 0.004, 0),
+        required=0,
+        quick=(0.5, 0),
+        bounds={"backward": BLENDED},
+        ways=WHOLE + HALF,
+        measure=_mask,
+    ),
+    Case(
+        53,
+        "gradient_near_equal_depth",
+        "Gradients where one surface hides another that almost touches it",
+        input="a wall before the target's, seen by the source; blended at a = 1",
+        oracle="the agreement of depths in fractions, and the transpose of the hat functions",
+        hardness="gap, share of the depth",
+        levels=(0.1, 1e-2, 1e-3, 2e-4, 1.01e-4, 9.9e-5, 1e-5, 1e-9, 0),
+        required=0,
+        quick=(1e-2, 1.01e-4, 9.9e-5, 0),
+        bounds={"backward": BLENDED},
+        ways=WHOLE + HALF,
+        measure=_near_equal_depth,
+    ),
+    Case(
+        54,
+        "injected_gradient",
+        "Gradients through injected attention features",
+        input="latents of a layer whose features are replaced in half of the tokens",
+        oracle="(1 - a M) times the layer's matrix, in long double",
+        hardness="a",
+        levels=(0.5, 0.9, 0.1, 0.999999, 1e-6, 1e-12, 1, 0),
+        required=0,
+        quick=(0.5, 1, 0),
+        bounds={
+            "backward": Bound(
+                "steps of the type at the sum of magnitudes",
+                2.5,
+                "1 - a, its product, the product with the matrix, the sum of three channels",
+            )
+        },
+        ways=WHOLE,
+        measure=_injected,
+    ),
+]
