@@ -181,9 +181,9 @@ def editor_card(
         carried: figures of :mod:`training.editor_carries`.
         scenes: figures of :mod:`training.editor_scenes`.
     """
-    known, unknown = "", "parts of things (a jacket, a pot), "
+    learned, missing = "", "parts of things (a jacket, a pot), "
     if facts["parts"]:
-        known, unknown = (
+        learned, missing = (
             ", and on the parts of those of `training/assemblies.py` (a jacket, a pot)",
             "",
         )
@@ -194,7 +194,7 @@ def editor_card(
         f" blocks. Trained on pictures of {facts['size']} x {facts['size']} px.", "",
         f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pairs, {facts['minutes']:.0f} minutes on one shared core. {facts['state']}",
         "", "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of"
-        f" `training/worlds.py`{known}. **Does not know**: {unknown}other words, photographs of the world.", "",
+        f" `training/worlds.py`{learned}. **Does not know**: {missing}other words, photographs of the world.", "",
         f"**Injection**: {facts['injection']}", "",
         f"**Data**: {facts['worlds'] + facts['parts']} random worlds by ray casting, two views and up to 30 looks each"
         " (`training/editing_pairs.py`); no scene of the package, none of its instructions. **Recipe**: `training/editor.py`.", "",

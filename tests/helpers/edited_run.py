@@ -3,6 +3,7 @@
 import io
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import yaml
 from PIL import Image
@@ -44,8 +45,11 @@ class Written:
     colors: dict[str, tuple[int, int, int]]
 
 
-def write_run(folder, views=2, methods=METHODS, seeds=(1, 2)):
-    """A run of two edits and so many seeds; every picture of a method has its colour."""
+def write_run(folder, views=2, methods=METHODS, seeds=(1, 2), more=MappingProxyType({})):
+    """A run of two edits and so many seeds; every picture of a method has its colour.
+
+    ``more`` has further pictures of a method: their colours by what they show.
+    """
     (folder / "ball.yaml").write_text(yaml.safe_dump(SCENE))
     names = ["yaw015", "yaw030", "yaw060", "yaw090"][:views]
     study = {
@@ -74,7 +78,8 @@ def write_run(folder, views=2, methods=METHODS, seeds=(1, 2)):
         )
         data["id"] = cell.id
         for view in names:
-            for content, color in (("before", (128, 128, 128)), ("render", colors[cell.variant])):
+            contents = {"before": (128, 128, 128), "render": colors[cell.variant]}
+            for content, color in (contents | more.get(cell.variant, {})).items():
                 path = store.pictures / cell.id[:16] / edit["name"] / f"{view}-{content}.jpg"
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(jpeg(color))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,7 +74,7 @@ def inspect(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port for --web; 0: a free one.")] = 0,
 ) -> None:
     """Open a warp in 3D: surface, cameras, mask against truth, and a pixel's numbers."""
-    with clear_errors():
+    with clear_errors(), _quick_start():
         place = _numbers(pixel, ",", "--pixel", "COLUMN,ROW such as 120,84")
         if export is not None:
             from attnwarp_eval.inspect.export import check_ending
@@ -122,6 +125,7 @@ def inspect(
         if screenshot is not None:
             window.screenshot(screenshot)
             typer.echo(screenshot)
+        gc.enable()
         if web:
             from attnwarp_eval.inspect.web import serve
 
@@ -130,6 +134,27 @@ def inspect(
         elif screenshot is None:
             window.open()
         window.close()
+
+
+@contextmanager
+def _quick_start() -> Iterator[None]:
+    """Neither garbage collection, a fifth of the time of imports that leave no garbage, nor threads
+    of torch, which wait by spinning; the renderer has threads of its own.
+    """
+    gc.disable()
+    import torch
+
+    from attnwarp.render.threads import set_thread_count
+
+    threads = torch.get_num_threads()
+    set_thread_count(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        set_thread_count(None)
+        gc.enable()
 
 
 def _subject(

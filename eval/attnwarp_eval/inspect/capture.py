@@ -15,12 +15,11 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.errors import InputError, suggest
-from attnwarp.fit import load_views
 from attnwarp.io import Dataset, read_image, read_ply
 from attnwarp.io.names import file_stems
-from attnwarp.propagate.folder import MANIFEST
 from attnwarp.render import render
-from attnwarp.warp import WarpSettings
+from attnwarp.warp import PRESETS, Surface, WarpSettings, render_surface
+from attnwarp.warp.settings import DepthStatistic, SplatDepth
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -73,16 +72,28 @@ class Capture:
         up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
         self.up = up / np.linalg.norm(up) if np.linalg.norm(up) > 0.1 else np.array([0.0, 0, 1])
         self.image: Callable[[str], Image] = cache(self._image)
+        self._rendered: Callable[..., Surface] = cache(self._render)
 
     def camera(self, name: str) -> Camera:
         """The source or a target by its name."""
         return self.source if name == self.source.name else self.targets[name]
 
+    def surface(self, name: str, settings: WarpSettings) -> Surface:
+        """What the splats show of a view, rendered once for all settings that render alike."""
+        return self._rendered(name, settings.depth, settings.depth_statistic)
+
+    def _render(self, name: str, depth: SplatDepth, depth_statistic: DepthStatistic) -> Surface:
+        settings = WarpSettings(depth=depth, depth_statistic=depth_statistic)
+        return render_surface(self.model, self.camera(name), settings)
+
     def _image(self, name: str) -> Image:
         """(H, W, 3) sRGB of a view in [0, 1]: its picture, or a render where it has none."""
         index, data = self.names.index(name), self.dataset
         if data.image_paths[index] is None:
-            return rendered(self.model, self.camera(name))
+            return np.clip(np.asarray(self.surface(name, PRESETS["corrected"]).image), 0, 1)
+        # The fit's losses and networks take their time to import.
+        from attnwarp.fit import load_views
+
         one = Dataset([data.cameras[index]], [data.image_paths[index]], lenses=[data.lenses[index]])
         views = load_views(one, max_size=self.size)
         return views.target(0, torch.zeros(3)).numpy()
@@ -140,7 +151,14 @@ def read_picture(path: Path) -> Image:
 
 def is_edit(path: Path) -> bool:
     """Whether a folder holds an edit."""
-    return (path / MANIFEST).is_file()
+    return (path / _manifest()).is_file()
+
+
+def _manifest() -> str:
+    # Editors take their time to import.
+    from attnwarp.propagate.folder import MANIFEST
+
+    return MANIFEST
 
 
 def read_edit(path: Path, names: Sequence[str]) -> Edit:
@@ -153,7 +171,7 @@ def read_edit(path: Path, names: Sequence[str]) -> Edit:
     Raises:
         InputError: the manifest is damaged, or the edit is of another data set.
     """
-    file = path / MANIFEST
+    file = path / _manifest()
     if file.stat().st_size > LARGEST_MANIFEST:
         raise InputError(f"{file}: {file.stat().st_size} bytes; expected an edit's manifest")
     try:

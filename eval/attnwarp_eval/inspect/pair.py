@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,9 @@ from attnwarp_eval.inspect.capture import Capture, Edit, rendered
 from attnwarp_eval.inspect.run import RunEdit
 from attnwarp_eval.study import pictures
 from attnwarp_eval.two_view import AMBIGUOUS, HIDDEN, NONE, VISIBLE, TwoView
-from attnwarp_eval.world import World
+
+if TYPE_CHECKING:
+    from attnwarp_eval.world import World
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
@@ -112,7 +114,7 @@ class Pair:
     @property
     def world(self) -> World | None:
         """The scene's truth; None for a user's own scene."""
-        return self.views if isinstance(self.views, World) else None
+        return None if isinstance(self.views, Capture) else self.views
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:
@@ -140,21 +142,25 @@ class Pair:
     @cached_property
     def images(self) -> tuple[Image, Image]:
         """(H, W, 3) sRGB of the source and of the target before any edit."""
-        if isinstance(self.views, World):
-            views = self.views
-            return views.image(views.source.name, self.spp), views.image(self.target, self.spp)
-        return self.views.image(self.views.source.name), self.views.image(self.target)
+        views, names = self.views, (self.views.source.name, self.target)
+        if isinstance(views, Capture):
+            return views.image(names[0]), views.image(names[1])
+        return views.image(names[0], self.spp), views.image(names[1], self.spp)
 
     @cached_property
     def surfaces(self) -> tuple[Surface, Surface]:
         """What source and target know of the surface, as the warp takes it."""
         source, target = self.cameras
+        if isinstance(self.views, Capture):
+            return (
+                self.views.surface(source.name, self.settings),
+                self.views.surface(target.name, self.settings),
+            )
         if self.model is not None:
             return (
                 render_surface(self.model, source, self.settings),
                 render_surface(self.model, target, self.settings),
             )
-        assert isinstance(self.views, World)
         source_hits = self.views.geometry.trace(source)
         target_hits = self.views.geometry.trace(target)
         return (
@@ -173,9 +179,11 @@ class Pair:
 
     def _warped_view(self) -> WarpedView:
         source, target = self.cameras
-        if self.model is None:
-            return warp_surfaces(source, target, self.surfaces[1], self.surfaces[0], self.settings)
         source_image, target_image = self.images
+        if self.model is None or self.settings.gaussian_filter == "none":
+            own = replace(self.surfaces[0], image=source_image)
+            seen = replace(self.surfaces[1], image=target_image)
+            return warp_surfaces(source, target, seen, own, self.settings)
         return warp_view(
             self.model,
             source,
@@ -340,7 +348,7 @@ class Pair:
 
         Number 0 is the source; the others are the targets in order, this one left out.
         """
-        assert isinstance(self.views, World) and self.truth is not None
+        assert not isinstance(self.views, Capture) and self.truth is not None
         hits, geometry = self.truth.hits, self.views.geometry
         points, normals = hits.point[hits.valid], hits.normal[hits.valid]
         best = np.full(len(points), -1)
@@ -538,6 +546,9 @@ class Pair:
 
 def fitted(picture: Image, camera: Camera) -> Image:
     """A picture at a camera's size: averaged where it shrinks, cubic where it grows."""
+    if picture.shape[:2] == (camera.height, camera.width):
+        return picture
+    # Editors take their time to import.
     from attnwarp.propagate.pictures import resized
 
     return resized(picture, (camera.height, camera.width))

@@ -8,18 +8,18 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from attnwarp import Gaussians
 from attnwarp.errors import InputError
 from attnwarp.io import read_ply
 from attnwarp.warp import WarpSettings
 from attnwarp_eval.inspect.capture import BEFORE, EDITED, Image, read_picture
-from attnwarp_eval.study.probes import probes
-from attnwarp_eval.study.probes.base import Probe
-from attnwarp_eval.study.probes.fit import folder_of
-from attnwarp_eval.study.record import PictureFile, Record
 from attnwarp_eval.study.store import Store
+
+if TYPE_CHECKING:
+    from attnwarp_eval.study.probes.base import Probe
+    from attnwarp_eval.study.record import PictureFile, Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +115,8 @@ def measured(
     Raises:
         StoreError: a record is damaged.
     """
+    from attnwarp_eval.study.probes import probes
+
     store = Store(folder)
     done, available = store.done(), {p.name: p for p in probes()}
     result: dict[str, Measured] = {}
@@ -139,6 +141,8 @@ def measured(
 
 def _measured(folder: Path, source: str, own: Probe[Any], data: dict[str, Any]) -> Measured | None:
     """From the JSON of a record; None where it neither edits nor fits."""
+    from attnwarp_eval.study.probes.fit import folder_of
+
     record = own.read(data)
     spec = record.spec
     edited = "edit" in spec

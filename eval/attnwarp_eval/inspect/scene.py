@@ -15,10 +15,11 @@ from attnwarp_eval.inspect.cell import CellReport
 from attnwarp_eval.inspect.pair import Image, Pair, Seen
 from attnwarp_eval.inspect.pixel import PixelReport
 from attnwarp_eval.inspect.subject import Subject
-from attnwarp_eval.truth import Geometry
 
 if TYPE_CHECKING:
     import pyvista
+
+    from attnwarp_eval.truth import Geometry
 
 Array = npt.NDArray[np.float64]
 
@@ -43,24 +44,23 @@ def seen_surface(seen: Seen, colors: Image) -> pyvista.PolyData:
     import pyvista
 
     height, width = seen.valid.shape
-    index = np.full(height * width, -1)
     valid = seen.valid.ravel()
-    index[valid] = np.arange(valid.sum())
-    corners = _squares(index.reshape(height, width))
-    around, owners = _squares(seen.depth), _squares(seen.owner)
-    with np.errstate(invalid="ignore"):
-        joined = (corners >= 0).all(-1) & (around.max(-1) <= (1 + SEAM) * around.min(-1))
-    joined &= (owners == owners[..., :1]).all(-1)
+    index = np.cumsum(valid) - 1
+    depths, owners = _squares(seen.depth), _squares(seen.owner)
+    joined = np.logical_and.reduce(_squares(seen.valid))
+    joined &= np.maximum.reduce(depths) <= (1 + SEAM) * np.minimum.reduce(depths)
+    joined &= np.logical_and.reduce([owner == owners[0] for owner in owners[1:]])
+    corners = [grid[joined] for grid in _squares(index.reshape(height, width))]
     points = seen.point.reshape(-1, 3)[valid]
-    mesh = pyvista.PolyData.from_regular_faces(points, corners[joined])
+    mesh = pyvista.PolyData.from_regular_faces(points, np.stack(corners, axis=-1))
     mesh.point_data["colors"] = as_bytes(colors).reshape(-1, 3)[valid]
     mesh.point_data["pixel"] = np.flatnonzero(valid)
     return mesh
 
 
-def _squares(grid: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """(H - 1, W - 1, 4) values at the corners of each square of neighbours, going around."""
-    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], axis=-1)
+def _squares(grid: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+    """Four (H - 1, W - 1) values at the corners of each square of neighbours, going around."""
+    return [grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]]
 
 
 def true_surface(geometry: Geometry) -> pyvista.PolyData:
@@ -90,10 +90,10 @@ def discs(gaussians: Gaussians) -> pyvista.PolyData:
     spans = (axes[:, :, :2] * scales[:, None, :2]).numpy()
     count = len(spans)
     sides = disc_sides(count)
-    angle = 2 * np.pi * np.arange(sides) / sides
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    offsets = np.swapaxes(spans @ circle, 1, 2)
-    points = gaussians.world_means()[:, None] + offsets
+    means = gaussians.world_means()
+    points = np.empty((count, sides, 3))
+    for number, angle in enumerate(2 * np.pi * np.arange(sides) / sides):
+        points[:, number] = means + spans @ [np.cos(angle), np.sin(angle)]
     faces: npt.NDArray[Any] = np.arange(count * sides).reshape(count, sides)
     mesh = pyvista.PolyData.from_regular_faces(points.reshape(-1, 3), faces)
     # Degree 0 of the harmonics is the colour without its dependence on the viewer.

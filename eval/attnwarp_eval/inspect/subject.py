@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,6 @@ from attnwarp import Gaussians
 from attnwarp.errors import InputError
 from attnwarp.io import read_dataset, read_ply, read_splat
 from attnwarp.io.names import file_stems
-from attnwarp.propagate.command import FIT_FOLDER
 from attnwarp.warp import PRESETS
 from attnwarp_eval.inspect.capture import (
     BEFORE,
@@ -29,8 +29,9 @@ from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
 from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.study import parse_study
-from attnwarp_eval.world import World, splats, world
+
+if TYPE_CHECKING:
+    from attnwarp_eval.world import World
 
 SIZE = 512
 """Image size of a scene that is inspected by its name, and longest side of a user's pictures."""
@@ -90,6 +91,8 @@ class Subject:
             if variant == EDIT_VARIANT and self.edit is not None:
                 settings = self.edit.settings
             return Pair(self.capture, target, settings, self.capture.model, edit=self.edit)
+        from attnwarp_eval.world import splats, world
+
         own = self.measured.get(variant, _NOT_MEASURED)
         gaussians = None
         if model is not None:
@@ -126,12 +129,17 @@ class Subject:
     @cached_property
     def views(self) -> World | Capture:
         """The cameras and pictures."""
-        return world(self.scene, self.size) if self.capture is None else self.capture
+        if self.capture is not None:
+            return self.capture
+        from attnwarp_eval.world import world
+
+        return world(self.scene, self.size)
 
     @cached_property
     def center(self) -> npt.NDArray[np.float64]:
         """(3,) what the cameras look at."""
-        center = self.views.scene.center if isinstance(self.views, World) else self.views.center
+        views = self.views
+        center = views.center if isinstance(views, Capture) else views.scene.center
         return np.asarray(center, dtype=np.float64)
 
     @cached_property
@@ -150,6 +158,8 @@ def of_scene(scene: str, size: int = SIZE) -> Subject:
         >>> sorted(of_scene("spheres", 16).variants)
         ['corrected', 'paper', 'released']
     """
+    from attnwarp_eval.world import world
+
     model = Splats(position_noise=0.1, normal_noise=3.0)
     targets = tuple(world(scene, size).targets)
     return Subject(scene, size, 8, 0, _presets(model), targets)
@@ -184,6 +194,9 @@ def of_run(
         >>> of_run(store.root).scene
         'spheres'
     """
+    from attnwarp_eval.study.study import parse_study
+    from attnwarp_eval.world import world
+
     stored = Store(folder).read_study()
     study = parse_study(stored["study"])
     if not study.scenes:
@@ -269,6 +282,8 @@ def of_capture(
     variants = _presets(None)
     edit = None
     if path.is_dir():
+        from attnwarp.propagate.command import FIT_FOLDER
+
         if not is_edit(path):
             raise InputError(f"{path}: expected splats (.ply, .splat) or a folder of attnwarp edit")
         edit = read_edit(path, file_stems(dataset.cameras))

@@ -38,6 +38,12 @@ SIZE = (1500, 900)
 
 INSET_ROWS = 4
 
+LARGEST_TITLE = 14
+"""Height of an inset's title, in pixels."""
+
+LETTER_WIDTH = 0.56
+"""Of a title in Arial, as a share of its height; 0.5 on average."""
+
 FLIGHT = 40
 """Pictures of a flight from the source to the target."""
 
@@ -303,6 +309,7 @@ class Window:
             window_size=list(size),
         )
         plotter.set_background("white", all_renderers=True)
+        plotter.render_window.AddObserver("WindowResizeEvent", self._fit_insets)
         return plotter
 
     def _main(self) -> None:
@@ -345,6 +352,7 @@ class Window:
             for name in ("picture", "title"):
                 # The plotter would remove it from all parts of the window.
                 self.plotter.renderer.remove_actor(name)
+        self._fit_insets()
 
     def _draw_inset(self, title: str, image: Image) -> None:
         height, width = image.shape[:2]
@@ -354,10 +362,33 @@ class Window:
         self.plotter.add_mesh(
             plane, texture=draw.texture(image), lighting=False, name="picture", pickable=False
         )
-        self.plotter.add_text(plain(title), font_size=7, name="title", color="black")
+        text = self.plotter.add_text(
+            plain(title), position=(0.02, 0.97), viewport=True, name="title", color="black"
+        )
+        text.prop.justification_vertical = "top"
         self.plotter.view_xy()
         self.plotter.camera.parallel_projection = True
-        self.plotter.camera.parallel_scale = max(height, 1.1 * width) / 1.75
+
+    def _fit_insets(self, *_: Any) -> None:
+        """Titles of one size, as large as the longest allows, over whole pictures."""
+        insets = [
+            (renderer, renderer.actors["title"], renderer.actors["picture"].bounds)
+            for renderer in self.plotter.renderers
+            if {"title", "picture"} <= renderer.actors.keys()
+        ]
+        longest = max((len(text.input) for _, text, _ in insets), default=1)
+        for renderer, text, bounds in insets:
+            columns, rows = renderer.GetSize()
+            letters = min(LARGEST_TITLE, columns / (LETTER_WIDTH * longest))
+            text.prop.font_size = max(1, int(letters))
+            # World units a pixel, so that the picture has room below its title.
+            unit = max(
+                bounds.x_max / (0.96 * columns), bounds.y_max / (0.98 * rows - 1.5 * letters)
+            )
+            x, y = bounds.x_max / 2, bounds.y_max / 2 + 0.75 * letters * unit
+            renderer.camera.focal_point = (x, y, 0)
+            renderer.camera.position = (x, y, renderer.camera.distance)
+            renderer.camera.parallel_scale = unit * rows / 2
 
     def _draw_parts(self) -> None:
         parts = scene.parts(self.subject, self.pair, self.state, self.picked)
@@ -415,15 +446,24 @@ class Window:
         self._draw_legend(pair.legend(state.coloring))
 
     def _draw_legend(self, legend: Legend) -> None:
+        import pyvista
+
         # A legend that is not there cannot be removed.
         if self.plotter.renderer.legend is not None:
             self.plotter.remove_legend()
         if not legend:
             return
-        labels = [[plain(text), color] for text, color in legend]
+        labels = [[plain(text), "black"] for text, _ in legend]
         actor = self.plotter.add_legend(
             labels, bcolor="white", background_opacity=0.8, face="rectangle"
         )
+        for number, (_, color) in enumerate(legend):
+            # An entry has one colour for its text and its symbol, unless the symbol has its own.
+            symbol = pyvista.PolyData(actor.GetEntrySymbol(number))
+            rgb = np.array(pyvista.Color(color).int_rgb, dtype=np.uint8)
+            symbol.point_data["colors"] = np.tile(rgb, (symbol.n_points, 1))
+            symbol.set_active_scalars("colors")
+            actor.SetEntrySymbol(number, symbol)
         longest = max(len(text) for text, _ in labels)
         width, height = 0.011 * longest + 0.05, 0.026 * len(labels)
         actor.SetPosition(0.99 - width, 0.99 - height)

@@ -250,20 +250,18 @@ def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
 FIRST_PICTURE = """
 import resource, sys, time
 from pathlib import Path
-import numpy as np, torch
-import attnwarp.render, attnwarp_eval.inspect.export, pyvista
-from attnwarp_eval.inspect import subject
-from attnwarp_eval.inspect.scene import State
-from attnwarp_eval.inspect.window import Window
+from attnwarp_eval.cli.main import app
 folder = Path(sys.argv[1])
-begin = time.process_time()
-chosen = subject.of_capture(folder / "scene.ply", folder, size=592)
-window = Window(chosen, State("corrected", chosen.targets[0], splats=True), off_screen=True)
-window.screenshot(folder / "a.png")
-seconds = time.process_time() - begin
-seen = window.plotter.renderer.actors["seen"].mapper.dataset
-print(2 * seen.n_cells, len(chosen.capture.model), seconds,
-      resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+data, size = str(folder), 592
+words = ["inspect", str(folder / "scene.ply"), "--data", data, "--size", str(size), "--splats"]
+app([*words, "--screenshot", str(folder / "a.png")], standalone_mode=False)
+seconds = time.process_time()
+gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+from attnwarp_eval.inspect import scene, subject
+chosen = subject.of_capture(folder / "scene.ply", folder, size=size)
+pair = chosen.pair("corrected", chosen.targets[0])
+triangles = 2 * scene.seen_surface(pair.seen, pair.colors("mask")).n_cells
+print(triangles, len(chosen.capture.model), seconds, gigabytes)
 """
 
 
@@ -293,7 +291,7 @@ def test_the_first_picture_of_a_large_scene_comes_soon_and_fits_in_memory(tmp_pa
         [sys.executable, "-c", FIRST_PICTURE, tmp_path],
         env=environment(), capture_output=True, text=True, check=True,
     )  # fmt: skip
-    triangles, splats, seconds, gigabytes = map(float, done.stdout.split())
+    triangles, splats, seconds, gigabytes = map(float, done.stdout.splitlines()[-1].split())
     assert triangles > 600_000 and splats == count
-    # CPU seconds of all threads, beyond imports; a busy machine does not change them much.
-    assert seconds < 10 and gigabytes < 2
+    # CPU seconds of all threads, imports included; a core that others use too takes longer.
+    assert seconds < 8 and gigabytes < 2

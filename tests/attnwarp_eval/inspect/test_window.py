@@ -11,8 +11,10 @@ from typer.testing import CliRunner
 from attnwarp.warp import PRESETS
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.inspect.cell import CellReport, cell_of, cell_report
+from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.scene import State
+from attnwarp_eval.inspect.subject import Subject
 from attnwarp_eval.inspect.window import KEYS, Window
 from attnwarp_eval.study.schema import Splats
 
@@ -128,6 +130,73 @@ def test_a_variant_is_explained_anew_and_another_view_is_not(window):
     window.show(target="yaw030")
     assert window.picked is None
     window.show(target="yaw060", variant="corrected")
+
+
+def part_of(picture, renderer):
+    """The pixels of one part of the window."""
+    left, bottom, right, top = renderer.GetViewport()
+    height, width = picture.shape[:2]
+    rows = slice(round((1 - top) * height), round((1 - bottom) * height))
+    return picture[rows, round(left * width) : round(right * width)]
+
+
+def luminance(colors):
+    """Relative luminance of (..., 3) bytes of sRGB, as WCAG 2.2 defines it."""
+    value = np.asarray(colors) / 255
+    linear = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return linear @ [0.2126, 0.7152, 0.0722]
+
+
+@pytest.mark.parametrize("background", ["white", "black"])
+def test_the_legend_is_read_on_light_and_on_dark(window, background):
+    plotter, before = window.plotter, window.state
+    plotter.window_size = (1024, 768)
+    window.show(coloring="rules")
+    window._main()
+    plotter.set_background(background)
+    picture = part_of(plotter.screenshot(return_img=True), plotter.renderer)
+    (x, y), (w, h) = (
+        f()[:2] for f in (plotter.renderer.legend.GetPosition, plotter.renderer.legend.GetPosition2)
+    )
+    height, width = picture.shape[:2]
+    box = picture[round((1 - y - h) * height) : round((1 - y) * height),
+                  round(x * width) : round((x + w) * width)]  # fmt: skip
+    legend = window.pair.legend("rules")
+    for (text, color), line in zip(legend, np.array_split(box, len(legend)), strict=True):
+        symbol, letters = np.split(line.reshape(len(line), -1, 3), [line.shape[1] // 8], axis=1)
+        assert (symbol == pyvista.Color(color).int_rgb).all(-1).any(), text
+        light = luminance(letters)
+        behind = np.median(light)  # letters cover less than half of their line
+        contrast = (np.maximum(light, behind) + 0.05) / (np.minimum(light, behind) + 0.05)
+        assert contrast.max() >= 4.5, text
+    plotter.set_background("white")
+    window.show(coloring=before.coloring)
+    plotter.window_size = (450, 300)
+
+
+def test_eight_insets_are_whole_and_their_titles_too(window, monkeypatch):
+    """Of a small window; pictures are plain, so that every pixel tells what it belongs to."""
+    titles = ["source, not edited", "target, not edited", "scene, stage 10", "source, warped",
+              "mask against truth", "features, warped", "true edit", "the last"]  # fmt: skip
+    plain = np.tile(np.float32([1, 0, 1]), (24, 32, 1))
+    monkeypatch.setattr(Pair, "insets", lambda *_: dict.fromkeys(titles, plain))
+    monkeypatch.setattr(Subject, "steps", ("before", "edited"))
+    opened = Window(window.subject, STATE, off_screen=True, size=(1024, 768))
+    picture = opened.plotter.screenshot(return_img=True)
+    insets = [r for r in opened.plotter.renderers if "picture" in r.actors]
+    assert len(insets) == 8
+    for renderer in insets:
+        part = part_of(picture, renderer)[2:-2, 2:-2]  # without the lines between the parts
+        rows, columns = np.nonzero((part == (255, 0, 255)).all(-1))
+        wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
+        assert wide / high == pytest.approx(32 / 24, rel=0.02)
+        assert wide > 0.9 * part.shape[1]
+        assert len(rows) == wide * high  # nothing lies over it
+        letters_rows, letters_columns = np.nonzero(part.max(-1) < 128)
+        assert letters_rows.min() > 0 and letters_rows.max() < rows.min()
+        assert np.ptp(letters_rows) >= 7  # capitals and stems, in pixels
+        assert letters_columns.max() < part.shape[1] - 2
+    opened.close()
 
 
 def test_a_flight_ends_at_the_target(window):

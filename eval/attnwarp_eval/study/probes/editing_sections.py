@@ -15,6 +15,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 
 BY_YAW = {
@@ -210,29 +211,54 @@ def _ratio(own: Mapping[str, float], other: Mapping[str, float]) -> float:
 
 
 def side_by_side(results: Results, probe: str) -> Section | None:
-    """A row for each view of an edit: before, the source's edit, each variant, the truth."""
-    rows: dict[tuple[str, str], dict[str, dict[str, str]]] = {}
+    """A row for each view of an edit: before, each variant's source edit and edited view, the
+    truth.
+    """
+    rows: dict[tuple[str, str], dict[str, dict[str, PictureFile]]] = {}
     for cell, record in results.finished(probe):
         for picture in record.pictures:
             own = rows.setdefault((cell.scene, picture.view), {})
-            own.setdefault(cell.variants[0], {})[picture.content] = picture.path
+            own.setdefault(cell.variants[0], {})[picture.content] = picture
     if not rows:
         return None
-    gallery = []
-    for (scene, view), variants in rows.items():
-        first = next(iter(variants.values()))
-        shown = [Picture(first[key], key.replace("-", " ")) for key in ("before", "source-edit")]
-        for name, files in variants.items():
-            if "by-hand" in files:
-                shown.append(Picture(files["by-hand"], f"{name}: the source, by hand"))
-                shown.append(Picture(files["source-edit"], f"{name}: the source, replayed"))
-            if "edited" in files:
-                shown.append(Picture(files["edited"], name))
-        if "truth" in first:
-            shown.append(Picture(first["truth"], "truth of the source's answer"))
-        gallery.append((f"**{scene}, {view}**", shown))
-    text = ["The view before the edit, the source's edit, and the edited view by each variant."]
+    gallery = [
+        (f"**{scene}, {view}**", _row_of_view(variants)) for (scene, view), variants in rows.items()
+    ]
+    text = [
+        "The view before the edit; each variant's edit of the source and its edited view; the truth"
+        " of the answer that the source's edit gave. Variants with the same picture share it."
+    ]
     return Section("Edited views side by side", text, gallery=Gallery(gallery))
+
+
+def _row_of_view(variants: Mapping[str, Mapping[str, PictureFile]]) -> list[Picture]:
+    """Pictures of one view, by variant and content."""
+    by_hand, sources, truths = (
+        _owners(variants, content) for content in ("by-hand", "source-edit", "truth")
+    )
+    row = [Picture(next(iter(variants.values()))["before"].path, "before")]
+    for name, files in variants.items():
+        if name in by_hand:
+            row.append(Picture(files["by-hand"].path, f"source by hand{by_hand[name]}"))
+        if name in sources:
+            row.append(Picture(files["source-edit"].path, f"source edit{sources[name]}"))
+        if "edited" in files:
+            row.append(Picture(files["edited"].path, name))
+    for name, owners in truths.items():
+        row.append(Picture(variants[name]["truth"].path, f"truth of the source's answer{owners}"))
+    return row
+
+
+def _owners(variants: Mapping[str, Mapping[str, PictureFile]], content: str) -> dict[str, str]:
+    """The variants that share a picture, by the first of them; empty for all of them."""
+    shared: dict[str, list[str]] = {}
+    for name, files in variants.items():
+        if content in files:
+            shared.setdefault(files[content].sha256, []).append(name)
+    return {
+        names[0]: "" if len(names) == len(variants) else f": {', '.join(names)}"
+        for names in shared.values()
+    }
 
 
 def parts_of_time(results: Results, probe: str) -> Section:

@@ -4,12 +4,14 @@ import dataclasses
 import itertools
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 import yaml
 from ball_scene import SCENE
+from edited_run import write_run
 from PIL import Image
 
 from attnwarp.baselines import Budget
@@ -131,6 +133,31 @@ def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_na
     row = next(line for line in report.splitlines() if "Paint the ball" in line)
     assert "some_colour" in row
     assert "**no**" in row
+
+
+def test_each_method_stands_beside_its_own_edit_of_the_source(tmp_path):
+    red, green, white = (220, 30, 30), (30, 220, 30), (250, 250, 250)
+    sources = {"alone": red, "warped": green, "third": red}
+    made = {
+        name: {"source-edit": color, "edited": white, "truth": color}
+        for name, color in sources.items()
+    }
+    store = Store(write_run(tmp_path, views=1, seeds=(0,), more=made).root)
+    write_report(store)
+    section = (store.root / "report.md").read_text().split("Edited views side by side")[1]
+    for edit in ("red", "blue"):
+        row = re.findall(rf"!\[([^]]*)\]\((pictures/[^)]*/{edit}/[^)]*)\)", section)
+        pictures = [
+            (caption, Image.open(store.root / path).getpixel((0, 0))) for caption, path in row
+        ]
+        assert [caption for caption, _ in pictures] == [
+            "before", "source edit: alone, third", "alone", "source edit: warped", "warped", "third",
+            "truth of the source's answer: alone, third", "truth of the source's answer: warped",
+        ]  # fmt: skip
+        # JPEG moves a plain colour by a few steps.
+        expected = [(128, 128, 128), red, white, green, white, white, red, green]
+        for (caption, color), planned_color in zip(pictures, expected, strict=True):
+            assert color == pytest.approx(planned_color, abs=4), caption
 
 
 def test_seconds_are_in_the_record_and_not_in_the_report_without_timings(
