@@ -20,7 +20,7 @@ ANSWERS = 64
 """How many answers a noise can draw."""
 
 
-SETTLED, OPEN = 600, 800
+SETTLED, OPEN = 850, 920
 """Time steps (of 1000): below the first the noise draws nothing more, above the second all it can.
 
 In between the noisy picture itself comes to show the answer.

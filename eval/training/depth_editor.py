@@ -49,6 +49,9 @@ Tensor = torch.Tensor
 CONTROL_WIDTHS = (16, 32, 64)
 """Channels of the convolutions that bring a depth map to the latents' size; each but the first halves it."""
 
+NOISY_FROM = 600
+"""Most steps are drawn from here on."""
+
 NO_PROMPT = 0.1
 """Probability that the prompt is left out, for guidance."""
 
@@ -278,7 +281,7 @@ def depth_loss(
     drawn = [prompts.prompted(rng, noise[k]) for k in range(count)]
     rows, texts = [row for row, _ in drawn], [text for _, text in drawn]
     texts = ["" if rng.uniform() < NO_PROMPT else text for text in texts]
-    t = draw_steps(count, rng)
+    t = draw_steps(count, rng, NOISY_FROM)
     a = alphas[t]
     picture = prompts.latents([prompts.picture(row, row.target) for row in rows])
     control = torch.from_numpy(np.stack([prompts.control(row) for row in rows])).permute(0, 3, 1, 2)

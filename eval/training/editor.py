@@ -56,14 +56,13 @@ VOCABULARY = 1500
 TOKENS = 24
 
 T_STEPS = 1000
-NOISY_FROM = 600
 NOISY_SHARE = 0.6
-"""Share of the steps drawn from the noisier 40 %, where the answer is decided."""
+"""Share of the steps drawn from the noisier ones, where the answer is decided."""
 MOST_WEIGHT = 5.0
 SD_BETAS = (0.00085, 0.012)
-"""Stable Diffusion's: on these small latents a colour shows in the noisy picture only after half of the steps."""
-EARLY_BETAS = (0.0001, 0.002)
-"""Seven times its signal at t = 800: the picture shows an answer while features still have most of their weight."""
+"""Stable Diffusion's, first and last."""
+SHIFT = 16.0
+"""How many times the signal-to-noise amplitude of Stable Diffusion's is at a step, see :func:`scheduler`."""
 COARSE = 12
 """The first channels of the latents are means and coarse details (:func:`attnwarp.editing.latents.haar_basis`)."""
 DROP = 0.05
@@ -83,7 +82,7 @@ INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
 CONSTANTS = (
-    "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_FROM", "NOISY_SHARE",
+    "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_SHARE",
     "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS", "EMA", "WARM", "STEPS_AN_EPOCH", "THING_WEIGHT", "MOST_THING_WEIGHT",
 )  # fmt: skip
 """What every stage's result depends on."""
@@ -105,7 +104,8 @@ class Stage:
         seed: of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
-        betas: of the noise schedule, first and last.
+        shift: of the noise schedule, see :func:`scheduler`.
+        noisy_from: :data:`NOISY_SHARE` of the steps are drawn from here on.
     """
 
     size: int
@@ -119,12 +119,13 @@ class Stage:
     parts: int = 0
     unclear: float = UNCLEAR
     draws: bool = True
-    betas: tuple[float, float] = EARLY_BETAS
+    shift: float = SHIFT
+    noisy_from: int = 850
 
 
 STAGES = {
-    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False, betas=SD_BETAS),
-    "drawn-64": Stage(64, 2_500, 6e-4, 200, start="plain-64", seed=5, unclear=0.5),
+    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False, shift=1, noisy_from=600),
+    "drawn-64": Stage(64, 5_000, 8e-4, 200, start="plain-64", seed=5, unclear=0.5),
     "features-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="features", seed=2),
     "control-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="control", seed=2),
     "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),
@@ -167,15 +168,31 @@ class EditorNet(torch.nn.Module):
         return self.unet(torch.cat([noisy, before], dim=1), t, context, return_dict=False)[0]
 
 
-def scheduler(betas: tuple[float, float] = SD_BETAS) -> Any:
-    """The noise schedule and the sampler, as diffusers' pipelines load them."""
+def scheduler(shift: float = 1.0) -> Any:
+    """The noise schedule and the sampler, as diffusers' pipelines load them.
+
+    Args:
+        shift: by which the ratio of signal to noise, in amplitude, is multiplied at every step. A mean
+            over a thing is read from as many cells as it has, so the same step of Stable Diffusion hides
+            four times as much on 16 x 16 latents as on its 64 x 64 (Hoogeboom et al. 2023, "simple
+            diffusion", section 2.3). More of it shows an answer while features still have most of
+            their weight.
+    """
     from diffusers import DDIMScheduler
 
-    return DDIMScheduler(
-        num_train_timesteps=T_STEPS, beta_schedule="scaled_linear", beta_start=betas[0], beta_end=betas[1],
-        rescale_betas_zero_snr=True, timestep_spacing="trailing", prediction_type="sample", clip_sample=False,
-        set_alpha_to_one=True, steps_offset=0,
-    )  # fmt: skip
+    settings: dict[str, Any] = {
+        "num_train_timesteps": T_STEPS, "beta_schedule": "scaled_linear", "beta_start": SD_BETAS[0], "beta_end": SD_BETAS[1],
+        "rescale_betas_zero_snr": True, "timestep_spacing": "trailing", "prediction_type": "sample", "clip_sample": False,
+        "set_alpha_to_one": True, "steps_offset": 0,
+    }  # fmt: skip
+    plain = DDIMScheduler(**settings)
+    if shift == 1:
+        return plain
+    alphas = plain.alphas_cumprod.double()
+    shifted = shift**2 * alphas / (1 + (shift**2 - 1) * alphas)
+    before = torch.cat([torch.ones(1, dtype=torch.float64), shifted[:-1]])
+    betas = (1 - shifted / before).tolist()
+    return DDIMScheduler(**settings | {"rescale_betas_zero_snr": False, "trained_betas": betas})
 
 
 def make_tokenizer(count: int = 20_000, worlds: int = 200) -> Tokenizer:
@@ -240,6 +257,24 @@ def picked(noise: Tensor, candidates: Sequence[int]) -> int:
     """
     scores = codes()[list(candidates)] @ noise.mean(dim=(1, 2))
     return int(candidates[int(scores.argmax())])
+
+
+def settled(noise: Tensor, answer: int, kind: str) -> Tensor:
+    """The noise with the answer that it picks among a kind's exchanged for another.
+
+    The two answers' shares of the noise's mean change places, so that the result is white noise that picks
+    ``answer``. A pick among the answers that a world happens to have would be a riddle: neither the noise
+    nor the text tells which these are, and the best prediction of a riddle is a mixture of colours.
+
+    Args:
+        noise: (48, h, w), white.
+        answer: index of the look to be picked.
+        kind: a key of :data:`training.editing_pairs.GROUPS`.
+    """
+    directions, mean = codes(), noise.mean(dim=(1, 2))
+    best = picked(noise, GROUPS[kind])
+    shift = (directions[best] - directions[answer]) @ mean * (directions[answer] - directions[best])
+    return noise + shift[:, None, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,10 +361,8 @@ class Pairs:
         x = torch.from_numpy(np.ascontiguousarray(np.stack(pictures))).permute(0, 3, 1, 2)
         return self.coder.encode(x, return_dict=False)[0]
 
-    def row(
-        self, rng: np.random.Generator, noise: Tensor, kinds: dict[str, float], unclear: float
-    ) -> Row:
-        """Draw a pair; where the instruction is unclear, the noise picks the target."""
+    def row(self, rng: np.random.Generator, kinds: dict[str, float], unclear: float) -> Row:
+        """Draw a pair."""
         worlds = self.worlds
         while True:
             world, view = int(rng.integers(len(worlds))), int(rng.integers(VIEWS))
@@ -348,17 +381,8 @@ class Pairs:
             ]
             if targets:
                 break
-        target = picked(noise, targets) if open_ended else int(rng.choice(targets))
-        return Row(
-            world,
-            view,
-            source,
-            target,
-            kind,
-            open_ended,
-            self.corner(world, view, rng),
-            bool(rng.uniform() < 0.5),
-        )
+        corner, flip = self.corner(world, view, rng), bool(rng.uniform() < 0.5)
+        return Row(world, view, source, int(rng.choice(targets)), kind, open_ended, corner, flip)
 
     def text(self, row: Row, rng: np.random.Generator) -> str:
         """The instruction of a row."""
@@ -379,26 +403,29 @@ class Pairs:
 
     def batch(
         self, count: int, rng: np.random.Generator, generator: torch.Generator, *, t: Tensor | None = None,
-        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR,
+        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR, noisy_from: int = 600,
     ) -> Batch:  # fmt: skip
-        """Draw ``count`` pairs."""
+        """Draw ``count`` pairs; where the instruction is unclear, the noise picks the target."""
         if self.tokenizer is None:
             raise ValueError("tokenizer: got None, which a batch of instructions needs")
         cells = self.size // BLOCK
         noise = torch.randn((count, CHANNELS, cells, cells), generator=generator)
-        rows = [self.row(rng, noise[k], kinds or KINDS, unclear) for k in range(count)]
+        rows = [self.row(rng, kinds or KINDS, unclear) for _ in range(count)]
+        for k, row in enumerate(rows):
+            if row.unclear:
+                noise[k] = settled(noise[k], row.target, row.kind)
         return Batch(
             self.latents([self.picture(r, r.source) for r in rows]), self.latents([self.picture(r, r.target) for r in rows]),
             noise, tokens_of(self.tokenizer, [self.text(r, rng) for r in rows]),
-            draw_steps(count, rng) if t is None else t,
+            draw_steps(count, rng, noisy_from) if t is None else t,
             torch.from_numpy(np.stack([self.weight(r) for r in rows]))[:, None], rows,
         )  # fmt: skip
 
 
-def draw_steps(count: int, rng: np.random.Generator) -> Tensor:
+def draw_steps(count: int, rng: np.random.Generator, noisy_from: int) -> Tensor:
     """(count,) steps, more of them noisy."""
-    noisy = rng.integers(NOISY_FROM, T_STEPS, count)
-    rest = rng.integers(0, NOISY_FROM, count)
+    noisy = rng.integers(noisy_from, T_STEPS, count)
+    rest = rng.integers(0, noisy_from, count)
     return torch.from_numpy(np.where(rng.uniform(size=count) < NOISY_SHARE, noisy, rest))
 
 
@@ -455,7 +482,7 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         ("parts", 0),
         ("unclear", UNCLEAR),
         ("draws", False),
-        ("betas", SD_BETAS),
+        ("shift", 1),
     ):
         if fields[key] == before:
             del fields[key]
@@ -502,7 +529,7 @@ def train_stage(
             teach_draws(net, tokenizer, pairs.worlds, seed=stage.seed)
     average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
     optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
-    alphas = scheduler(stage.betas).alphas_cumprod
+    alphas = scheduler(stage.shift).alphas_cumprod
     empty = tokens_of(tokenizer, [""])[0]
     step_loss = _step(stage, pairs, net, alphas, empty)
 
@@ -538,7 +565,9 @@ def _step(
     def plain(
         rng: np.random.Generator, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, float]]:
-        batch = pairs.batch(stage.batch, rng, generator, unclear=stage.unclear)
+        batch = pairs.batch(
+            stage.batch, rng, generator, unclear=stage.unclear, noisy_from=stage.noisy_from
+        )
         before, tokens = dropped(batch, empty, rng)
         a = alphas[batch.t]
         prediction = net(noised(batch.after, batch.noise, a), before, batch.t, tokens)
@@ -561,7 +590,7 @@ def _step(
             return loss, {f"plain {key}": value for key, value in parts.items()}
         inject = stage.inject == "features"
         return injected_loss(
-            pairs, net, alphas, empty, stage.batch // 2, rng, generator, inject=inject
-        )
+            pairs, net, alphas, empty, stage.batch // 2, rng, generator, inject=inject, noisy_from=stage.noisy_from,
+        )  # fmt: skip
 
     return injected

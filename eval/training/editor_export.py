@@ -12,7 +12,7 @@ from tokenizers import Tokenizer
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
 from training.depth_editor import DEPTH_STAGES, DepthNet
-from training.editor import SD_BETAS, STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
+from training.editor import STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
 
 
 def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
@@ -44,7 +44,7 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
     net, tokenizer, _, _ = averaged(stage, out)
     parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
     pipeline = "StableDiffusionInstructPix2PixPipeline"
-    return _write(folder, net, tokenizer, pipeline, parts, STAGES[stage].betas)
+    return _write(folder, net, tokenizer, pipeline, parts, STAGES[stage].shift)
 
 
 def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
@@ -55,12 +55,12 @@ def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     parts = {
         "unet": ["diffusers", "UNet2DConditionModel"], "controlnet": ["diffusers", "ControlNetModel"],
     }  # fmt: skip
-    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts, SD_BETAS)
+    return _write(folder, net, tokenizer, "StableDiffusionControlNetPipeline", parts, 1)
 
 
 def _write(
     folder: Path, net: Any, tokenizer: Tokenizer, pipeline: str, parts: dict[str, list[str]],
-    betas: tuple[float, float],
+    shift: float,
 ) -> Path:  # fmt: skip
     """Write what both kinds have, the list of all parts and their checksums."""
     from transformers import PreTrainedTokenizerFast
@@ -69,7 +69,7 @@ def _write(
     net.unet.save_pretrained(folder / "unet")
     net.text.save_pretrained(folder / "text_encoder")
     HaarLatents().save_pretrained(folder / "vae")
-    scheduler(betas).save_pretrained(folder / "scheduler")
+    scheduler(shift).save_pretrained(folder / "scheduler")
     words = PreTrainedTokenizerFast(
         tokenizer_object=tokenizer, pad_token="<pad>", eos_token="<end>", model_max_length=TOKENS
     )

@@ -20,7 +20,7 @@ from attnwarp.camera import Camera
 from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
-from training.editing_pairs import SIZE
+from training.editing_pairs import GROUPS, SIZE
 from training.editor import (
     T_STEPS,
     Batch,
@@ -30,7 +30,7 @@ from training.editor import (
     draw_steps,
     loss_of,
     noised,
-    picked,
+    settled,
 )
 
 FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05
@@ -40,7 +40,7 @@ A weight that does not follow the step asks for what no network can give: of two
 each would have to win.
 """
 
-MOST_ALPHA = 0.25
+MOST_ALPHA = 0.05
 """Largest alpha-bar of a step at which B's state may still show its own answer: later that is visible."""
 
 CARRIED = 0.5
@@ -193,7 +193,7 @@ def falling_weight(t: Tensor, rng: np.random.Generator) -> Tensor:
 
 def injected_loss(
     pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor, count: int, rng: np.random.Generator,
-    generator: torch.Generator, *, inject: bool = True,
+    generator: torch.Generator, *, inject: bool = True, noisy_from: int = 850,
 ) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
     """The loss of ``count`` pairs of runs, each against its own target; the runs share their steps.
 
@@ -205,10 +205,13 @@ def injected_loss(
         count: of pairs; twice as many pictures go through the network.
         rng, generator: to draw from.
         inject: False is the control: the same runs, nothing goes over, B's target is its own answer.
+        noisy_from: more of the steps are drawn from here on.
     """
     noisy = np.flatnonzero(alphas.numpy() < MOST_ALPHA)
     carried = torch.from_numpy(rng.uniform(size=count) < CARRIED)
-    t = torch.where(carried, draw_steps(count, rng), torch.from_numpy(rng.choice(noisy, count)))
+    t = torch.where(
+        carried, draw_steps(count, rng, noisy_from), torch.from_numpy(rng.choice(noisy, count))
+    )
     b = pairs.batch(count, rng, generator, t=t, kinds=INJECTED_KINDS, unclear=1.0)
     sources, ways, index, mask = draw_moves(pairs, b.rows, rng)
     # "Other view" needs the whole picture, so B's rows may have changed with A's.
@@ -219,8 +222,9 @@ def injected_loss(
     b = _rebuilt(pairs, b, rows)
     no_text = torch.from_numpy(rng.uniform(size=count) < NO_TEXT)
     b = replace(b, tokens=torch.where(no_text[:, None], empty, b.tokens))
+    sources = [_answered(pairs, s, rng) for s in sources]
     noise = torch.randn(b.noise.shape, generator=generator)
-    sources = [_answered(pairs, s, n) for s, n in zip(sources, noise, strict=True)]
+    noise = torch.stack([settled(n, s.target, s.kind) for n, s in zip(noise, sources, strict=True)])
     a = replace(_rebuilt(pairs, b, sources), noise=noise)
     related = torch.tensor([way != "unrelated" for way in ways])
     cells = pairs.size // BLOCK
@@ -254,10 +258,8 @@ def injected_loss(
     return loss_a + loss_b, {"recorded": float(loss_a.detach()), "injected": float(loss_b.detach())}
 
 
-def _answered(pairs: Pairs, row: Row, noise: Tensor) -> Row:
-    """The row with the answer that its own noise picks."""
-    from training.editing_pairs import GROUPS
-
+def _answered(pairs: Pairs, row: Row, rng: np.random.Generator) -> Row:
+    """The row with an answer of its own."""
     valid = pairs.worlds.valid[row.world]
     allowed = pairs.worlds.sources(row.world, row.kind)
     source = row.source if row.source in allowed else int(allowed[0])
@@ -266,7 +268,7 @@ def _answered(pairs: Pairs, row: Row, noise: Tensor) -> Row:
         k for k in GROUPS[row.kind]
         if valid[k] and k != source and not np.array_equal(looks[k], looks[source])
     ]  # fmt: skip
-    return replace(row, source=source, target=picked(noise, targets))
+    return replace(row, source=source, target=int(rng.choice(targets)))
 
 
 def _rebuilt(pairs: Pairs, batch: Batch, rows: list[Row]) -> Batch:

@@ -156,12 +156,32 @@ def test_an_unclear_pair_ends_in_the_answer_that_its_noise_picks(pairs):
     assert len(unclear) > 20
     for k, row in unclear:
         looks = pairs.worlds.looks[row.world]
-        allowed = [
-            j for j in GROUPS[row.kind]
-            if pairs.worlds.valid[row.world, j] and j != row.source and not np.array_equal(looks[j], looks[row.source])
-        ]  # fmt: skip
-        scores = codes()[allowed] @ batch.noise[k].mean(dim=(1, 2))
-        assert row.target == allowed[int(scores.argmax())]
+        assert pairs.worlds.valid[row.world, row.target]
+        assert not np.array_equal(looks[row.target], looks[row.source])
+        # Among all answers of the kind, so that no world needs to be known for it.
+        scores = codes()[list(GROUPS[row.kind])] @ batch.noise[k].mean(dim=(1, 2))
+        assert row.target == GROUPS[row.kind][int(scores.argmax())]
+
+
+def test_noise_that_got_its_answer_is_as_white_as_before():
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn((4000, 48, 2, 2), generator=generator)
+    answers = torch.randint(len(GROUPS["color"]), (4000,), generator=generator)
+    given = torch.stack(
+        [editor.settled(n, int(a), "color") for n, a in zip(noise, answers, strict=True)]
+    )
+    assert torch.allclose(
+        given - given.mean((2, 3), True), noise - noise.mean((2, 3), True), atol=1e-5
+    )
+    flat = given.flatten(1).double().numpy()
+    # Means and covariances of 4,000 normals have standard deviations of about 1 / sqrt(4000); six of them.
+    assert np.abs(flat.mean(axis=0)).max() < 6 / 4000**0.5
+    assert np.abs(np.cov(flat.T) - np.eye(192)).max() < 6 * (2 / 4000) ** 0.5
+    mean = given.mean(dim=(2, 3)) @ codes()[list(GROUPS["color"])].T
+    assert mean.argmax(dim=1).tolist() == answers.tolist()
+    # The shares that the noise has of the answers are the same numbers, two of them exchanged.
+    own = noise.mean(dim=(2, 3)) @ codes()[list(GROUPS["color"])].T
+    assert torch.allclose(mean.sort(dim=1).values, own.sort(dim=1).values, atol=1e-5)
 
 
 def checkpoint(folder):
@@ -367,28 +387,32 @@ def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
     net = editor.EditorNet(tokenizer.get_vocab_size(), 64).unet.double()
     torch.nn.init.normal_(net.conv_out.weight, std=0.05)
     sample, text = torch.randn((2, 96, 8, 12)).double(), torch.randn((2, 5, 128)).double()
-    result = net(sample, 700, encoder_hidden_states=text).sample
+    result = net(sample, 885, encoder_hidden_states=text).sample
     # The mean of 96 cells has a standard deviation of 1 / sqrt(96).
     mean = sample[:, :48].flatten(2).sum(dim=2) / 96**0.5
     # Half of the way from where the answer is settled to where it is open.
     drawn = 0.5 * net.draw(torch.cat([mean, text[:, 4]], dim=1))
     draw, net.draw = net.draw, None
-    expected = net(sample, 700, encoder_hidden_states=text + drawn[:, None]).sample
+    expected = net(sample, 885, encoder_hidden_states=text + drawn[:, None]).sample
     assert torch.allclose(result, expected, rtol=0, atol=1e-10)
-    assert not torch.allclose(result, net(sample, 700, text).sample, rtol=0, atol=1e-4)
+    assert not torch.allclose(result, net(sample, 885, text).sample, rtol=0, atol=1e-4)
     net.draw = draw
-    late = net(sample, torch.tensor([600, 500]), text).sample
+    late = net(sample, torch.tensor([850, 500]), text).sample
     net.draw = None
-    assert torch.equal(late, net(sample, torch.tensor([600, 500]), text).sample)
+    assert torch.equal(late, net(sample, torch.tensor([850, 500]), text).sample)
 
 
-@pytest.mark.parametrize("betas", [editor.SD_BETAS, editor.EARLY_BETAS])
-def test_the_schedule_ends_in_pure_noise(betas):
-    scheduler = editor.scheduler(betas)
-    root = np.cumprod(1 - np.linspace(betas[0] ** 0.5, betas[1] ** 0.5, 1000) ** 2) ** 0.5
+@pytest.mark.parametrize("shift", [1, editor.SHIFT])
+def test_the_schedule_ends_in_pure_noise(shift):
+    scheduler = editor.scheduler(shift)
+    first, last = (beta**0.5 for beta in editor.SD_BETAS)
+    root = np.cumprod(1 - np.linspace(first, last, 1000) ** 2) ** 0.5
     # Lin et al. 2024, algorithm 1: the root is shifted so that it ends in 0, and scaled so that it begins as before.
-    expected = ((root - root[-1]) * root[0] / (root[0] - root[-1])) ** 2
-    assert np.allclose(scheduler.alphas_cumprod.numpy(), expected, atol=1e-5)
+    root = (root - root[-1]) * root[0] / (root[0] - root[-1])
+    ratio = shift * root / (1 - root**2) ** 0.5
+    assert np.allclose(
+        scheduler.alphas_cumprod.numpy(), ratio**2 / (1 + ratio**2), rtol=0, atol=1e-5
+    )
     assert float(scheduler.alphas_cumprod[-1]) == 0
     scheduler.set_timesteps(20)
     assert scheduler.timesteps[0] == 999
@@ -399,7 +423,7 @@ def test_the_rate_falls_at_the_end():
     assert rates[0] == 0.01 and rates[99] == 1 and rates[600] == 1
     assert np.all(np.diff(rates[100:]) <= 0)
     assert 0 < rates[-1] < 0.03
-    steps = editor.draw_steps(20_000, np.random.default_rng(0)).numpy()
+    steps = editor.draw_steps(20_000, np.random.default_rng(0), 600).numpy()
     assert (steps >= 600).mean() == pytest.approx(0.6, abs=0.02)
 
 
