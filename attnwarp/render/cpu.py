@@ -203,6 +203,7 @@ class _Composite(torch.autograd.Function):
                     total,
                     gradients,
                     d_view[k],
+                    projection_backward.workspace(),
                 )
                 for k, piece in enumerate(pieces)
             ],
