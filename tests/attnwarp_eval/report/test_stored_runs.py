@@ -2,8 +2,9 @@
 
 ``data/runs.tar.xz`` holds ``variants`` (the probes of variants on two scenes, 24 x 24 px) and
 ``edits`` (sensitivity, without encoders) as revision 33b7813e6823 wrote them, with its report.md and
-results.jsonl of ``report --no-timings --no-pictures``. Where a protocol or a scene is changed on
-purpose, run the studies in their study.json again and put the new folders there.
+results.jsonl of ``report --no-timings --no-pictures``. Its two scenes said ``bounces: 1``, so today's
+are given that. Where a protocol is changed on purpose, run the studies in their study.json again and
+put the new folders there.
 """
 
 import json
@@ -12,6 +13,7 @@ import shutil
 import tarfile
 
 import pytest
+from direct_light import direct
 
 from attnwarp_eval.report import write_report
 from attnwarp_eval.study import Store
@@ -20,6 +22,11 @@ from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.store import StoreError
 
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
+
+
+@pytest.fixture(autouse=True)
+def scenes_of_direct_light(monkeypatch):
+    monkeypatch.setattr(runner, "load_scene", direct)
 
 
 @pytest.fixture(scope="module")

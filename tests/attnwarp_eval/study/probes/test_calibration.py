@@ -177,4 +177,4 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
     assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
     assert planned == full == "volpath" and "medium" in why
     assert sections(old={}) == []
-    assert plan_words(plan(load_scene("lens")).to_dict()) == "direct, thin lens"
+    assert plan_words(plan(load_scene("lens")).to_dict()) == "path, thin lens"
