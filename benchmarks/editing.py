@@ -4,6 +4,11 @@ Each plan is fitted on seven of eight views, which gives its held-out PSNR, and 
 all views. A plan's fit and edit are resumed in --work.
 
     python -m benchmarks.editing DATA --work FOLDER --out reports/editing/time.md
+
+With --ratio, in its place: the seconds of propagation against those of the same views edited one by
+one, tuning apart, in turn in one process.
+
+    python -m benchmarks.editing --ratio --rounds 9
 """
 
 from __future__ import annotations
@@ -11,9 +16,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +29,25 @@ import torch
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.fit import FitSettings, fit, from_points, hold_out, load_views
 from attnwarp.io import read_dataset
-from attnwarp.propagate import PRESETS, preset, propagate
+from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
 from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
 
 INSTRUCTION = "make it snow"
+
+ONE_BY_ONE = "each view alone"
+
+EDITING_PARTS = ("source", "warp", "edit")
+"""Parts of an edit's seconds that are neither files nor tuning."""
+
+
+RATIO_OPTIONS = (
+    ("pixels", 256, "side of the views"),
+    ("splats", 30_000, "of the scene"),
+    ("views", 9, "that are edited, the source among them"),
+    ("steps", 20, "of denoising"),
+    ("rounds", 5, "each with both"),
+)
 
 
 @dataclass(frozen=True)
@@ -138,6 +158,95 @@ def table(rows: Sequence[dict[str, Any]], data: Path, load: float) -> str:
     return "\n".join(lines)
 
 
+def against_one_by_one(
+    editor_name: str, *, pixels: int, count: int, views: int, steps: int, rounds: int
+) -> dict[str, list[dict[str, float]]]:
+    """Seconds by part and network rows of propagation and of each view edited alone.
+
+    Both edit the same views in the same batches from the same noise, without tuning.
+
+    Args:
+        editor_name: of the editor.
+        pixels: side of the views.
+        count: of splats.
+        views: the source and the views nearest to it.
+        steps: of denoising.
+        rounds: each runs propagation twice and one by one once, in an order drawn anew.
+
+    Returns:
+        "propagation", "again" (the same a second time) and "one by one": by round.
+    """
+    from attnwarp_eval.cost import AGAIN, in_turn
+    from attnwarp_eval.world import splats, world
+
+    scene = world("bear", pixels)
+    nearest = sorted(scene.yaw, key=lambda name: scene.yaw[name])[: views - 1]
+    cameras = [scene.source, *(scene.camera(name) for name in nearest)]
+    model = splats("bear", pixels, 0, kind="2d", count=count, position_noise=0.1, normal_noise=3.0)
+    editor = load_editor(editor_name)
+    torch.set_num_threads(thread_count(editor))
+    size = editor.unet.config.sample_size * editor.factor
+    warped = preset("corrected", steps=steps, iterations=0, size=size)
+    figures: dict[str, list[dict[str, float]]] = {"propagation": [], "again": [], "one by one": []}
+
+    def run(name: str, settings: PropagateSettings, turn: int) -> None:
+        result = propagate(model, cameras, None, editor, INSTRUCTION, settings)
+        row = {**result.seconds, "network_rows": result.counters["network_rows"]}
+        figures["again" if turn >= AGAIN else name].append(row)
+
+    in_turn(
+        [
+            lambda turn: run("propagation", warped, turn),
+            lambda turn: run("one by one", replace(warped, method=ONE_BY_ONE), turn),
+        ],
+        rounds,
+    )
+    # The first round compiles.
+    return {name: rows[-rounds:] for name, rows in figures.items()}
+
+
+def ratio_table(figures: dict[str, list[dict[str, float]]], load: float) -> str:
+    """A Markdown table of :func:`against_one_by_one`: medians, and the ratio in each round."""
+    sums = {"editing": EDITING_PARTS, "editing and files": (*EDITING_PARTS, "write")}
+    taken = {
+        name: {
+            **{part: [row.get(part, 0.0) for row in rows] for part in (*EDITING_PARTS, "write")},
+            **{
+                s: [sum(row.get(p, 0.0) for p in parts) for row in rows]
+                for s, parts in sums.items()
+            },
+        }
+        for name, rows in figures.items()
+    }
+
+    def ratio(first: str, second: str, part: str) -> str:
+        pairs = zip(taken[first][part], taken[second][part], strict=True)
+        ratios = sorted(a / b for a, b in pairs)
+        return f"{statistics.median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f})"
+
+    lines = [
+        "| seconds | propagation | one by one | ratio: median of rounds (lowest, highest) |"
+        " propagation to itself |",
+        "|---|---|---|---|---|",
+    ]
+    for part in (*EDITING_PARTS, "write", *sums):
+        both = [statistics.median(taken[name][part]) for name in ("propagation", "one by one")]
+        ratios = ("", "")
+        if part in sums:
+            ratios = ratio("propagation", "one by one", part), ratio("again", "propagation", part)
+        lines.append(f"| {part} | {both[0]:.3f} | {both[1]:.3f} | {ratios[0]} | {ratios[1]} |")
+    rows = [figures[name][0]["network_rows"] for name in ("propagation", "one by one")]
+    lines += [
+        "",
+        f"Rows through the network: {rows[0]:.0f} and {rows[1]:.0f}."
+        f" {len(figures['propagation'])} rounds; {len(os.sched_getaffinity(0))} threads; load"
+        f" average of the machine at the end {load:.1f}. Above the number of threads, seconds are"
+        " too long and ratios noisy.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -150,7 +259,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--plans", nargs="*", help="names of the rows; all if left out")
     parser.add_argument("--fit-only", action="store_true", help="leave the edits out")
     parser.add_argument("--out", type=Path, help="also write the table here")
+    parser.add_argument(
+        "--ratio", action="store_true", help="time propagation against views edited one by one"
+    )
+    for name, default, meaning in RATIO_OPTIONS:
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"of --ratio: {meaning}")
     options = parser.parse_args(arguments)
+    if options.ratio:
+        figures = against_one_by_one(
+            options.editor,
+            pixels=options.pixels,
+            count=options.splats,
+            views=options.views,
+            steps=options.steps,
+            rounds=options.rounds,
+        )
+        text = ratio_table(figures, os.getloadavg()[0])
+        if options.out is not None:
+            options.out.write_text(text)
+        print(text)
+        return
     data = options.data
     if data is None:
         from attnwarp_eval.cli.main import app

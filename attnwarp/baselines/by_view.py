@@ -91,4 +91,7 @@ class _ByView:
                 noise=work.noise(number, group),
                 watch=lambda step, steps, latents: watch(),
             )
-        return [ViewEdit(picture, {"start": start}) for picture in result.images]
+        about: dict[str, Any] = {"start": start}
+        if start is not None:
+            about["timesteps"] = result.timesteps
+        return [ViewEdit(picture, about) for picture in result.images]

@@ -18,7 +18,7 @@ from attnwarp.baselines.settings import DGESettings
 from attnwarp.baselines.work import KEYS, VIEWS, Round, ViewEdit, Work, chunks, parts_of
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.schedule import following, steps_from
+from attnwarp.editing.schedule import following, steps_as_published, steps_from
 from attnwarp.gaussians import Gaussians
 
 
@@ -82,16 +82,16 @@ class _DGE:
             self.rounds.append(Round((tuple(views),), tuple(views), iterations))
 
     def rows(self, number: int, group: Sequence[int]) -> int:
-        timesteps = self._timesteps(number)
-        with_keys = sum(t >= self.settings.plain_below for t in timesteps)
+        with_keys = sum(self._with_keys(number))
         batches = len(chunks(group, self.settings.batch))
-        return (len(timesteps) * len(group) + with_keys * batches) * self.work.branches()
+        return (self.settings.steps * len(group) + with_keys * batches) * self.work.branches()
 
     def edit(
         self, number: int, group: Sequence[int], model: Gaussians, watch: Callable[[], None]
     ) -> list[ViewEdit]:
-        work, s, timesteps = self.work, self.settings, self._timesteps(number)
+        work, s = self.work, self.settings
         editor: Any = work.editor
+        timesteps = steps_as_published(editor.schedule, self._start(number), s.steps)
         cameras = [work.scene.cameras[view] for view in group]
         batches = chunks(range(len(group)), s.batch)
         generator = work.generator(KEYS, number)
@@ -105,9 +105,11 @@ class _DGE:
             with key_views(
                 editor.unet, task.branches, (x.shape[2], x.shape[3]), s.epipolar
             ) as attention:
-                for now, then in following(timesteps):
+                for (now, then), with_keys in zip(
+                    following(timesteps), self._with_keys(number), strict=True
+                ):
                     outputs = []
-                    if now >= s.plain_below:
+                    if with_keys:
                         keys = [_drawn(batch, generator) for batch in batches]
                         drawn.append([cameras[key].name for key in keys])
                         key_cameras = [cameras[key] for key in keys]
@@ -115,7 +117,7 @@ class _DGE:
                             _part(task, keys).predict(x[keys], now)
                     for place, batch in enumerate(batches):
                         views, part = list(batch), _part(task, batch)
-                        if now < s.plain_below:
+                        if not with_keys:
                             outputs.append(part.predict(x[views], now))
                             continue
                         nearest = 1 if place == 0 else s.nearest
@@ -125,12 +127,18 @@ class _DGE:
                     x = editor.schedule.step(torch.cat(outputs), x, now, then)
                     watch()
             pictures = editor.decode(x)
-        about = {"start": timesteps[0], "keys": drawn}
+        about = {"start": self._start(number), "timesteps": timesteps, "keys": drawn}
         return [ViewEdit(picture, about) for picture in pictures]
 
-    def _timesteps(self, number: int) -> list[int]:
+    def _start(self, number: int) -> int:
+        """Stable Diffusion's timestep that a round starts from."""
         starts = self.settings.starts
-        return steps_from(starts[min(number, len(starts) - 1)], self.settings.steps)
+        return starts[min(number, len(starts) - 1)]
+
+    def _with_keys(self, number: int) -> list[bool]:
+        """Of each step of a round, whether views take the outputs of key views there."""
+        published = steps_from(self._start(number), self.settings.steps)
+        return [timestep >= self.settings.plain_below for timestep in published]
 
 
 def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:

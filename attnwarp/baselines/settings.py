@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal, TypeVar, get_args
 
 from attnwarp import check
+from attnwarp.editing.schedule import PUBLISHED_STEPS
 
 Noise = Literal["fresh", "shared"]
 Latents = Literal["inversion", "random"]
@@ -49,6 +50,10 @@ class Budget:
 @dataclass(frozen=True)
 class BaselineSettings:
     """What all baselines have. Each has a class of its own with its published numbers.
+
+    Timesteps are Stable Diffusion's, in [0, 999]. On the editor's own schedule each becomes the
+    step that leaves as much of the picture
+    (:func:`attnwarp.editing.schedule.steps_as_published`).
 
     Args:
         seed: of everything random.
@@ -289,12 +294,15 @@ def _check_number(name: str, value: Any) -> None:
 def _check_timesteps(name: str, value: Any) -> None:
     if value is None and name == "start":
         return
-    right = isinstance(value, tuple) and all(isinstance(t, int) and t >= 0 for t in value)
+    right = isinstance(value, tuple) and all(
+        isinstance(t, int) and 0 <= t < PUBLISHED_STEPS for t in value
+    )
+    limits = f"of Stable Diffusion, in [0, {PUBLISHED_STEPS - 1}]"
     if name == "start":
         if not right or len(value) != 2 or value[0] > value[1]:
-            raise ValueError(f"start: got {value!r}, expected (lowest, highest) timestep")
+            raise ValueError(f"start: got {value!r}, expected (lowest, highest) timestep {limits}")
     elif not right or not value:
-        raise ValueError(f"starts: got {value!r}, expected timesteps, at least one")
+        raise ValueError(f"starts: got {value!r}, expected timesteps {limits}, at least one")
 
 
 _STABLE_DIFFUSION: dict[str, Any] = {

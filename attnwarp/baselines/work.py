@@ -179,7 +179,9 @@ class Work:
         return torch.cat([shared_noise(one, seed) for seed in seeds])
 
     def timestep(self, number: int, view: int, limits: tuple[int, int]) -> int:
-        """Timestep that an edit starts from, drawn evenly within limits, both included."""
+        """Stable Diffusion's timestep that an edit starts from, drawn evenly within limits, both
+        included.
+        """
         low, high = limits
         views = () if self.settings.noise == "shared" else (view,)
         generator = self.generator(TIMESTEP, number, *views)

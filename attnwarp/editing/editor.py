@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.editing.schedule import Schedule, following, steps_from
+from attnwarp.editing.schedule import Schedule, following, steps_as_published
 
 Image = npt.NDArray[np.float32]
 Guide = Literal["picture", "depth"]
@@ -79,7 +79,7 @@ class Edit:
     Attributes:
         images: (H, W, 3) float32 sRGB in [0, 1], one a view.
         latents: (B, C, h, w) scaled latents.
-        timesteps: that were run.
+        timesteps: of the editor's schedule that were run.
     """
 
     images: list[Image]
@@ -124,8 +124,10 @@ def edit(
         prompt: instruction or description.
         steps: of DDIM.
         seed: of the noise, which the views share.
-        start: timestep T to start from: the views' own latents are noised to T, then ``steps``
-            steps follow. Left out, the edit starts from pure noise.
+        start: Stable Diffusion's timestep T to start from, as publications give it: the views' own
+            latents are noised to the share of signal that T stands for, then ``steps`` steps follow
+            (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
+            pure noise.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
         noise: (B, C, h, w) in place of the seed's.
         latents: (B, C, h, w) to begin from as they are, such as those of an inversion.
@@ -141,7 +143,11 @@ def edit(
     """
     task = editor.task(guides, prompt)
     device, dtype = editor.unet.device, editor.unet.dtype
-    timesteps = editor.timesteps(steps) if start is None else steps_from(start, steps)
+    timesteps = (
+        editor.timesteps(steps)
+        if start is None
+        else steps_as_published(editor.schedule, start, steps)
+    )
     if noise is None:
         noise = shared_noise(task.shape, seed)
     check.shape(noise, task.shape, "noise")
@@ -156,7 +162,7 @@ def edit(
     else:
         before = editor.encode(guides if pictures is None else pictures)
         check.shape(before, task.shape, "pictures")
-        x = editor.schedule.add_noise(before, noise, start)
+        x = editor.schedule.add_noise(before, noise, timesteps[0])
     with torch.no_grad():
         for number, (now, then) in enumerate(following(timesteps)):
             change = None if estimate is None else partial(estimate, number)

@@ -13,6 +13,9 @@ from attnwarp import check
 
 Prediction = Literal["epsilon", "sample", "v_prediction"]
 
+PUBLISHED_STEPS = 1000
+"""Steps of Stable Diffusion, whose numbers publications give."""
+
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
@@ -105,6 +108,62 @@ def steps_from(start: int, steps: int) -> list[int]:
             f"start, steps: got {start}, {steps}, expected at least one step and start >= steps - 1"
         )
     return [round((start + 1) * (steps - k) / steps) - 1 for k in range(steps)]
+
+
+def stable_diffusion_alphas() -> Tensor:
+    """(1000,) float64 alpha-bar of Stable Diffusion 1.
+
+    The products of 1 - beta, whose roots rise evenly from sqrt(0.00085) to sqrt(0.012):
+    ``scaled_linear`` in diffusers, ``make_beta_schedule`` in CompVis' code. The last is 0.0047:
+    7 % of the signal's amplitude is left.
+    """
+    roots = torch.linspace(0.00085**0.5, 0.012**0.5, PUBLISHED_STEPS, dtype=torch.float64)
+    return torch.cumprod(1 - roots.square(), 0)
+
+
+def steps_as_published(schedule: Schedule, start: int, steps: int) -> list[int]:
+    """The steps of a schedule that stand for steps of Stable Diffusion, as publications give them.
+
+    A method that noises a picture to a published timestep T relies on the share of the picture that
+    is left there, sqrt(alpha-bar), and not on the number T. So each of Stable Diffusion's steps
+    that fall evenly from ``start`` (:func:`steps_from`) becomes the step whose alpha-bar is nearest
+    to it. With Stable Diffusion's own schedule that is the same step.
+
+    Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it does
+    not become the pure noise that another schedule may end in. Where neighbours have the same
+    nearest step, each is one below the other, so that no step is taken twice. A range of T is drawn
+    from on Stable Diffusion's clock, each draw becomes a step here: so shares of signal come as
+    often as published.
+
+    Args:
+        schedule: of the editor.
+        start: Stable Diffusion's first timestep, in [0, 999].
+        steps: how many.
+
+    Raises:
+        ValueError: no such timestep, or more steps than the schedule has from there.
+
+    Example:
+        >>> alphas = stable_diffusion_alphas()
+        >>> steps_as_published(Schedule(alphas, "epsilon", 1.0), 980, 4)
+        [980, 735, 489, 244]
+        >>> clearer = 4 * alphas / (1 + 3 * alphas)  # twice the signal for the same noise
+        >>> steps_as_published(Schedule(clearer, "epsilon", 1.0), 700, 4)
+        [856, 713, 558, 360]
+    """
+    check.number(start, 0, PUBLISHED_STEPS - 1, "start", whole=True)
+    published = stable_diffusion_alphas()[steps_from(start, steps)]
+    own = schedule.alphas.double().cpu()
+    result: list[int] = []
+    for alpha in published:
+        nearest = int((own - alpha).abs().argmin())
+        result.append(min(nearest, result[-1] - 1) if result else nearest)
+    if result[-1] < 0:
+        raise ValueError(
+            f"steps: got {steps} from {start}, which is step {result[0]} of this editor's schedule;"
+            f" take at most {result[0] + 1}"
+        )
+    return result
 
 
 def following(timesteps: list[int]) -> list[tuple[int, int | None]]:

@@ -24,7 +24,7 @@ from attnwarp.editing.attention import (
 )
 from attnwarp.editing.editor import Editor, edit, shared_noise
 from attnwarp.editing.inversion import edit_friendly_invert, replay
-from attnwarp.editing.schedule import steps_from
+from attnwarp.editing.schedule import steps_as_published
 from attnwarp.propagate.noise import carried, unmoved
 from attnwarp.propagate.pictures import Image
 from attnwarp.propagate.settings import PropagateSettings
@@ -84,7 +84,7 @@ class ViewEditor:
         announce: told the memory of a recording before it is made.
 
     Attributes:
-        timestep: drawn to start from; None for pure noise.
+        timestep: Stable Diffusion's, drawn to start from; None for pure noise.
     """
 
     def __init__(
@@ -111,7 +111,8 @@ class ViewEditor:
             low, high = settings.start
             generator = torch.Generator().manual_seed(settings.seed)
             self.timestep = int(torch.randint(low, high + 1, (1,), generator=generator))
-            steps_from(self.timestep, settings.steps)  # refuses more steps than timesteps
+            # Refuses more steps than there are timesteps.
+            steps_as_published(editor.schedule, self.timestep, settings.steps)
 
     def source(
         self,
@@ -329,7 +330,7 @@ class ViewEditor:
         timesteps = (
             self.editor.timesteps(s.steps)
             if self.timestep is None
-            else steps_from(self.timestep, s.steps)
+            else steps_as_published(self.editor.schedule, self.timestep, s.steps)
         )
         latents = self.editor.encode([picture])
         generator = torch.Generator().manual_seed(s.seed + 1)

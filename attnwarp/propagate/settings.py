@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 from attnwarp import check
 from attnwarp.editing.attention import Block, Kind
+from attnwarp.editing.schedule import PUBLISHED_STEPS
 from attnwarp.warp import PRESETS as WARP_PRESETS
 from attnwarp.warp import WarpSettings
 
@@ -60,8 +61,10 @@ class PropagateSettings:
         noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
             a point of the surface has the same noise in every view
             (:mod:`attnwarp.propagate.noise`).
-        start: (lowest, highest) timestep, of which one is drawn for all views, to start from in
-            place of pure noise.
+        start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
+            to start from in place of pure noise. On the editor's own schedule it becomes the step
+            that leaves as much of the picture
+            (:func:`attnwarp.editing.schedule.steps_as_published`).
         start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
         text_guidance: s_T of the first stage; None for the editor's own.
         guidance_drop: what each further stage takes off s_T.
@@ -247,9 +250,12 @@ _LIMITS: dict[str, tuple[float, float]] = {
 def _check_start(start: tuple[int, int] | None) -> None:
     if start is None:
         return
-    right = len(start) == 2 and all(isinstance(t, int) and t >= 0 for t in start)
+    right = len(start) == 2 and all(isinstance(t, int) and 0 <= t < PUBLISHED_STEPS for t in start)
     if not right or start[0] > start[1]:
-        raise ValueError(f"start: got {list(start)}, expected [lowest, highest] timestep")
+        raise ValueError(
+            f"start: got {list(start)}, expected [lowest, highest] timestep of Stable Diffusion, in"
+            f" [0, {PUBLISHED_STEPS - 1}]"
+        )
 
 
 _RELEASED = PropagateSettings(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from tiny_baselines import QUICK, close, rows_of
+from tiny_editors import nearest_steps
 from tiny_scenes import cameras
 
 from attnwarp import Camera, baselines
@@ -96,6 +97,34 @@ def test_views_that_look_at_others_differ_from_views_alone(
     alone = ByViewSettings(steps=2, iterations=0, start=start)
     floor = by_view(model, views, images, kind, "a bear", alone).edited
     assert all(close(apart[view], floor[view]) for view in range(3))
+
+
+def test_published_timesteps_stand_for_the_share_of_the_picture_that_is_left(
+    run, scene, editor, monkeypatch
+):
+    # At every step twice the signal that Stable Diffusion has for the same noise.
+    alphas = 4 * editor.schedule.alphas / (1 + 3 * editor.schedule.alphas)
+    with_its_own = run("dge", replace(SETTINGS["dge"], steps=4, iterations=0)).counters
+    monkeypatch.setattr(editor, "schedule", Schedule(alphas, "epsilon", 1.0))
+    clock = [700, 525, 349, 174]
+    for name, settings in {
+        "by_view": ByViewSettings(start=(700, 700)),
+        "igs2gs": IGS2GSSettings(start=(700, 700)),
+        "dge": DGESettings(starts=(700,), batch=2),
+    }.items():
+        steps = []
+        handle = editor.unet.register_forward_pre_hook(
+            lambda module, args, steps=steps: steps.append(int(args[1]))
+        )
+        try:
+            result = run(name, replace(settings, steps=4, iterations=0), alone(scene))
+        finally:
+            handle.remove()
+        assert list(dict.fromkeys(steps)) == nearest_steps(alphas, clock), name
+        assert steps[0] > 800
+    # As many steps with key views as on Stable Diffusion's own schedule.
+    result = run("dge", replace(SETTINGS["dge"], steps=4, iterations=0))
+    assert result.counters == with_its_own
 
 
 # --- Instruct-GS2GS

@@ -1,5 +1,6 @@
 """Oracle: diffusers' own pipelines on the same small random models, latents and noise."""
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler
-from tiny_editors import controlnet, pix2pix
+from tiny_editors import controlnet, nearest_steps, pix2pix
 
 from attnwarp.editing.attention import (
     CONTROLNET_BRANCHES,
@@ -22,7 +23,8 @@ from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.folder import load_parts
 from attnwarp.editing.pix2pix import InstructPix2Pix
-from attnwarp.editing.schedule import Schedule, following, steps_from
+from attnwarp.editing.schedule import Schedule, following, steps_as_published, steps_from
+from attnwarp.editing.small import WEIGHTS, bundled
 from attnwarp.errors import InputError
 
 H, W = 16, 24
@@ -140,6 +142,49 @@ def test_steps_from_the_last_are_diffusers_trailing_ones():
         assert steps_from(999, steps) == scheduler.timesteps.tolist()
     with pytest.raises(ValueError, match="start, steps: got 3, 20"):
         steps_from(3, 20)
+
+
+STABLE_DIFFUSION = {"beta_schedule": "scaled_linear", "beta_start": 0.00085, "beta_end": 0.012}
+
+
+def test_published_steps_are_those_of_diffusers_stable_diffusion():
+    schedule = Schedule.of(DDIMScheduler(**STABLE_DIFFUSION))
+    for step in range(1000):
+        assert steps_as_published(schedule, step, 1) == [step]
+    assert steps_as_published(schedule, 980, 20) == steps_from(980, 20)
+    assert steps_as_published(schedule, 999, 1000) == list(range(999, -1, -1))
+    for start in (-1, 1000):
+        with pytest.raises(ValueError, match=rf"start: got {start}, expected a whole number in"):
+            steps_as_published(schedule, start, 1)
+
+
+def schedulers():
+    """Those of the bundled editors, Stable Diffusion's without a rest of signal, and another."""
+    yield from (DDIMScheduler.from_pretrained(WEIGHTS / name / "scheduler") for name in bundled())
+    yield DDIMScheduler(**STABLE_DIFFUSION, rescale_betas_zero_snr=True)
+    yield DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2")
+
+
+def test_a_published_step_is_the_one_that_leaves_as_much_of_the_picture():
+    published = [0, 1, 20, 100, 299, 500, 700, 820, 980, 998, 999]
+    for scheduler in schedulers():
+        schedule = Schedule.of(scheduler)
+        steps = [steps_as_published(schedule, step, 1)[0] for step in published]
+        assert steps == nearest_steps(schedule.alphas, published)
+        # Stable Diffusion never hides a picture wholly, so no step becomes pure noise.
+        assert schedule.alphas[steps[-1]] > 0
+        # Those that methods take fall evenly on Stable Diffusion's clock.
+        falling = [round(981 * k / 4) - 1 for k in (4, 3, 2, 1)]
+        assert steps_as_published(schedule, 980, 4) == nearest_steps(schedule.alphas, falling)
+
+
+def test_published_steps_with_one_nearest_step_fall_one_by_one():
+    schedule = Schedule.of(DDIMScheduler(num_train_timesteps=50, beta_schedule="squaredcos_cap_v2"))
+    steps = steps_as_published(schedule, 980, 40)
+    assert len(steps) == 40
+    assert all(after < before for before, after in itertools.pairwise(steps))
+    with pytest.raises(ValueError, match=r"steps: got 60 from 980, which is step 47 .*at most 48"):
+        steps_as_published(schedule, 980, 60)
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])

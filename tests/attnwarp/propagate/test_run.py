@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tiny_baselines import rows_of
+from tiny_editors import nearest_steps
 from tiny_scenes import cameras, pictures, splats
 
 from attnwarp import Camera, Gaussians
 from attnwarp.editing.editor import edit, shared_noise
+from attnwarp.editing.schedule import Schedule
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate import preset, propagate
@@ -214,18 +217,15 @@ def test_the_folder_holds_what_a_person_wants(finished, scene):
 
 
 def test_counters_are_what_was_done(scene, editor):
-    rows = 0
-
-    def count(module, args, kwargs):
-        nonlocal rows
-        rows += (args[0] if args else kwargs["sample"]).shape[0]
-
-    handle = editor.unet.register_forward_pre_hook(count, with_kwargs=True)
-    result = run(scene, editor, settings=replace(QUICK, batch=2))
-    handle.remove()
-    assert result.counters["network_rows"] == rows == 5 * 2 * 3
+    settings = replace(QUICK, batch=2)
+    rows, result = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
+    assert result.counters["network_rows"] == sum(rows) == 5 * 2 * 3
     assert result.counters["iterations"] == 6
     assert result.counters["views"] == 5
+    # Each view alone takes the same passes: carrying the edit asks nothing more of the network.
+    settings = replace(settings, method="each view alone", iterations=0)
+    alone, _ = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
+    assert alone == rows
 
 
 def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, editor):
@@ -403,6 +403,23 @@ def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
     result = run(scene, editor, settings=replace(QUICK, start=(700, 700), start_picture="original"))
     noised = edit(editor, [scene[2][0]], "a bear", steps=2, seed=0, start=700).images[0]
     assert np.array_equal(result.edited[0], to_bytes(noised))
+
+
+def test_the_released_start_is_a_share_of_signal(scene, editor, monkeypatch):
+    # At every step twice the signal that Stable Diffusion has for the same noise.
+    alphas = 4 * editor.schedule.alphas / (1 + 3 * editor.schedule.alphas)
+    monkeypatch.setattr(editor, "schedule", Schedule(alphas, "epsilon", 1.0))
+    steps = []
+    handle = editor.unet.register_forward_pre_hook(lambda module, args: steps.append(int(args[1])))
+    settings = replace(QUICK, stages=1, iterations=0, steps=4, start=(700, 700))
+    by_hand = scene[2][0][::-1].copy()
+    try:
+        run(scene, editor, settings=settings)
+        # An edit made by hand is inverted along the same steps.
+        run(scene, editor, settings=settings, source_picture=by_hand)
+    finally:
+        handle.remove()
+    assert set(steps) == set(nearest_steps(alphas, [700, 525, 349, 174]))
 
 
 def test_depth_of_the_frozen_model_does_not_follow_the_tuning(scene, editor, tmp_path):

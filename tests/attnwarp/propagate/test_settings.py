@@ -60,6 +60,7 @@ def test_settings_survive_json(name):
         ({"steps": 2.5}, "steps: got 2.5, expected a whole number"),
         ({"noise": "frsh"}, "did you mean 'fresh'"),
         ({"start": (5, 3)}, "start: got \\[5, 3\\]"),
+        ({"start": (700, 1000)}, "start: got \\[700, 1000\\], .* in \\[0, 999\\]"),
         ({"stagse": 1}, "did you mean 'stages'"),
         ({"warp.opaqe": 1}, "did you mean 'opaque'"),
         ({"mask": 1}, "mask: got 1, expected true or false"),

@@ -72,6 +72,10 @@ inside the edited object."""
 STOPWATCH = Stopwatch()
 """Seconds of the methods that this process has run."""
 
+START_PROTOCOL = 2
+"""Of methods that start from partly noised pictures. Up to 1, a published timestep was a number of
+the editor's own schedule; it stands for Stable Diffusion's share of signal."""
+
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
 """What the variant for a given time is chosen by; less is better."""
 
@@ -297,10 +301,13 @@ class EditingProbe(Probe[EditResult]):
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""
         own = variant.part(VariantPart)
+        settings = settings_of(study, variant, seed)
+        noised = settings.get("start") or settings.get("starts")
         return {
             "spp": study.spp,
             "method": own.method,
-            "settings": settings_of(study, variant, seed),
+            "settings": settings,
+            **({"start_protocol": START_PROTOCOL} if noised else {}),
             "editor": editor_identity(editor_of(study, variant)),
             "geometry": variant.geometry,
             "mask": own.mask,
