@@ -35,8 +35,6 @@ from attnwarp.render.threads import set_thread_count
 
 INSTRUCTION = "make it snow"
 
-ONE_BY_ONE = "each view alone"
-
 EDITING_PARTS = ("source", "warp", "edit")
 """Parts of an edit's seconds that are neither files nor tuning."""
 
@@ -197,7 +195,7 @@ def against_one_by_one(
     in_turn(
         [
             lambda turn: run("propagation", warped, turn),
-            lambda turn: run("one by one", replace(warped, method=ONE_BY_ONE), turn),
+            lambda turn: run("one by one", replace(warped, method="each view alone"), turn),
         ],
         rounds,
     )
