@@ -127,10 +127,14 @@ def test_fitted_splats_are_read_from_the_run(run, edited):
     assert torch.equal(model.sh, read_ply(file).sh)
 
 
-def test_the_window_of_an_edit_shows_every_inset(edited):
-    state = State("oracle", edited.targets[0], step="edited")
+def test_the_window_of_an_edit_shows_every_inset_once_its_slider_is_at_edited(edited):
+    state = State("oracle", edited.targets[0], step="before")
     window = Window(edited, state, off_screen=True, size=(600, 360))
     try:
+        window._add_sliders()
+        slider = window._sliders["step"][0]
+        slider.GetRepresentation().SetValue(1)
+        slider.InvokeEvent("EndInteractionEvent")
         image = window.plotter.screenshot(return_img=True)[..., :3] / 255
     finally:
         window.close()

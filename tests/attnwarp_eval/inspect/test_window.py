@@ -113,6 +113,23 @@ def test_fifty_pixels_picked_on_the_screen_show_the_librarys_numbers(window):
     assert tried == 50
 
 
+def test_a_slider_moved_changes_what_is_shown(window):
+    window._add_sliders()
+    for name, attribute, index, expected in (
+        ("view", "target", 1, window.targets[1]),
+        ("variant", "variant", 2, "released"),
+        ("layer", "layer", 2, (8, 8)),
+    ):
+        slider = window._sliders[name][0]
+        slider.GetRepresentation().SetValue(index)
+        slider.InvokeEvent("EndInteractionEvent")
+        assert getattr(window.state, attribute) == expected
+        assert slider.GetRepresentation().GetTitleText().startswith(f"{name}: ")
+    window.plotter.clear_slider_widgets()
+    window._sliders.clear()
+    window.show(target="yaw060", variant="corrected", layer=None)
+
+
 @pytest.mark.parametrize("key", [*"evpfswri3uq", "Up", "plus"])
 def test_a_key_does_what_is_listed_and_nothing_of_vtks_or_pyvistas(window, key):
     """Of theirs, e closes the window, v turns the view, w draws wires, 3 is for red-blue glasses."""
