@@ -81,12 +81,12 @@ class Contestant:
 
     def run(self, folder: Path, size: int) -> None:
         """Draw the scene once."""
-        words = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", folder / "scene.ply"]
-        words += ["--data", folder, "--size", str(size), "--splats"]
+        words = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
+        words += [str(folder / "scene.ply"), "--data", str(folder), "--size", str(size), "--splats"]
         path = os.pathsep.join([str(self.checkout), str(self.checkout / "eval")])
         start = time.perf_counter()
         process = subprocess.Popen(
-            [*words, "--screenshot", folder / "first.png"],
+            [*words, "--screenshot", str(folder / "first.png")],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": path},
             stdout=subprocess.DEVNULL,

@@ -204,11 +204,19 @@ def of_run(
         >>> of_run(store.root).scene
         'spheres'
     """
-    from attnwarp_eval.study.study import parse_study
+    from pydantic import ValidationError
+
+    from attnwarp_eval.study.study import explain_errors, parse_study
     from attnwarp_eval.world import world
 
     stored = Store(folder).read_study()
-    study = parse_study(stored["study"])
+    try:
+        study = parse_study(stored["study"])
+    except ValidationError as error:
+        raise InputError(
+            f"{folder / 'study.json'}: {explain_errors(error)}; run the study again with --out"
+            f" {folder}, which writes it anew"
+        ) from None
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     scene = scene or study.scenes[0]

@@ -160,6 +160,19 @@ def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options
     assert "attnwarp edit" in result.stderr
 
 
+def test_a_hostile_study_is_one_line_without_control_characters(tmp_path):
+    erase = "\x1b[2J"
+    for content, message in (
+        (STUDY | {"name": f"x{erase}"}, "study.json: "),
+        (STUDY | {"size": -1}, "study.json: "),
+        (STUDY | {"variants": {f"a{erase}": {}}, "probes": {"depth": [f"a{erase}"]}}, "variant: "),
+    ):
+        Store(tmp_path).write_study({"study": content, "scenes": {}, "cells": []})
+        result = CliRunner().invoke(app, ["inspect", str(tmp_path), "--variant", "b"])
+        assert result.exit_code == 2 and message in result.stderr, result.stderr
+        assert result.stderr.count("\n") == 1 and "\x1b" not in result.stderr
+
+
 def test_runs_that_do_not_fit_and_damaged_ones_are_refused(tmp_path):
     run = make(tmp_path / "changed", content="0" * 64)
     with pytest.raises(InputError, match="'spheres' has changed since the run was made"):
