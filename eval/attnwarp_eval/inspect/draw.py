@@ -5,14 +5,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from attnwarp import Camera
 from attnwarp_eval.inspect.pair import Image
-from attnwarp_eval.inspect.scene import Part, as_bytes
+from attnwarp_eval.inspect.scene import Part, as_bytes, frustum, frustum_depth
 from attnwarp_eval.inspect.subject import Subject
 
 if TYPE_CHECKING:
     import pyvista
+
+VIEW_ANGLE = 30.0
+"""Height of the view from outside, in degrees."""
+
+FILLED = 0.8
+"""Share of that view that the frusta take at most; the sliders are below it."""
 
 
 def add_part(plotter: Any, part: Part) -> Any:
@@ -44,13 +51,34 @@ def texture(image: Image) -> pyvista.Texture:
     return pyvista.Texture(np.ascontiguousarray(as_bytes(image)))
 
 
-def outside(subject: Subject, cameras: tuple[Camera, Camera]) -> list[Any]:
-    """Position, focal point and upward axis of a view of the scene and of two cameras."""
+def outside(
+    subject: Subject, cameras: tuple[Camera, Camera], aspect: float = 1.0
+) -> list[npt.NDArray[np.float64]]:
+    """Position, focal point and upward axis of a view of the scene and of two cameras.
+
+    Args:
+        subject: whose centre is in view.
+        cameras: source and target; their frusta are wholly in view, above the sliders.
+        aspect: width by height of the view, which is :data:`VIEW_ANGLE` degrees high.
+    """
     center, up = subject.center, subject.up
     eyes = np.stack([camera.position for camera in cameras]) - center
     away = eyes.mean(0)
     if np.linalg.norm(away) <= 0.3 * np.linalg.norm(eyes[0]):
         away = np.cross(eyes[0], up)
-    reach = np.linalg.norm(eyes, axis=1).max()
     direction = away / max(float(np.linalg.norm(away)), 1e-12) + 0.5 * up
-    return [center + 2.1 * reach * direction / np.linalg.norm(direction), center, up]
+    direction /= np.linalg.norm(direction)
+    right = np.cross(up, direction)
+    right /= max(float(np.linalg.norm(right)), 1e-12)
+    reach = frustum_depth(subject, cameras[0])
+    points = np.vstack([center, *(frustum(camera, reach)[0].points for camera in cameras)])
+    # Columns: right, up, toward the viewer.
+    axes = np.stack([right, np.cross(direction, right), direction], axis=1)
+    local = (points - center) @ axes
+    middle = (local.min(axis=0) + local.max(axis=0)) / 2 * [1, 1, 0]
+    across, along, toward = (local - middle).T
+    # A point's distance ahead of the viewer is the viewer's own from the middle, less its depth.
+    slope = FILLED * np.tan(np.radians(VIEW_ANGLE / 2))
+    distance = (np.maximum(abs(across) / aspect, abs(along)) / slope + toward).max()
+    focus = center + axes @ middle
+    return [focus + distance * direction, focus, up]

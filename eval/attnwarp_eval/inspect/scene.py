@@ -122,6 +122,11 @@ def frustum(camera: Camera, reach: float) -> tuple[pyvista.PolyData, Array]:
     return pyvista.PolyData(points, lines=np.array(lines).ravel()), corners
 
 
+def frustum_depth(subject: Subject, source: Camera) -> float:
+    """Depth at which frusta are drawn: a quarter of the way from the source to the scene."""
+    return 0.25 * float(np.linalg.norm(source.position - subject.center))
+
+
 def picture_plane(corners: Array) -> pyvista.PolyData:
     """A rectangle with texture coordinates, from its corners as :func:`frustum` gives them."""
     import pyvista
@@ -269,7 +274,7 @@ def parts(
 ) -> list[Part]:
     """Everything in the 3D view, in the order of drawing."""
     source, target = pair.cameras
-    reach = 0.25 * float(np.linalg.norm(source.position - subject.center))
+    reach = frustum_depth(subject, source)
     result = [
         *_camera("source", source, reach, SOURCE_COLOR, lambda: pair.images[0]),
         *_camera(

@@ -76,15 +76,25 @@ class Subject:
     edit: Edit | None = field(default=None, repr=False)
     measured: Mapping[str, Measured] = field(default_factory=dict, repr=False)
     elsewhere: str = ""
+    _pairs: dict[tuple[str, str], Pair] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def pair(self, variant: str, target: str) -> Pair:
         """One target view under one variant; an edited view of a run is named ``edit/view``.
+
+        A pair is made once.
 
         Raises:
             InputError: there is no such variant or view.
         """
         one_of(variant, list(self.variants), "variant")
         one_of(target, list(self.targets), "view")
+        if (variant, target) not in self._pairs:
+            self._pairs[variant, target] = self._pair(variant, target)
+        return self._pairs[variant, target]
+
+    def _pair(self, variant: str, target: str) -> Pair:
         chosen, model = self.variants[variant]
         settings = chosen.settings()
         if self.capture is not None:
@@ -194,11 +204,19 @@ def of_run(
         >>> of_run(store.root).scene
         'spheres'
     """
-    from attnwarp_eval.study.study import parse_study
+    from pydantic import ValidationError
+
+    from attnwarp_eval.study.study import explain_errors, parse_study
     from attnwarp_eval.world import world
 
     stored = Store(folder).read_study()
-    study = parse_study(stored["study"])
+    try:
+        study = parse_study(stored["study"])
+    except ValidationError as error:
+        raise InputError(
+            f"{folder / 'study.json'}: {explain_errors(error)}; run the study again with --out"
+            f" {folder}, which writes it anew"
+        ) from None
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     scene = scene or study.scenes[0]

@@ -50,6 +50,9 @@ FLIGHT = 40
 MOVING = 20_000
 """More splats than this are points while the view moves, so that it follows the mouse."""
 
+PICKING_TOLERANCE = 5e-4
+"""Of a click on the surface, as a share of the window's diagonal: about a pixel."""
+
 PIXELS = "pixels"
 """Name of the layer that is no feature grid."""
 
@@ -88,7 +91,6 @@ class Window:
         self.picked: PixelReport | CellReport | None = None
         self.help_shown = False
         self.changed: Callable[[], object] = lambda: None
-        self._pairs: dict[tuple[str, str], Pair] = {}
         self._drawn: dict[str, tuple[Any, ...]] = {}
         self._insets: tuple[Any, ...] = ()
         self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
@@ -103,10 +105,7 @@ class Window:
     @property
     def pair(self) -> Pair:
         """The pair of views on show."""
-        key = self.state.variant, self.state.target
-        if key not in self._pairs:
-            self._pairs[key] = self.subject.pair(*key)
-        return self._pairs[key]
+        return self.subject.pair(self.state.variant, self.state.target)
 
     @property
     def layers(self) -> list[Size | None]:
@@ -147,8 +146,11 @@ class Window:
     def look_from_outside(self) -> None:
         """A view of the scene and of both cameras."""
         self._main()
-        self.plotter.camera.view_angle = 30
-        self.plotter.camera_position = draw.outside(self.subject, self.pair.cameras)
+        self.plotter.camera.view_angle = draw.VIEW_ANGLE
+        width, height = self.plotter.renderer.GetSize()
+        self.plotter.camera_position = draw.outside(
+            self.subject, self.pair.cameras, width / max(height, 1)
+        )
         self.plotter.reset_camera_clipping_range()
         self.plotter.render()
 
@@ -198,8 +200,7 @@ class Window:
     def open(self) -> None:
         """Show the window until it is closed."""
         self._main()
-        for key, action in self.actions().items():
-            self.plotter.add_key_event(key, action)
+        self._replace_keys()
         self._add_sliders()
         self.enable_picking()
         self.plotter.show()
@@ -229,6 +230,17 @@ class Window:
             "f": self.fly,
         }
 
+    def _replace_keys(self) -> None:
+        """Bind the keys of :data:`KEYS`, and no others.
+
+        Of PyVista's and VTK's own, e closes the window and v turns the view.
+        """
+        interactor = self.plotter.iren
+        interactor.clear_key_event_callbacks()
+        interactor.style.AddObserver("CharEvent", lambda *_: None)
+        for key, action in {**self.actions(), "q": interactor.terminate_app}.items():
+            self.plotter.add_key_event(key, action)
+
     def toggle_help(self) -> None:
         """Show or hide the keys."""
         self.help_shown = not self.help_shown
@@ -239,6 +251,9 @@ class Window:
         self._main()
         self.plotter.enable_point_picking(
             callback=self._picked_point,
+            # The one for points prefers a nearer surface beside the pointer.
+            picker="cell",
+            tolerance=PICKING_TOLERANCE,
             left_clicking=True,
             show_message=False,
             show_point=False,
@@ -247,12 +262,13 @@ class Window:
         )
 
     def _picked_point(self, point: Any, picker: Any) -> None:
-        mesh, index = picker.GetDataSet(), picker.GetPointId()
-        if mesh is None or index < 0 or not mesh.GetPointData().HasArray("pixel"):
+        """Pick the target's pixel that shows a point, (3,) world, of the surface."""
+        if picker.GetDataSet() is None:
             return
-        pixel = int(mesh.GetPointData().GetArray("pixel").GetValue(index))
-        row, column = divmod(pixel, self.pair.size[1])
-        self.pick(column, row)
+        camera = self.pair.cameras[1]
+        column, row = np.floor(camera.project(np.asarray(point))[0]).astype(int).tolist()
+        if 0 <= column < camera.width and 0 <= row < camera.height:
+            self.pick(column, row)
 
     def _add_sliders(self) -> None:
         choices: dict[str, tuple[Sequence[Any], Callable[[], Any], Callable[[Any], None]]] = {
@@ -274,10 +290,13 @@ class Window:
                 pointa=(left, 0.07),
                 pointb=(left + 0.85 * width, 0.07),
                 title_height=0.018,
-                slider_width=0.03,
-                tube_width=0.006,
+                style="modern",
+                slider_width=0.025,
+                tube_width=0.004,
                 interaction_event="end",
             )
+            # VTK's key i would hide it.
+            slider.KeyPressActivationOff()
             self._sliders[name] = (
                 slider,
                 _index(values, current),
@@ -309,8 +328,21 @@ class Window:
             window_size=list(size),
         )
         plotter.set_background("white", all_renderers=True)
+        plotter.subplot(0, columns)
+        plotter.renderer.AddObserver("StartEvent", self._clear_the_view)
         plotter.render_window.AddObserver("WindowResizeEvent", self._fit_insets)
         return plotter
+
+    def _clear_the_view(self, renderer: Any, *_: Any) -> None:
+        """Hide the picture of a camera whose place the view takes: it is before all that the camera
+        sees.
+        """
+        eye = np.array(renderer.GetActiveCamera().GetPosition())
+        near = 0.5 * scene.frustum_depth(self.subject, self.pair.cameras[0])
+        for name, camera in zip(("source", "target"), self.pair.cameras, strict=True):
+            if f"{name} picture" in self._drawn:
+                far = bool(np.linalg.norm(eye - camera.position) > near)
+                renderer.actors[f"{name} picture"].visibility = far
 
     def _main(self) -> None:
         """Turn to the 3D view; the insets are the other parts of the window."""

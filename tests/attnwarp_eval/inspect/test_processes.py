@@ -14,8 +14,11 @@ import browser
 import numpy as np
 import pytest
 
+from benchmarks import inspecting
+
 pytestmark = pytest.mark.slow
 
+ROOT = Path(__file__).parents[3]
 COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect"]
 
 
@@ -119,6 +122,29 @@ def test_a_real_window_follows_its_keys_and_closes(display, tmp_path):
         screen.press("q")
         _, errors = process.communicate(timeout=300)
         assert process.returncode == 0 and not errors
+    finally:
+        process.kill()
+        screen.display.close()
+
+
+def test_a_real_window_steps_through_an_edit(display, folders):
+    """e goes before -> stage 1 -> edited -> before, where VTK's own e would close the window; the
+    screen is then what it was."""
+    process = subprocess.Popen(
+        [*COMMAND, folders / "edit", "--data", folders, "--ply", folders / "scene.ply"],
+        env=environment(DISPLAY=display), stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    screen = Screen(display)
+    try:
+        screens = [screen.settled(different=screen.picture())]
+        screen.move(550, 300)
+        for _ in range(3):
+            screen.press("e")
+            screens.append(screen.settled(different=screens[-1]))
+        assert (screens[3] == screens[0]).all() and (screens[2] != screens[0]).any()
+        screen.press("q")
+        _, errors = process.communicate(timeout=300)
+        assert process.returncode == 0 and "Traceback" not in errors
     finally:
         process.kill()
         screen.display.close()
@@ -247,51 +273,10 @@ def test_the_librarys_command_becomes_the_instruments(folders, tmp_path):
     assert "pixel (16, 16)" in done.stdout and out.stat().st_size > 1000
 
 
-FIRST_PICTURE = """
-import resource, sys, time
-from pathlib import Path
-from attnwarp_eval.cli.main import app
-folder = Path(sys.argv[1])
-data, size = str(folder), 592
-words = ["inspect", str(folder / "scene.ply"), "--data", data, "--size", str(size), "--splats"]
-app([*words, "--screenshot", str(folder / "a.png")], standalone_mode=False)
-seconds = time.process_time()
-gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-from attnwarp_eval.inspect import scene, subject
-chosen = subject.of_capture(folder / "scene.ply", folder, size=size)
-pair = chosen.pair("corrected", chosen.targets[0])
-triangles = 2 * scene.seen_surface(pair.seen, pair.colors("mask")).n_cells
-print(triangles, len(chosen.capture.model), seconds, gigabytes)
-"""
-
-
-def test_the_first_picture_of_a_large_scene_comes_soon_and_fits_in_memory(tmp_path):
-    """A hollow ball of 200,000 discs, seen from inside by pictures of 592 x 592 px."""
-    import torch
-
-    from attnwarp import Camera, Gaussians
-    from attnwarp.io import Dataset, write_ply, write_transforms
-
-    count, random = 200_000, torch.Generator().manual_seed(0)
-    away = torch.nn.functional.normalize(torch.randn((count, 3), generator=random), dim=1)
-    up = torch.tensor([0.0, 0, 1]).expand(count, 3)
-    turn = torch.cat([1 + (up * away).sum(1, keepdim=True), torch.cross(up, away, dim=1)], 1)
-    model = Gaussians(
-        "2d", 3 * away, torch.nn.functional.normalize(turn, dim=1), torch.full((count, 2), 0.02),
-        torch.full((count,), 0.95), Gaussians.sh_from_rgb(torch.rand((count, 3), generator=random)),
-    )  # fmt: skip
-    view = {"width": 592, "height": 592, "fov_y": 60}
-    cameras = [
-        Camera.look_at((0.3 * k, 0, 0), (0.3 * k, 3, 0.2), name=f"{k}.png", **view)
-        for k in range(2)
-    ]
-    write_ply(tmp_path / "scene.ply", model)
-    write_transforms(tmp_path / "transforms.json", Dataset(cameras, [None, None]))
-    done = subprocess.run(
-        [sys.executable, "-c", FIRST_PICTURE, tmp_path],
-        env=environment(), capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    triangles, splats, seconds, gigabytes = map(float, done.stdout.splitlines()[-1].split())
-    assert triangles > 600_000 and splats == count
-    # CPU seconds of all threads, imports included; a core that others use too takes longer.
-    assert seconds < 8 and gigabytes < 2
+def test_the_first_picture_of_a_large_scene_comes_soon_and_fits_in_memory():
+    """CPU seconds bound the wall seconds of a machine that has nothing else to do, as other work on
+    the same core lengthens both."""
+    result = inspecting.measure([ROOT], rounds=2)
+    (row,) = result["rows"]
+    assert result["triangles"] > 690_000 and result["splats"] == 200_000
+    assert row["cpu_best_s"] < 5 and row["peak_gib"] < 2

@@ -127,10 +127,14 @@ def test_fitted_splats_are_read_from_the_run(run, edited):
     assert torch.equal(model.sh, read_ply(file).sh)
 
 
-def test_the_window_of_an_edit_shows_every_inset(edited):
-    state = State("oracle", edited.targets[0], step="edited")
+def test_the_window_of_an_edit_shows_every_inset_once_its_slider_is_at_edited(edited):
+    state = State("oracle", edited.targets[0], step="before")
     window = Window(edited, state, off_screen=True, size=(600, 360))
     try:
+        window._add_sliders()
+        slider = window._sliders["step"][0]
+        slider.GetRepresentation().SetValue(1)
+        slider.InvokeEvent("EndInteractionEvent")
         image = window.plotter.screenshot(return_img=True)[..., :3] / 255
     finally:
         window.close()
@@ -154,6 +158,19 @@ def test_an_edited_view_without_pictures_names_what_to_open(run, edited, options
     assert result.exit_code == 2, result.output
     assert f"edited views red/{VIEW} by the variants 'oracle' alone" in result.stderr
     assert "attnwarp edit" in result.stderr
+
+
+def test_a_hostile_study_is_one_line_without_control_characters(tmp_path):
+    erase = "\x1b[2J"
+    for content, message in (
+        (STUDY | {"name": f"x{erase}"}, "study.json: "),
+        (STUDY | {"size": -1}, "study.json: "),
+        (STUDY | {"variants": {f"a{erase}": {}}, "probes": {"depth": [f"a{erase}"]}}, "variant: "),
+    ):
+        Store(tmp_path).write_study({"study": content, "scenes": {}, "cells": []})
+        result = CliRunner().invoke(app, ["inspect", str(tmp_path), "--variant", "b"])
+        assert result.exit_code == 2 and message in result.stderr, result.stderr
+        assert result.stderr.count("\n") == 1 and "\x1b" not in result.stderr
 
 
 def test_runs_that_do_not_fit_and_damaged_ones_are_refused(tmp_path):

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import pyvista
-import vtk
+import scipy.ndimage
 from typer.testing import CliRunner
 
 from attnwarp.warp import PRESETS
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.inspect import subject
 from attnwarp_eval.inspect.cell import CellReport, cell_of, cell_report
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.pixel import report
@@ -28,6 +29,8 @@ def window(chosen):
     splats = Splats(count=1000, position_noise=0.1, normal_noise=3.0)
     variants = {name: (variant, splats) for name, (variant, _) in chosen.variants.items()}
     opened = Window(replace(chosen, variants=variants), STATE, off_screen=True, size=(450, 300))
+    opened.enable_picking()
+    opened.plotter.screenshot(return_img=True)  # a person clicks on what is drawn
     yield opened
     opened.close()
 
@@ -38,35 +41,55 @@ def shown(window):
 
 
 def click(window, column, row):
-    """Pick what VTK finds where a pixel's surface point lies on the screen; whether it is there."""
-    plotter, renderer = window.plotter, window.plotter.renderer
-    renderer.SetWorldPoint(*window.pair.truth.hits.point[row, column], 1)
-    renderer.WorldToDisplay()
-    x, y, _ = renderer.GetDisplayPoint()
-    left, bottom, right, top = renderer.GetViewport()
-    width, height = plotter.window_size
-    if not (left * width < x < right * width and bottom * height < y < top * height):
-        return False
-    picker = vtk.vtkPointPicker()
-    picker.SetTolerance(0.002)
-    picker.PickFromListOn()
-    picker.AddPickList(renderer.actors["seen"])
-    picker.Pick(x, y, 0, renderer)
-    window._picked_point(None, picker)
-    return True
+    """Press and release the left button where a position of the target's picture is on the screen,
+    while the view is the target's own."""
+    window._main()
+    renderer, interactor = window.plotter.renderer, window.plotter.iren.interactor
+    left, bottom = renderer.GetOrigin()
+    width, height = renderer.GetSize()
+    # A square picture in the middle of the view, as high as the view.
+    x = left + width / 2 + (column / SIZE - 0.5) * height
+    y = bottom + height * (1 - row / SIZE)
+    interactor.SetEventInformation(round(x), round(y), 0, 0)
+    interactor.LeftButtonPressEvent()
+    interactor.LeftButtonReleaseEvent()
+
+
+def beside_nearer_surface(depth, pixels):
+    """Whether something nearer is within so many pixels."""
+    low = scipy.ndimage.minimum_filter(np.nan_to_num(depth, nan=np.inf), 2 * pixels + 1)
+    return low < 0.9 * depth
+
+
+def beside_an_edge(hits):
+    """Whether another surface, the sky, or the picture's border is within a pixel."""
+    depth = np.pad(np.where(hits.valid, hits.depth, np.inf), 1, constant_values=np.inf)
+    owner = np.pad(hits.object_id, 1, mode="edge")
+    low, high = (f(depth, 3) for f in (scipy.ndimage.minimum_filter, scipy.ndimage.maximum_filter))
+    mixed = scipy.ndimage.minimum_filter(owner, 3) != scipy.ndimage.maximum_filter(owner, 3)
+    return ((high > 1.04 * low) | mixed)[1:-1, 1:-1]
 
 
 def test_fifty_pixels_picked_on_the_screen_show_the_librarys_numbers(window):
     window.look_through("yaw060")
     pair, tried = window.pair, 0
+    hard = beside_nearer_surface(pair.truth.hits.depth, 2)
+    edge = beside_an_edge(pair.truth.hits)
+    random = np.random.default_rng(3)
+    # The first ten are behind the edge of something nearer, which a coarse picker would prefer.
+    places = random.permutation(np.argwhere(hard & ~edge))[:10].tolist()
+    assert len(places) == 10
+    places += random.integers(0, SIZE, (200, 2)).tolist()
     redraw, window._draw = window._draw, lambda: None  # each picture costs; the text is drawn below
     try:
-        for column, row in np.random.default_rng(3).integers(0, SIZE, (200, 2)).tolist():
+        for row, column in places:
             window.picked = None
-            if not pair.truth.hits.valid[row, column] or not click(window, column, row):
+            click(window, column + 0.5, row + 0.5)
+            if window.picked is None:  # the sky, or the half of a pixel along an edge
+                assert edge[row, column]
                 continue
             result = window.picked
-            assert abs(result.column - column) <= 1 and abs(result.row - row) <= 1
+            assert (result.column, result.row) == (column, row)
             window._main()
             window._draw_texts()
             text = shown(window)
@@ -88,6 +111,85 @@ def test_fifty_pixels_picked_on_the_screen_show_the_librarys_numbers(window):
     finally:
         window._draw = redraw
     assert tried == 50
+
+
+def test_a_slider_moved_changes_what_is_shown(window):
+    window._add_sliders()
+    for name, attribute, index, expected in (
+        ("view", "target", 1, window.targets[1]),
+        ("variant", "variant", 2, "released"),
+        ("layer", "layer", 2, (8, 8)),
+    ):
+        slider = window._sliders[name][0]
+        slider.GetRepresentation().SetValue(index)
+        slider.InvokeEvent("EndInteractionEvent")
+        assert getattr(window.state, attribute) == expected
+        assert slider.GetRepresentation().GetTitleText().startswith(f"{name}: ")
+    window.plotter.clear_slider_widgets()
+    window._sliders.clear()
+    window.show(target="yaw060", variant="corrected", layer=None)
+
+
+@pytest.mark.parametrize("key", [*"evpfswri3uq", "Up", "plus"])
+def test_a_key_does_what_is_listed_and_nothing_of_vtks_or_pyvistas(window, key):
+    """Of theirs, e closes the window, v turns the view, w draws wires, 3 is for red-blue glasses."""
+    window._replace_keys()
+    called, plotter = [], window.plotter
+    callbacks = plotter.iren._key_press_event_callbacks
+    for name in list(callbacks):
+        callbacks[name] = [lambda name=name: called.append(name)]
+    interactor = plotter.iren.interactor
+    ended = []
+    observer = interactor.AddObserver("ExitEvent", lambda *_: ended.append(True))
+    before = plotter.screenshot(return_img=True)
+    interactor.SetKeyEventInformation(0, 0, key[0], 0, key)
+    interactor.KeyPressEvent()
+    interactor.CharEvent()
+    interactor.RemoveObserver(observer)
+    listed = {name for names in KEYS for name in names.split(" / ")}
+    assert called == [key] * (key in listed) and not ended
+    assert (plotter.screenshot(return_img=True) == before).all()
+
+
+@pytest.mark.parametrize("coloring", ["mask", "picture"])
+def test_through_the_target_each_pixel_has_its_colour(window, coloring):
+    """No picture is between the target camera and what it sees."""
+    window.picked = None
+    window.show(coloring=coloring, target="yaw060")
+    window.look_through("yaw060")
+    picture = part_of(window.plotter.screenshot(return_img=True), window.plotter.renderer)
+    height, width = picture.shape[:2]
+    y, x = np.indices((SIZE, SIZE)) + 0.5
+    columns = np.floor(width / 2 + (x / SIZE - 0.5) * height).astype(int)
+    actual = picture[np.floor(y / SIZE * height).astype(int), columns]
+    expected = 255 * window.pair.colors(coloring)
+    # The surface is drawn from one pixel's centre to the next; texts and the legend lie above it.
+    inner = ~beside_an_edge(window.pair.truth.hits)
+    inner[: SIZE // 4], inner[-SIZE // 8 :] = False, False
+    close = abs(actual - expected).max(axis=2) < 40
+    assert inner.sum() > 500 and close[inner].mean() > 0.95
+    window.show(coloring="mask")
+    window.look_from_outside()
+
+
+@pytest.mark.parametrize("size", [(450, 300), (300, 450)])
+def test_both_frusta_are_in_the_view_from_outside(window, size):
+    opened = Window(window.subject, STATE, off_screen=True, size=size)
+    opened.plotter.screenshot(return_img=True)
+    opened._main()
+    renderer = opened.plotter.renderer
+    (left, bottom), (width, height) = renderer.GetOrigin(), renderer.GetSize()
+    positions = []
+    for name in ("source frustum", "target frustum"):
+        for point in opened.plotter.actors[name].mapper.dataset.points:
+            renderer.SetWorldPoint(*point, 1)
+            renderer.WorldToDisplay()
+            x, y, _ = renderer.GetDisplayPoint()
+            positions.append(((x - left) / width, (y - bottom) / height))
+    opened.close()
+    # A tenth is left on every side, and no more of the tighter ones.
+    assert np.min(positions) >= 0.099 and np.max(positions) <= 0.901
+    assert np.max(abs(np.array(positions) - 0.5)) == pytest.approx(0.4, abs=0.02)
 
 
 def test_a_pick_on_a_feature_grid_explains_its_cell(window):
@@ -210,6 +312,16 @@ def test_a_flight_ends_at_the_target(window):
 
 def invoke(*arguments):
     return CliRunner().invoke(app, ["inspect", *map(str, arguments)])
+
+
+def test_a_pair_is_made_once_for_numbers_file_and_window(tmp_path, folders, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        subject, "Pair", lambda *given, **more: made.append(given[1]) or Pair(*given, **more)
+    )
+    words = (folders / "scene.ply", "--data", folders, "--view", "3", "--pixel", "16,16")
+    done = invoke(*words, "--export", tmp_path / "a.vtp", "--screenshot", tmp_path / "a.png")
+    assert done.exit_code == 0 and made == ["3"]
 
 
 def test_the_command_draws_and_explains(tmp_path):
