@@ -7,11 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
 from attnwarp_eval.scene.materials import NOT_SIMULATED
@@ -20,9 +22,6 @@ from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.plan import everything_on, plan
-
-if TYPE_CHECKING:
-    from attnwarp_eval.document.model import Table
 
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
@@ -80,7 +79,6 @@ def measure_entry(
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
-    progress(f"{scene.name}: effects")
     findings = detect(scene)
     entry: dict[str, Any] = {
         "scene": scene.name,
@@ -147,8 +145,6 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
         >>> table([entry]).rows[0][:5]
         ['a', '–', '–', 'direct', 'not asked']
     """
-    from attnwarp_eval.document.model import Table
-
     columns = [
         "scene",
         "beyond the usual",
@@ -225,8 +221,6 @@ def _smallest(proof: Mapping[str, Any] | None) -> str:
 
 
 def _times(cost: Mapping[str, Any] | None) -> list[str]:
-    from attnwarp_eval.document.numbers import number
-
     if cost is None:
         return ["–"] * len(TIMED)
 
@@ -252,11 +246,8 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
-    """The table as Markdown, with the pictures side by side; ``about`` is the environment."""
-    from attnwarp_eval.document.model import Gallery, Picture, Report, Section
-    from attnwarp_eval.document.write import markdown
-
+def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Report:
+    """The table, and the pictures side by side; ``about`` is the environment."""
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
     partly = (
         sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries)
@@ -319,9 +310,7 @@ def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
             for e in drawn
         ]  # fmt: skip
         sections.append(Section("Side by side", text, gallery=Gallery(rows)))
-    return markdown(
-        Report("What light does in each scene, and what of it is simulated", lead, sections)
-    )
+    return Report("What light does in each scene, and what of it is simulated", lead, sections)
 
 
 def said_by(scene: Scene) -> dict[str, Any]:

@@ -244,7 +244,7 @@ def _measured(
     encoders: dict[Any, str | None] = {
         str(kind): name for kind, name in study.part(EncodersPart).encoders.items()
     }
-    done = measure.measure(inputs, encoders, store=Store(folder / "measured"))
+    done = measure.measure(inputs, encoders, Store(folder / "measured"))
     result.left_out |= {
         title: why for title, why in done.missing.items() if title not in result.left_out
     }
@@ -266,8 +266,7 @@ def _write(
     }
     text = json.dumps(without_nan(data), indent=1, ensure_ascii=False) + "\n"
     write_atomic(out / "captured.json", text.encode())
-    write_atomic(out / "captured.md", write.markdown(document).encode())
-    write_atomic(out / "captured.html", write.page(document, out).encode())
+    write.write_files(document, out, "captured")
 
 
 def report(study: Study, words: Words, cameras: Sequence[Camera], result: Comparison) -> Report:

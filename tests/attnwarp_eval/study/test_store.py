@@ -63,7 +63,7 @@ def test_a_run_of_former_code_in_one_folder_is_read_and_resumed_where_it_is(tmp_
     assert store.done() == {record()["id"]}
     assert store.read(record()["id"])["summary"] == {"x": 1.5}
     former.write_bytes(whole[:20])
-    store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})
+    store.resumed(SPEC, lambda: {"summary": {"x": 1.5}}, dict)
     assert former.read_bytes() == whole and not new.exists()
 
 
@@ -121,7 +121,7 @@ def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_
     with pytest.raises(StoreError, match="run again, which computes it anew") as caught:
         store.read(record()["id"])
     assert "\n" not in str(caught.value)
-    assert store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})["summary"] == {"x": 1.5}
+    assert store.resumed(SPEC, lambda: {"summary": {"x": 1.5}}, dict)["summary"] == {"x": 1.5}
     assert store.path(record()["id"]).read_bytes() == whole
 
 
