@@ -4,7 +4,7 @@ what it looks like.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Tabl
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
@@ -59,20 +60,18 @@ class Settings:
     pictures: bool = True
 
 
-def measure_entry(
-    scene: Scene, settings: Settings, progress: Callable[[str], None]
-) -> dict[str, Any]:
+def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict[str, Any]:
     """A scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
         scene: the scene.
         settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
-        progress: told what is at work.
+        tell: told what is at work.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
         >>> settings = Settings(prove=False, rounds=0)
-        >>> entry = measure_entry(load_scene("opposed"), settings, lambda step: None)
+        >>> entry = measure_entry(load_scene("opposed"), settings)
         >>> entry["needed"]
         ['geometry', 'direct', 'shadows', 'environment', 'textures']
     """
@@ -97,10 +96,10 @@ def measure_entry(
     if scene.spec.appearance.bounces == "auto":
         entry["bounces"] = answer(scene).words
     if settings.rounds:
-        progress(f"{scene.name}: time against everything on")
+        tell(f"{scene.name}: time against everything on")
         entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
     if settings.prove:
-        progress(f"{scene.name}: proof")
+        tell(f"{scene.name}: proof")
         entry["proof"] = prove(scene, seconds=settings.budget).to_dict()
     return entry
 

@@ -11,11 +11,11 @@ from attnwarp_eval.cost import environment
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
 from attnwarp_eval.effects.table import Settings, measure_entry, report, side_by_side
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.task import Task, Tell, results
+from attnwarp_eval.study.task import Task, results
 
 PROTOCOL = 2
 """Raised whenever an entry would come out otherwise."""

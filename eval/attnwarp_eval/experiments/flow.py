@@ -21,11 +21,11 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.task import Task, Tell, results
+from attnwarp_eval.study.task import Task, results
 
 Method = Literal["dis", "farneback"]
 

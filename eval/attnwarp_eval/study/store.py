@@ -57,11 +57,11 @@ class Store:
     Example:
         >>> from attnwarp_eval.study import Store
         >>> store = Store("run")
+        >>> from attnwarp_eval.canonical_json import digest
         >>> spec = {"scene": "bear"}
-        >>> store.resumed(spec, lambda: {"answer": 42}, lambda record: record["answer"])
-        42
-        >>> store.resumed(spec, lambda: {"answer": 0}, lambda record: record["answer"])  # as stored
-        42
+        >>> store.write({"id": digest(spec), "spec": spec, "answer": 42})
+        >>> [store.whole(cell_id, lambda record: record["answer"]) for cell_id in store.done()]
+        [42]
     """
 
     def __init__(self, root: Path | str) -> None:
@@ -238,27 +238,6 @@ class Store:
             if not self.damaged_pictures(pictures):
                 return result
         return None
-
-    def resumed(
-        self,
-        spec: dict[str, Any],
-        compute: Callable[[], dict[str, Any]],
-        read: Callable[[dict[str, Any]], T],
-    ) -> T:
-        """The result of a cell: read where its record is whole, else computed and written.
-
-        Args:
-            spec: everything that decides the result, and nothing else; its hash is the cell's id.
-            compute: makes the rest of the record, as JSON.
-            read: makes the result of a record. A new record is read back as well, so that a resumed
-                run cannot differ from a whole one.
-        """
-        cell_id = digest(spec)
-        result = self.whole(cell_id, read)
-        if result is None:
-            self.write({"id": cell_id, "spec": spec, **compute()})
-            result = self.read_as(cell_id, read)
-        return result
 
     def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
         """What a record says of a picture that was written below the folder: ``about``, its path

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import Generic, TypeVar
 
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
 
 T = TypeVar("T")
-
-Tell = Callable[[str], None]
-"""Called with the step at work."""
 
 
 @dataclass(frozen=True)
@@ -63,5 +60,10 @@ def results(
                 progress(number, total, step)
 
             tell(task.title)
-            yield store.resumed(task.spec, partial(task.compute, tell), task.read)
+            cell_id = digest(task.spec)
+            result = store.whole(cell_id, task.read)
+            if result is None:
+                store.write({"id": cell_id, "spec": task.spec, **task.compute(tell)})
+                result = store.read_as(cell_id, task.read)  # as a resumed run reads it
+            yield result
     progress(total, total, "done")

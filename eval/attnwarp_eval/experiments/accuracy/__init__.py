@@ -18,11 +18,11 @@ from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import PROTOCOL, Panel
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.study.task import Task, Tell, results
+from attnwarp_eval.study.task import Task, results
 
 PICTURE_SCENES = ("spheres", "bear", "glass", "fog")
 GEOMETRY_SCENES = ("bear", "garden", "far")
