@@ -50,6 +50,16 @@ def inline(text: str) -> Markup:
     return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped))
 
 
+def _block(text: str) -> Markup:
+    """A paragraph, or a list where the text begins with a dash."""
+    if not text.startswith("- "):
+        return Markup("<p>{}</p>").format(inline(text))
+    items = text.removeprefix("- ").split("\n- ")
+    return Markup("<ul>{}</ul>").format(
+        Markup().join(Markup("<li>{}</li>").format(inline(item)) for item in items)
+    )
+
+
 def _css(cell: str) -> Markup:
     if cell in _CLASSES:
         return Markup(f' class="{_CLASSES[cell]}"')
@@ -240,8 +250,8 @@ def page(report: Report, root: Path) -> str:
         >>> "<title>Warps &amp; views</title>" in text
         True
     """
-    embed, draw = _embedder(report, root), _drawer(root)
-    filters = {"inline": inline, "css": _css, "cell": _linker(report), "embed": embed, "draw": draw}
+    filters = {"inline": inline, "block": _block, "css": _css, "cell": _linker(report)}
+    filters |= {"embed": _embedder(report, root), "draw": _drawer(root)}
     return _render("report.html.j2", report, True, filters) + "\n"
 
 

@@ -73,10 +73,10 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
             "The figure is the mean CIEDE2000 of the edited object between the two views, about 1"
             " being just seen. Its exact form compares colours at correspondences known from the"
             " scene; published work takes optical flow for them, where flow there and back agree."
-            " The four pairs' consistency is known beforehand: *truth*, the scene unedited, and"
-            " *one answer*, a recolouring that is the same in both views, are as consistent as can"
-            f" be; *slip* is the second with the target moved by {SLIP} px; *two answers* has"
-            " another colour in each view. docs/metrics.md explains the rest."
+            " The four pairs' consistency is known beforehand: **truth**, the scene unedited, and"
+            " **one answer**, a recolouring that is the same in both views, are as consistent as"
+            f" can be; **slip** is the second with the target moved by {SLIP} px; **two answers**"
+            " has another colour in each view. docs/metrics.md explains the rest."
         ),
     ]
     far = Section(
