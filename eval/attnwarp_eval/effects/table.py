@@ -312,14 +312,12 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
     return Report("What light does in each scene, and what of it is simulated", lead, sections)
 
 
-def said_by(scene: Scene) -> dict[str, Any]:
-    """What a run keeps of a scene's effects: those its file calls for, with the words, and the
-    plan.
-    """
-    words = called_for(scene.spec)
+def transport_of(scene: Scene) -> dict[str, Any]:
+    """The effects that a scene's file calls for, each with the reason, and the plan, as JSON."""
+    reasons = called_for(scene.spec)
     return {
-        "needed": {name: text for name, text in words.items() if name not in NOT_SIMULATED},
-        "not_simulated": {name: text for name, text in words.items() if name in NOT_SIMULATED},
+        "needed": {name: text for name, text in reasons.items() if name not in NOT_SIMULATED},
+        "not_simulated": {name: text for name, text in reasons.items() if name in NOT_SIMULATED},
         "plan": plan(scene).to_dict(),
         "everything_on": everything_on(scene, capped=False).integrator,
     }
