@@ -250,8 +250,8 @@ def page(report: Report, root: Path) -> str:
         >>> "<title>Warps &amp; views</title>" in text
         True
     """
-    filters = {"inline": inline, "block": _block, "css": _css, "cell": _linker(report)}
-    filters |= {"embed": _embedder(report, root), "draw": _drawer(root)}
+    filters: dict[str, Any] = {"inline": inline, "block": _block, "css": _css}
+    filters |= {"cell": _linker(report), "embed": _embedder(report, root), "draw": _drawer(root)}
     return _render("report.html.j2", report, True, filters) + "\n"
 
 
