@@ -1,8 +1,8 @@
 """How fast views and attention features are warped: ``python -m benchmarks.warp``.
 
-One process. All contestants of a case take turns, round after round, so that a slow moment of the
-machine falls on all of them. The table has the median over rounds, and ratios are medians of the
-ratios within a round.
+One process. All contestants run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment
+of the machine falls on all of them. The table has the median over rounds, and ratios are medians of
+the ratios within a round.
 
 - A pair: the correspondence, every rule and the mask at image size, and feature grids of 1/8 and
   1/16; beside it the definition in torch, and the render of the target that it starts from.
@@ -38,6 +38,7 @@ from attnwarp.render.api import render
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
 from attnwarp.warp._kernels import sampling
+from attnwarp_eval.cost import in_turn
 
 SPLATS = 40_000
 YAW = 20.0
@@ -55,14 +56,6 @@ class Case:
     counters: dict[str, int] = field(default_factory=dict)
     wall: dict[str, list[float]] = field(default_factory=dict)
     cpu: dict[str, list[float]] = field(default_factory=dict)
-
-    def time_once(self) -> None:
-        """Time every contestant once."""
-        for name, work in self.contestants.items():
-            start, start_cpu = time.perf_counter(), time.process_time()
-            work()
-            self.cpu.setdefault(name, []).append(time.process_time() - start_cpu)
-            self.wall.setdefault(name, []).append(time.perf_counter() - start)
 
     def rows(self) -> list[dict[str, Any]]:
         """One line of the table for each contestant."""
@@ -186,15 +179,24 @@ def _others(layer: FeatureWarp, maps: Tensor) -> dict[str, Callable[[], object]]
     }
 
 
+def _timed(work: Callable[[], object]) -> Callable[[int], float]:
+    """The processor time in seconds of ``work``."""
+
+    def timed(_: int) -> float:
+        start = time.process_time()
+        work()
+        return time.process_time() - start
+
+    return timed
+
+
 def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
     """Time the cases; all of the table, as JSON values."""
+    entries = [(case, name) for case in cases for name in case.contestants]
     with torch.no_grad():
-        for case in cases:
-            for work in case.contestants.values():
-                work()  # compiled, or read from the cache
-        for _ in range(rounds):
-            for case in cases:
-                case.time_once()
+        turns = in_turn([_timed(case.contestants[name]) for case, name in entries], rounds)
+    for (case, name), wall, cpu in zip(entries, turns.seconds, turns.results, strict=True):
+        case.wall[name], case.cpu[name] = wall, cpu
     rows = [row for case in cases for row in case.rows()]
     for row in rows:
         if row["contestant"] in ("copy", "tokens", "maps"):

@@ -166,12 +166,8 @@ def _sheet(tiles: list[Image]) -> Image:
 
 
 def _write(path: Path, image: Image) -> None:
-    import cv2
-    import numpy as np
-
     from attnwarp.io.file import write_atomically
+    from attnwarp.io.picture import encode_picture
 
-    pixels = np.rint(255 * np.clip(image[..., ::-1], 0, 1)).astype(np.uint8)
-    _, data = cv2.imencode(".png", pixels)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, lambda stream: stream.write(data.tobytes()))
+    write_atomically(path, lambda stream: stream.write(encode_picture(image)))

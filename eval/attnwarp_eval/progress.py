@@ -10,5 +10,13 @@ not known.
 """
 
 
+Tell = Callable[[str], None]
+"""Called with the step at work, where somebody else counts the steps."""
+
+
 def silent(done: int, total: int, step: str) -> None:
     """Show nothing."""
+
+
+def untold(step: str) -> None:
+    """Tell nobody."""

@@ -58,9 +58,9 @@ def metrics(
         str, typer.Option(help="Behind transparent pixels: black, white, or r,g,b in [0, 1].")
     ] = "black",
     device: Annotated[str, typer.Option(help="cpu or cuda, for real encoders.")] = "cpu",
-    out: Annotated[Path, typer.Option(help="Folder for metrics.json and metrics.md.")] = Path(
-        "runs/metrics"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder for metrics.json, metrics.md and metrics.html.")
+    ] = Path("runs/metrics"),
     as_json: Annotated[
         bool, typer.Option("--json", help="Print metrics.json instead of a table.")
     ] = False,
@@ -80,13 +80,7 @@ def metrics(
         )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
         with progress() as show, resumable(lambda: "finished views are kept"):
-            measured = measure.measure(
-                inputs,
-                kinds,
-                device=device,
-                progress=show,
-                store=Store(out),
-            )
+            measured = measure.measure(inputs, kinds, Store(out), device=device, progress=show)
         paths = write.write(measured, out)
     if as_json:
         typer.echo(write.to_json(measured), nl=False)

@@ -184,7 +184,8 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
             resumable(lambda: "finished scenes are kept"),
         ):
             entries = collect(scenes, out, Settings(prove=prove, budget=budget), show)
-    typer.echo(out / "effects.md")
+    for name in ("effects.md", "effects.html"):
+        typer.echo(out / name)
     doubtful = [f"{e['scene']}: {proof_words(e['proof'])}" for e in entries if "proof" in e
                 and e["proof"]["verdict"] != "certified"]  # fmt: skip
     if doubtful:
@@ -198,7 +199,7 @@ def accuracy(
         typer.Argument(help="Scenes' names or paths; a few telling ones if left out."),
     ] = None,
     out: Annotated[
-        Path, typer.Option(help="Folder for accuracy.md, accuracy.json and the figures.")
+        Path, typer.Option(help="Folder for the report, accuracy.json and the figures.")
     ] = Path("runs/accuracy"),
     rounds: Annotated[int, typer.Option(min=3, help="Of every timing.")] = 7,
 ) -> None:
@@ -227,13 +228,14 @@ def flow(
     spp: Annotated[int, typer.Option(min=1, help="Samples a pixel.")] = 32,
     method: Annotated[str, typer.Option(help="Of OpenCV's flow: dis or farneback.")] = "dis",
     out: Annotated[
-        Path, typer.Option(help="Folder for report.md, its figures, flow.json and pictures.")
+        Path, typer.Option(help="Folder for the report, its figures, flow.json and pictures.")
     ] = Path("runs/flow"),
     pictures: Annotated[bool, typer.Option(help="Keep the pictures of each pair.")] = True,
 ) -> None:
     """How far consistency along optical flow is from that at exact correspondences."""
     with clear_errors():
         from attnwarp.errors import InputError
+        from attnwarp_eval.document.write import markdown_table
         from attnwarp_eval.experiments import flow, flow_report
 
         try:
@@ -249,7 +251,7 @@ def flow(
             rows = list(flow.measure(chosen, angles, out, options, progress=show))
         if not rows:
             raise InputError("--yaws: got none, expected degrees such as 5,20")
-        typer.echo(flow_report.table(rows))
+        typer.echo(markdown_table(flow_report.table(rows)))
         for path in flow_report.write(rows, out, size=size, spp=spp):
             typer.echo(path)
 

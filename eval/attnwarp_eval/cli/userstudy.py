@@ -99,10 +99,9 @@ def score(
             typer.echo(note, err=True)
         if out is not None:
             data = json.dumps(result.to_json(), indent=1, ensure_ascii=False) + "\n"
-            for name, text in (
-                ("preferences.json", data),
-                ("preferences.md", write.markdown(document)),
-                ("preferences.html", write.page(document, out)),
+            write_atomic(out / "preferences.json", data.encode())
+            for path in (
+                out / "preferences.json",
+                *write.write_files(document, out, "preferences"),
             ):
-                write_atomic(out / name, text.encode())
-                typer.echo(out / name)
+                typer.echo(path)

@@ -12,12 +12,13 @@ import mimetypes
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from attnwarp_eval.document.model import Gallery, Report, Slider, Table
+from attnwarp_eval.files import write_atomic
 
 if TYPE_CHECKING:
     import rich.table
@@ -47,6 +48,16 @@ def inline(text: str) -> Markup:
     )
     escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
     return Markup(re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped))
+
+
+def _block(text: str) -> Markup:
+    """A paragraph, or a list where the text begins with a dash."""
+    if not text.startswith("- "):
+        return Markup("<p>{}</p>").format(inline(text))
+    items = text.removeprefix("- ").split("\n- ")
+    return Markup("<ul>{}</ul>").format(
+        Markup().join(Markup("<li>{}</li>").format(inline(item)) for item in items)
+    )
 
 
 def _css(cell: str) -> Markup:
@@ -185,6 +196,35 @@ def terminal(table: Table) -> rich.table.Table:
     return grid
 
 
+def markdown_table(table: Table) -> str:
+    """The rows of a table in Markdown.
+
+    Example:
+        >>> print(markdown_table(Table(["variant", "AbsRel"], [["paper", "0.01"]])))
+        | variant | AbsRel |
+        |---|---|
+        | paper | 0.01 |
+    """
+    lines = [
+        " | ".join(plain(cell.replace("|", "\\|")) for cell in cells)
+        for cells in (table.columns, *table.rows)
+    ]
+    header, *rows = (f"| {line} |" for line in lines)
+    return "\n".join([header, f"|{'---|' * len(table.columns)}", *rows])
+
+
+def _render(template: str, report: Report, autoescape: bool, filters: dict[str, Any]) -> str:
+    environment = Environment(
+        loader=PackageLoader("attnwarp_eval.document", "."),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        autoescape=autoescape,
+    )
+    environment.filters.update(filters)
+    return environment.get_template(template).render(report=report)
+
+
 def markdown(report: Report) -> str:
     """The report as Markdown; pictures are links relative to the run's folder, and come last, since
     a CI's summary shows none.
@@ -196,15 +236,7 @@ def markdown(report: Report) -> str:
         >>> "| paper | 0.01 |" in text
         True
     """
-    environment = Environment(
-        loader=PackageLoader("attnwarp_eval.document", "."),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-        autoescape=False,
-    )
-    environment.filters["plain"] = plain
-    text = environment.get_template("report.md.j2").render(report=report)
+    text = _render("report.md.j2", report, False, {"plain": plain, "table": markdown_table})
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 
@@ -218,18 +250,25 @@ def page(report: Report, root: Path) -> str:
         >>> "<title>Warps &amp; views</title>" in text
         True
     """
-    environment = Environment(
-        loader=PackageLoader("attnwarp_eval.document", "."),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-        autoescape=True,
-    )
-    environment.filters.update(
-        inline=inline,
-        css=_css,
-        cell=_linker(report),
-        embed=_embedder(report, root),
-        draw=_drawer(root),
-    )
-    return environment.get_template("report.html.j2").render(report=report) + "\n"
+    filters: dict[str, Any] = {"inline": inline, "block": _block, "css": _css}
+    filters |= {"cell": _linker(report), "embed": _embedder(report, root), "draw": _drawer(root)}
+    return _render("report.html.j2", report, True, filters) + "\n"
+
+
+def write_files(report: Report, folder: Path, name: str) -> list[Path]:
+    """Write the report as Markdown and as a page; return their paths, the page at the end.
+
+    Args:
+        report: its pictures and figures lie below ``folder``.
+        folder: of the files.
+        name: of the files, without a suffix.
+
+    Example:
+        >>> from pathlib import Path
+        >>> [path.name for path in write_files(Report("Warps", [], []), Path(), "warps")]
+        ['warps.md', 'warps.html']
+    """
+    texts = {f"{name}.md": markdown(report), f"{name}.html": page(report, folder)}
+    for file, text in texts.items():
+        write_atomic(folder / file, text.encode())
+    return [folder / file for file in texts]

@@ -4,25 +4,25 @@ what it looks like.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
+from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
 from attnwarp_eval.effects.saving import measure
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.materials import NOT_SIMULATED
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import Equivalence
 from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.plan import everything_on, plan
-
-if TYPE_CHECKING:
-    from attnwarp_eval.document.model import Table
 
 USUAL = ("geometry", "direct", "shadows", "textures")
 """Effects that nearly every scene calls for, and that no plan leaves out."""
@@ -60,27 +60,24 @@ class Settings:
     pictures: bool = True
 
 
-def measure_entry(
-    scene: Scene, settings: Settings, progress: Callable[[str], None]
-) -> dict[str, Any]:
+def measure_entry(scene: Scene, settings: Settings, tell: Tell = untold) -> dict[str, Any]:
     """A scene's effects, the cost of its plan, and the proof, as JSON.
 
     Args:
         scene: the scene.
         settings: how the entry is made; pictures are apart, see :func:`side_by_side`.
-        progress: told what is at work.
+        tell: told what is at work.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
         >>> settings = Settings(prove=False, rounds=0)
-        >>> entry = measure_entry(load_scene("opposed"), settings, lambda step: None)
+        >>> entry = measure_entry(load_scene("opposed"), settings)
         >>> entry["needed"]
         ['geometry', 'direct', 'shadows', 'environment', 'textures']
     """
     from attnwarp_eval.effects.proof import prove
     from attnwarp_eval.truth.llvm import variant
 
-    progress(f"{scene.name}: effects")
     findings = detect(scene)
     entry: dict[str, Any] = {
         "scene": scene.name,
@@ -99,10 +96,10 @@ def measure_entry(
     if scene.spec.appearance.bounces == "auto":
         entry["bounces"] = answer(scene).words
     if settings.rounds:
-        progress(f"{scene.name}: time against everything on")
+        tell(f"{scene.name}: time against everything on")
         entry["cost"] = measure(scene, rounds=settings.rounds).to_dict()
     if settings.prove:
-        progress(f"{scene.name}: proof")
+        tell(f"{scene.name}: proof")
         entry["proof"] = prove(scene, seconds=settings.budget).to_dict()
     return entry
 
@@ -147,8 +144,6 @@ def table(entries: Iterable[Mapping[str, Any]]) -> Table:
         >>> table([entry]).rows[0][:5]
         ['a', '–', '–', 'direct', 'not asked']
     """
-    from attnwarp_eval.document.model import Table
-
     columns = [
         "scene",
         "beyond the usual",
@@ -225,8 +220,6 @@ def _smallest(proof: Mapping[str, Any] | None) -> str:
 
 
 def _times(cost: Mapping[str, Any] | None) -> list[str]:
-    from attnwarp_eval.document.numbers import number
-
     if cost is None:
         return ["–"] * len(TIMED)
 
@@ -252,11 +245,8 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
     ]
 
 
-def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
-    """The table as Markdown, with the pictures side by side; ``about`` is the environment."""
-    from attnwarp_eval.document.model import Gallery, Picture, Report, Section
-    from attnwarp_eval.document.write import markdown
-
+def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Report:
+    """The table, and the pictures side by side; ``about`` is the environment."""
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
     partly = (
         sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries)
@@ -319,19 +309,15 @@ def page(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> str:
             for e in drawn
         ]  # fmt: skip
         sections.append(Section("Side by side", text, gallery=Gallery(rows)))
-    return markdown(
-        Report("What light does in each scene, and what of it is simulated", lead, sections)
-    )
+    return Report("What light does in each scene, and what of it is simulated", lead, sections)
 
 
-def said_by(scene: Scene) -> dict[str, Any]:
-    """What a run keeps of a scene's effects: those its file calls for, with the words, and the
-    plan.
-    """
-    words = called_for(scene.spec)
+def transport_of(scene: Scene) -> dict[str, Any]:
+    """The effects that a scene's file calls for, each with the reason, and the plan, as JSON."""
+    reasons = called_for(scene.spec)
     return {
-        "needed": {name: text for name, text in words.items() if name not in NOT_SIMULATED},
-        "not_simulated": {name: text for name, text in words.items() if name in NOT_SIMULATED},
+        "needed": {name: text for name, text in reasons.items() if name not in NOT_SIMULATED},
+        "not_simulated": {name: text for name, text in reasons.items() if name in NOT_SIMULATED},
         "plan": plan(scene).to_dict(),
         "everything_on": everything_on(scene, capped=False).integrator,
     }

@@ -23,8 +23,7 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
-from attnwarp_eval.study.probes import editing
-from attnwarp_eval.study.probes.sensitivity import StudyPart as EncodersPart
+from attnwarp_eval.study.probes import editing, sensitivity
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 WITHOUT_TRUTH = ("image.", "embedding.")
 """Beginnings of the names of figures that need no true pictures."""
 
-SHOWN = 4
+PICTURED = 4
 """Views side by side in the report, evenly spread."""
 
 
@@ -242,9 +241,9 @@ def _measured(
         source_prompt=words.source,
     )
     encoders: dict[Any, str | None] = {
-        str(kind): name for kind, name in study.part(EncodersPart).encoders.items()
+        str(kind): name for kind, name in study.part(sensitivity.StudyPart).encoders.items()
     }
-    done = measure.measure(inputs, encoders, store=Store(folder / "measured"))
+    done = measure.measure(inputs, encoders, Store(folder / "measured"))
     result.left_out |= {
         title: why for title, why in done.missing.items() if title not in result.left_out
     }
@@ -266,8 +265,7 @@ def _write(
     }
     text = json.dumps(without_nan(data), indent=1, ensure_ascii=False) + "\n"
     write_atomic(out / "captured.json", text.encode())
-    write_atomic(out / "captured.md", write.markdown(document).encode())
-    write_atomic(out / "captured.html", write.page(document, out).encode())
+    write.write_files(document, out, "captured")
 
 
 def report(study: Study, words: Words, cameras: Sequence[Camera], result: Comparison) -> Report:
@@ -288,15 +286,15 @@ def report(study: Study, words: Words, cameras: Sequence[Camera], result: Compar
     table = Table(["variant", *titles, *costs], rows, timed=("seconds",))
     lacking = Table(["left out", "reason"], [list(entry) for entry in result.left_out.items()])
     count = len(cameras)
-    views = sorted({k * count // min(SHOWN, count) for k in range(min(SHOWN, count))})
+    views = sorted({k * count // min(PICTURED, count) for k in range(min(PICTURED, count))})
     pictures = []
     for view in views:
-        shown = [Picture(f"originals/{_name(view)}.png", "before")]
-        shown += [
+        edited = [
             Picture(f"{row['folder']}/renders/{_name(view)}.png", name)
             for name, row in result.rows.items()
         ]
-        pictures.append((f"**{cameras[view].name or _name(view)}**", shown))
+        before = Picture(f"originals/{_name(view)}.png", "before")
+        pictures.append((f"**{cameras[view].name or _name(view)}**", [before, *edited]))
     lead = [
         f"Study `{study.name}` on {count} views; instruction: {words.instruction}.",
         "One scene and one seed: figures without intervals, from which nothing follows for other"

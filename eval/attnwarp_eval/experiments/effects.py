@@ -1,20 +1,27 @@
-"""The table of effects as a run that can be interrupted: every scene is a cell."""
+"""The table of effects as a run that can be interrupted: every scene has two cells."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from attnwarp_eval.canonical_json import write_json
+from attnwarp_eval.cost import environment
+from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
-from attnwarp_eval.effects.table import Settings, measure_entry, page, side_by_side
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.effects.table import Settings, measure_entry, report, side_by_side
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.task import Task, results
 
 PROTOCOL = 2
 """Raised whenever an entry would come out otherwise."""
+
+Part = tuple[str, dict[str, Any]]
+"""A scene's name, and some fields of its entry."""
 
 
 def collect(
@@ -27,7 +34,7 @@ def collect(
 
     Args:
         names: scenes' names or paths.
-        out: folder of ``effects.json``, ``effects.md``, ``<scene>.jpg`` and ``cells/``.
+        out: folder of ``effects.json``, the report, ``<scene>.jpg`` and ``cells/``.
         settings: how an entry is made.
         progress: told of each step of each scene.
 
@@ -35,108 +42,75 @@ def collect(
         The entries, as they stand in ``effects.json``.
 
     Raises:
-        InputError: a scene that is unknown or contradicts itself, an ``effects.json`` of something
-            else, or another run that is writing to ``out``.
+        InputError: a scene that is unknown or contradicts itself, or another run that is writing to
+            ``out``.
     """
+    store = Store(out)
+    tasks = _tasks(names, store, settings)
+    entries: dict[str, dict[str, Any]] = {}
+    for scene, part in results(store, tasks, len(names) * (1 + settings.pictures), progress):
+        entries.setdefault(scene, {}).update(part)
+        # What is done can be read while the rest is at work.
+        about = environment()
+        data = {"environment": about, "scenes": [entries[name] for name in sorted(entries)]}
+        write_json(out / "effects.json", data, sort_keys=False)
+        write_files(report(list(entries.values()), about), out, "effects")
+    return list(entries.values())
+
+
+def _tasks(names: Sequence[str], store: Store, settings: Settings) -> Iterator[Task[Part]]:
     from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.truth.mitsuba import forget
 
-    # Scenes of an earlier call stay in the file; the table is of those asked for, as far as they
-    # are done.
-    available = _read(out / "effects.json")
-    entries = []
-    store = Store(out)
-    with store.lock():
-        for number, name in enumerate(names):
-
-            def tell(step: str, number: int = number) -> None:
-                progress(number, len(names), step)
-
-            scene = load_scene(name)
-            entry = _entry(scene, store, settings, tell)
-            available[scene.name] = entry
-            entries.append(entry)
-            _write(out, available, entries)
-            forget()
-    return entries
+    for name in names:
+        scene = load_scene(name)
+        yield _entry(scene, settings)
+        if settings.pictures:
+            yield _pictures(scene, store)
+        forget()
 
 
-def _entry(
-    scene: Scene, store: Store, settings: Settings, progress: Callable[[str], None]
-) -> dict[str, Any]:
-    """The entry of a scene, with what is finished of it read from the store."""
-    entry = _resumed(
-        store,
-        {"probe": "effects", "prove": settings.prove, "budget": settings.budget}
-        | {"rounds": settings.rounds},
-        scene,
-        lambda: {"entry": measure_entry(scene, settings, progress)},
-    )["entry"]
-    if settings.pictures:
-        progress(f"{scene.name}: pictures")
+def _entry(scene: Scene, settings: Settings) -> Task[Part]:
+    spec = {"probe": "effects", "prove": settings.prove, "budget": settings.budget}
+    spec |= {"rounds": settings.rounds}
 
-        def pictures() -> dict[str, Any]:
-            path = store.root / entry["picture"]
-            about = side_by_side(scene, path)
-            saved = [store.keep_picture(path, view=scene.source.name, what="side by side")]
-            return {"about": about, "pictures": saved}
+    def compute(tell: Tell) -> Json:
+        return {"entry": measure_entry(scene, settings, tell)}
 
-        samples = {"size": table.PICTURE_SIZE, "plan": table.PLAN_SAMPLES}
-        samples |= {"everything_on": table.FULL_SAMPLES}
-        entry |= _resumed(store, {"probe": "effects, pictures", **samples}, scene, pictures)[
-            "about"
-        ]
-    return dict(entry)
+    return Task(
+        f"{scene.name}: effects", _common(scene) | spec, compute, lambda r: (scene.name, r["entry"])
+    )
 
 
-def _resumed(
-    store: Store, own: dict[str, Any], scene: Scene, compute: Callable[[], dict[str, Any]]
-) -> dict[str, Any]:
-    """A record of what ``own`` and the scene decide, with this version of Mitsuba."""
+def _pictures(scene: Scene, store: Store) -> Task[Part]:
+    spec = {"probe": "effects, pictures", "size": table.PICTURE_SIZE, "plan": table.PLAN_SAMPLES}
+    spec |= {"everything_on": table.FULL_SAMPLES}
+
+    def compute(tell: Tell) -> Json:
+        path = store.root / f"{scene.name}.jpg"
+        about = side_by_side(scene, path)
+        saved = store.keep_picture(path, view=scene.source.name, what="side by side")
+        return {"about": about, "pictures": [saved]}
+
+    return Task(
+        f"{scene.name}: pictures",
+        _common(scene) | spec,
+        compute,
+        lambda r: (scene.name, r["about"]),
+    )
+
+
+def _common(scene: Scene) -> Json:
+    """What decides both: the scene and this version of Mitsuba."""
     import mitsuba
 
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
 
-    spec = {
-        **own,
+    return {
         "protocol": [PROTOCOL, APPEARANCE_PROTOCOL],
         "mitsuba": mitsuba.__version__,
         "variant": variant(),
         "scene": scene.content_hash,
         "name": scene.name,
     }
-    return store.resumed(spec, compute)
-
-
-def _read(path: Path) -> dict[str, dict[str, Any]]:
-    from attnwarp.errors import InputError
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return {}
-    try:
-        return {
-            entry["scene"]: entry
-            for entry in json.loads(text)["scenes"]
-            if entry["plan"] and entry["picture"]
-        }
-    except (ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{path}: it is not a table of effects; name another folder with --out, or remove the"
-            " file"
-        ) from None
-
-
-def _write(out: Path, available: Mapping[str, Any], asked: Sequence[Mapping[str, Any]]) -> None:
-    from attnwarp_eval.canonical_json import write_json
-    from attnwarp_eval.cost import environment
-    from attnwarp_eval.files import write_atomic
-
-    data: dict[str, Any] = {
-        "environment": environment(),
-        "scenes": [available[name] for name in sorted(available)],
-    }
-    write_json(out / "effects.json", data, sort_keys=False)
-    write_atomic(out / "effects.md", page(asked, data["environment"]).encode())

@@ -9,7 +9,6 @@ moved by 2 px. The fourth, with a different answer in each view, is as inconsist
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,9 +21,11 @@ from attnwarp.camera import Camera
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.files import write_picture
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.task import Task, results
 
 Method = Literal["dis", "farneback"]
 
@@ -106,7 +107,7 @@ class Options:
 def measure(
     scenes: Sequence[str],
     yaws: Sequence[float],
-    out: Path | None,
+    out: Path,
     options: Options,
     *,
     progress: Progress = silent,
@@ -118,7 +119,7 @@ def measure(
     Args:
         scenes: names among :data:`SCENES`.
         yaws: degrees from the source.
-        out: the run's folder, which also takes the pictures; nothing is kept if left out.
+        out: the run's folder, which also takes the pictures.
         options: how each row is measured.
         progress: told of each row.
 
@@ -132,18 +133,12 @@ def measure(
     for name in scenes:
         if name not in SCENES:
             raise InputError(f"scene {name!r}: expected one of {', '.join(SCENES)}")
-    store = None if out is None else Store(out)
-    cells = [(name, float(yaw)) for name in scenes for yaw in yaws]
-    with nullcontext() if store is None else store.lock():
-        for number, (name, yaw) in enumerate(cells):
-            progress(number, len(cells), f"{name}, {yaw:g} degrees")
-            if store is None:
-                yield measure_pair(name, SCENES[name], yaw, options)
-            else:
-                yield _resumed(store, name, yaw, options)
+    store = Store(out)
+    tasks = (_task(store, name, float(yaw), options) for name in scenes for yaw in yaws)
+    yield from results(store, tasks, len(scenes) * len(yaws), progress)
 
 
-def _resumed(store: Store, name: str, yaw: float, options: Options) -> Row:
+def _task(store: Store, name: str, yaw: float, options: Options) -> Task[Row]:
     from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
@@ -158,7 +153,7 @@ def _resumed(store: Store, name: str, yaw: float, options: Options) -> Row:
         **asdict(options),
     }
 
-    def compute() -> dict[str, Any]:
+    def compute(tell: Tell) -> Json:
         pictures = []
 
         def keep(kind: str, image: npt.NDArray[np.float64]) -> None:
@@ -168,17 +163,13 @@ def _resumed(store: Store, name: str, yaw: float, options: Options) -> Row:
         row = measure_pair(name, SCENES[name], yaw, options, keep if options.pictures else None)
         return {"row": without_nan(asdict(row)), "pictures": pictures}
 
-    return _row(store.resumed(spec, compute)["row"])
+    return Task(f"{name}, {yaw:g} degrees", spec, compute, _row)
 
 
-def _row(fields: dict[str, Any]) -> Row:
-    """A row from its JSON, in which NaN is null."""
-
-    def numbers(values: dict[str, float | None]) -> dict[str, float]:
-        return {name: np.nan if value is None else value for name, value in values.items()}
-
-    figures = {kind: numbers(fields["figures"][kind]) for kind in PAIRS}
-    return Row(fields["scene"], fields["yaw"], fields["method"], figures, numbers(fields["flow"]))
+def _row(record: Json) -> Row:
+    row = record["row"]
+    figures = {kind: with_nan(row["figures"][kind]) for kind in PAIRS}
+    return Row(row["scene"], row["yaw"], row["method"], figures, with_nan(row["flow"]))
 
 
 @lru_cache(maxsize=1)

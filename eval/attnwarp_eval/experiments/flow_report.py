@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from attnwarp_eval.canonical_json import without_nan, write_json
+from attnwarp_eval.document.model import Picture, Report, Section, Table
 from attnwarp_eval.experiments.flow import PAIRS, SLIP, Row
-from attnwarp_eval.files import write_atomic
 
 TITLES = {
     "truth": "truth",
@@ -21,20 +21,13 @@ TITLES = {
 """What tables call the pairs."""
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown: mean DeltaE of the edited object, exact, along the flow, and along it at the exact
-    figure's pixels; and the flow's own errors in the whole picture.
+def table(rows: Sequence[Row]) -> Table:
+    """Mean DeltaE of the edited object, exact, along the flow, and along it at the exact figure's
+    pixels; and the flow's own errors in the whole picture.
     """
-    columns, cells = _cells(rows)
-    lines = [columns, ["---"] * len(columns), *cells]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """The table's columns, and its rows as text."""
     columns = ["scene", "yaw", "object px", *TITLES.values()]
     columns += ["EPE median, p95 (px)", "check passes", "not in source"]
-    table = []
+    lines = []
     for row in rows:
         cells = [row.scene, f"{row.yaw:g}", f"{row.figures['truth']['consistency.pixels']:g}"]
         for kind in PAIRS:
@@ -49,12 +42,15 @@ def _cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
             f"{row.flow['consistency.flow_recall']:.0%}",
             f"{row.flow['consistency.flow_false']:.0%}",
         ]
-        table.append(cells)
-    return columns, table
+        lines.append(cells)
+    caption = (
+        "Mean CIEDE2000: exact / along the flow / along the flow at the pixels of the exact figure"
+    )
+    return Table(columns, lines, caption)
 
 
 def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
-    """Write flow.json, report.md and its figures; return the path of the report.
+    """Write flow.json, the report and its figures; return the paths of the report.
 
     Args:
         rows: of :func:`attnwarp_eval.experiments.flow.measure`, of one flow method.
@@ -62,8 +58,7 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
         size, spp: of the pictures, which the report names.
     """
     from attnwarp_eval.cost import environment
-    from attnwarp_eval.document.model import Picture, Report, Section, Table
-    from attnwarp_eval.document.write import markdown
+    from attnwarp_eval.document.write import write_files
 
     about = environment()
     lead = [
@@ -78,13 +73,12 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
             "The figure is the mean CIEDE2000 of the edited object between the two views, about 1"
             " being just seen. Its exact form compares colours at correspondences known from the"
             " scene; published work takes optical flow for them, where flow there and back agree."
-            " The four pairs' consistency is known beforehand: *truth*, the scene unedited, and"
-            " *one answer*, a recolouring that is the same in both views, are as consistent as can"
-            f" be; *slip* is the second with the target moved by {SLIP} px; *two answers* has"
-            " another colour in each view. docs/metrics.md explains the rest."
+            " The four pairs' consistency is known beforehand: **truth**, the scene unedited, and"
+            " **one answer**, a recolouring that is the same in both views, are as consistent as"
+            f" can be; **slip** is the second with the target moved by {SLIP} px; **two answers**"
+            " has another colour in each view. docs/metrics.md explains the rest."
         ),
     ]
-    columns, cells = _cells(rows)
     far = Section(
         "How far the flow's figure is from the exact one",
         [
@@ -115,17 +109,12 @@ def write(rows: Sequence[Row], out: Path, *, size: int, spp: int) -> list[Path]:
             )
         ],
     )
-    caption = (
-        "Mean CIEDE2000: exact / along the flow / along the flow at the pixels of the exact figure"
-    )
-    every = Section("Every scene and yaw", tables=[Table(columns, cells, caption)])
+    every = Section("Every scene and yaw", tables=[table(rows)])
     report = Report(
         "Consistency along optical flow, against exact correspondences", lead, [far, wrong, every]
     )
-    path = out / "report.md"
-    write_atomic(path, markdown(report).encode())
     write_json(out / "flow.json", without_nan([asdict(row) for row in rows]), sort_keys=False)
-    return [path]
+    return write_files(report, out, "report")
 
 
 SUMMARY = [

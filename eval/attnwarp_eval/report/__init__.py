@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from attnwarp_eval.document.write import markdown, page
+from attnwarp_eval.document.write import write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.results import lines, read_results
@@ -47,14 +47,9 @@ def write_report(store: Store, *, timings: bool = True, pictures: bool = True) -
     if pictures:
         _check_pictures(results, store)
     report = build(results, store.root, timings=timings, pictures=pictures)
-    files = {
-        "results.jsonl": "".join(f"{line}\n" for line in lines(results, timings)),
-        "report.md": markdown(report),
-        "report.html": page(report, store.root),
-    }
-    for name, text in files.items():
-        write_atomic(store.root / name, text.encode())
-    return [store.root / name for name in files]
+    path = store.root / "results.jsonl"
+    write_atomic(path, "".join(f"{line}\n" for line in lines(results, timings)).encode())
+    return [path, *write_files(report, store.root, "report")]
 
 
 def _check_pictures(results: Results, store: Store) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +16,7 @@ from attnwarp.camera import Camera
 from attnwarp.fit.views import HELD_OUT_EVERY
 from attnwarp.gaussians import SH_C0
 from attnwarp_eval.colors import to_srgb
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SkySpec
 from attnwarp_eval.splats.surface import surface_splats
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from attnwarp.io import Dataset
 
 Array = npt.NDArray[np.float64]
-Progress = Callable[[str], object]
 
 SKY_SHARE = 0.1
 """Share of the first points that stand for the sky, where a scene has one."""
@@ -206,7 +205,7 @@ def export(
     points: int = 5000,
     noise: float = 0.5,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Tell = untold,
 ) -> Dataset:
     """Write a scene as a data set: transforms.json, images/*.png and points.ply.
 
@@ -230,14 +229,13 @@ def export(
     from attnwarp.io import Dataset, write_transforms
     from attnwarp_eval.files import write_picture
 
-    tell = progress or (lambda text: None)
     folder = Path(folder)
-    tell("points")
+    progress("points")
     cloud = first_points(scene, points, noise=noise, seed=seed)
     cameras = orbit(scene, views, size)
     paths: list[Path | None] = []
     for k, camera in enumerate(cameras):
-        tell(f"view {k + 1} of {views}")
+        progress(f"view {k + 1} of {views}")
         path = folder / "images" / f"{camera.name}.png"
         paths.append(write_picture(path, picture(scene, camera, spp)))
     splits: list[str | None] = ["test" if out else "train" for out in held_out(views)]

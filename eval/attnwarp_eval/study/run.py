@@ -17,7 +17,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
 from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.record import Environment, Failure, Record
+from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.schema import Study, StudyError
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
@@ -75,13 +75,12 @@ def plan(study: Study, store: Store) -> Plan:
     todo: list[Cell] = []
     other_code = 0
     for cell in cells:
-        if cell.id in done:
-            with contextlib.suppress(StoreError):  # a damaged record is computed again
-                record = store.read_as(cell.id, probe(cell.probe).read)
-                if _has_pictures(cell, record, store):
-                    other_code += not record.environment.same_code(this)
-                    continue
-        todo.append(cell)
+        record = store.whole(cell.id, probe(cell.probe).read) if cell.id in done else None
+        # Pictures are no part of a cell's id: those that the study wants may be others.
+        if record is None or not set(cell.pictures) <= {p.view for p in record.pictures}:
+            todo.append(cell)
+        else:
+            other_code += not record.environment.same_code(this)
     return Plan(study, scenes, cells, todo, other_code)
 
 
@@ -93,15 +92,6 @@ def _scenes(study: Study) -> dict[str, Scene]:
             if other != name and scene.content_hash == scenes[name].content_hash:
                 raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
     return scenes
-
-
-def _has_pictures(cell: Cell, record: Record[Any], store: Store) -> bool:
-    """Whether the record's pictures are whole, and those that the study wants are among them;
-    pictures are no part of a cell's id.
-    """
-    views = {p.view for p in record.pictures}
-    damaged = store.damaged_pictures(p.to_json() for p in record.pictures)
-    return not damaged and set(cell.pictures) <= views
 
 
 def verify(store: Store) -> Problems:

@@ -57,10 +57,11 @@ class Store:
     Example:
         >>> from attnwarp_eval.study import Store
         >>> store = Store("run")
-        >>> record = store.resumed({"scene": "bear"}, lambda: {"answer": 42})
-        >>> again = store.resumed({"scene": "bear"}, lambda: {"answer": 0})  # read, not computed
-        >>> again["answer"], store.done() == {record["id"]}
-        (42, True)
+        >>> from attnwarp_eval.canonical_json import digest
+        >>> spec = {"scene": "bear"}
+        >>> store.write({"id": digest(spec), "spec": spec, "answer": 42})
+        >>> [store.whole(cell_id, lambda record: record["answer"]) for cell_id in store.done()]
+        [42]
     """
 
     def __init__(self, root: Path | str) -> None:
@@ -228,26 +229,15 @@ class Store:
                 f" {error}); run again, which computes it anew"
             ) from None
 
-    def resumed(
-        self, spec: dict[str, Any], compute: Callable[[], dict[str, Any]]
-    ) -> dict[str, Any]:
-        """The record of a cell: read where it is finished and whole, else computed and written.
-
-        Args:
-            spec: everything that decides the result, and nothing else; its hash is the cell's id.
-            compute: makes the rest of the record, as JSON.
-
-        Returns:
-            The record, as it is read back, so that a resumed run cannot differ from a whole one.
+    def whole(self, cell_id: str, read: Callable[[dict[str, Any]], T]) -> T | None:
+        """What ``read`` makes of the record of a cell; None where the record or one of its pictures
+        is missing or damaged.
         """
-        cell_id = digest(spec)
-        if self.path(cell_id).is_file():
-            with contextlib.suppress(StoreError):  # a damaged record is computed again
-                record = self.read(cell_id)
-                if not self.damaged_pictures(record.get("pictures", [])):
-                    return record
-        self.write({"id": cell_id, "spec": spec, **compute()})
-        return self.read(cell_id)
+        with contextlib.suppress(StoreError):
+            result, pictures = self.read_as(cell_id, lambda r: (read(r), r.get("pictures", [])))
+            if not self.damaged_pictures(pictures):
+                return result
+        return None
 
     def keep_picture(self, path: Path, **about: str) -> dict[str, str]:
         """What a record says of a picture that was written below the folder: ``about``, its path

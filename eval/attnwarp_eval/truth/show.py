@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.extent import extent
 from attnwarp_eval.scene.meshes import read_mesh_file
 from attnwarp_eval.scene.scene import Scene
@@ -63,7 +64,7 @@ def describe(scene: Scene) -> str:
 
 def render_views(
     scene: Scene, out: Path, *, views: list[str] | None = None, spp: int | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Tell = untold,
 ) -> Iterator[Path]:  # fmt: skip
     """Write each view's picture, depth and normals as PNG, and one sheet of them all.
 
@@ -85,8 +86,7 @@ def render_views(
     geometry = Geometry(scene)
     rows = []
     for camera in cameras:
-        if progress:
-            progress(camera.name)
+        progress(camera.name)
         image = to_srgb(appearance(scene, camera, spp=spp))
         hits = geometry.trace(camera)
         pictures = {

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,9 @@ from attnwarp.errors import InputError
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.study.record import Json, with_nan
 from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.task import Task, results
 
 Picture = npt.NDArray[np.float32]
 Embedding = npt.NDArray[np.float64]
@@ -158,9 +158,13 @@ PROTOCOL = 1
 
 
 def measure(
-    inputs: Inputs, encoders: Mapping[Kind, str | None] | None = None, *, device: str = "cpu",
-    progress: Progress = silent, store: Store | None = None,
-) -> Measured:  # fmt: skip
+    inputs: Inputs,
+    encoders: Mapping[Kind, str | None],
+    store: Store,
+    *,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> Measured:
     """Compute every figure of the paper's table that the pictures and prompts allow.
 
     Args:
@@ -168,10 +172,10 @@ def measure(
         encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
             figures out. A kind that is not named, or named None, takes the bundled one, and its
             figures are left out where there is none.
-        device: "cpu" or "cuda", for real encoders.
-        progress: told of each view.
         store: finished views are read from there and written there, so that a call that was killed
             goes on where it was. Views are known by the content of their files.
+        device: "cpu" or "cuda", for real encoders.
+        progress: told of each batch of views.
 
     Raises:
         InputError: nothing can be computed (the message says why, figure by figure), a picture that
@@ -196,8 +200,8 @@ def measure(
                 f"{_option(name)}: {len(maps)} normal maps beside pictures of the same name are no"
                 f" views and are left out, {maps[0]} first"
             )
-    wanted = _possible(inputs, folders, encoders or {}, done)
-    loaded = _load(wanted, encoders or {}, device, done)
+    wanted = _possible(inputs, folders, encoders, done)
+    loaded = _load(wanted, encoders, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     if not wanted:
         raise InputError(
@@ -211,9 +215,9 @@ def measure(
     if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
         source = read_picture(inputs.source_edit, inputs.background)  # before the long part
     gathered = _Gathered()
-    with nullcontext() if store is None else store.lock():
-        for batch, part in _gather(inputs, folders, views, loaded, progress, store, device):
-            gathered.add(batch, part)
+    tasks = _tasks(inputs, folders, views, loaded, device)
+    for batch in results(store, tasks, len(tasks), progress):
+        gathered.add(batch)
     _rows(inputs, source, views, loaded, gathered, done)
     return done
 
@@ -420,34 +424,33 @@ class _Gathered:
             },
         }
 
-    def add(self, views: Iterable[str], data: Mapping[str, Mapping[str, Any]]) -> None:
-        """Add some views from the JSON of :meth:`to_json`."""
-        for view in views:
-            if view in data["errors"]:
-                mse = _number(data["errors"][view])
-                psnr = np.inf if mse == 0 else _number(data["psnr"][view])
-                self.errors[view] = (mse, psnr)
-            if view in data["distances"]:
-                self.distances[view] = _number(data["distances"][view])
-            for name in ("clip", "dino", "before"):
-                if view in data[name]:
-                    getattr(self, name)[view] = np.array(data[name][view], dtype=np.float64)
+    @classmethod
+    def from_json(cls, views: Iterable[str], data: Json) -> _Gathered:
+        """Some views, in this order, from the JSON of :meth:`to_json`."""
+        errors, psnr, distances = (with_nan(data[k]) for k in ("errors", "psnr", "distances"))
+        return cls(
+            {v: (errors[v], psnr[v] if errors[v] else np.inf) for v in views if v in errors},
+            {v: distances[v] for v in views if v in distances},
+            *(
+                {v: np.array(data[name][v], np.float64) for v in views if v in data[name]}
+                for name in ("clip", "dino", "before")
+            ),
+        )
+
+    def add(self, other: _Gathered) -> None:
+        """Add the views of another."""
+        for name, values in vars(other).items():
+            getattr(self, name).update(values)
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else value
-
-
-def _gather(
+def _tasks(
     inputs: Inputs,
     folders: Mapping[str, Mapping[str, Path]],
     views: Mapping[_Figure, Sequence[str]],
     loaded: Mapping[Kind, Any],
-    progress: Progress,
-    store: Store | None,
     device: str,
-) -> Iterator[tuple[list[str], dict[str, Any]]]:
-    """Read each picture once; yield batches of views with what the figures need, as JSON."""
+) -> list[Task[_Gathered]]:
+    """Batches of views with what the figures need, each picture read once."""
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
@@ -499,13 +502,7 @@ def _gather(
                     raise InputError(f"{folders['edited'][name]}: {error}") from None
         return result
 
-    # Encoders take a batch at once and round differently in another one: a batch is the cell.
-    for start in range(0, len(needed), BATCH):
-        batch = needed[start : start + BATCH]
-        progress(start, len(needed), batch[0])
-        if store is None:
-            yield batch, gather(batch).to_json()
-            continue
+    def task(batch: Sequence[str]) -> Task[_Gathered]:
         spec = {
             "probe": "user images",
             "protocol": PROTOCOL,
@@ -521,12 +518,15 @@ def _gather(
             "background": list(inputs.background),
             "device": device,
         }
-        yield batch, store.resumed(spec, partial(_plain, gather, batch))["views"]
-    progress(len(needed), len(needed), "")
+        return Task(
+            f"{batch[0]} to {batch[-1]}",
+            spec,
+            lambda tell: {"views": gather(batch).to_json()},
+            lambda record: _Gathered.from_json(batch, record["views"]),
+        )
 
-
-def _plain(gather: Callable[[Sequence[str]], _Gathered], batch: Sequence[str]) -> dict[str, Any]:
-    return {"views": gather(batch).to_json()}
+    # Encoders take a batch at once and round differently in another one: a batch is the cell.
+    return [task(needed[start : start + BATCH]) for start in range(0, len(needed), BATCH)]
 
 
 def _sha256(path: Path) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.document.model import Report, Section, Table
-from attnwarp_eval.document.write import markdown, terminal
+from attnwarp_eval.document.write import terminal, write_files
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import Metric, metric
 from attnwarp_eval.user_images.measure import Measured, Row, natural
@@ -75,8 +75,8 @@ def to_json(measured: Measured) -> str:
     return json.dumps(to_dict(measured), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def to_markdown(measured: Measured) -> str:
-    """The text of metrics.md."""
+def report(measured: Measured) -> Report:
+    """The figures as a document."""
     lists = {
         "Not computed": [f"{what}: {why}" for what, why in measured.missing.items()],
         "Pictures without a partner": measured.unpaired,
@@ -92,7 +92,7 @@ def to_markdown(measured: Measured) -> str:
     lead = _list(
         f"{name.replace('_', ' ')}: {value}" for name, value in inputs.items() if value is not None
     )
-    return markdown(Report(_TITLE, [lead], sections))
+    return Report(_TITLE, [lead], sections)
 
 
 def table(measured: Measured) -> rich.table.Table:
@@ -104,13 +104,9 @@ def table(measured: Measured) -> rich.table.Table:
 
 
 def write(measured: Measured, folder: Path) -> list[Path]:
-    """Write metrics.json and metrics.md, over older ones."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for name, text in (("metrics.json", to_json(measured)), ("metrics.md", to_markdown(measured))):
-        write_atomic(folder / name, text.encode())
-        paths.append(folder / name)
-    return paths
+    """Write metrics.json and the report, over older ones; return their paths."""
+    write_atomic(folder / "metrics.json", to_json(measured).encode())
+    return [folder / "metrics.json", *write_files(report(measured), folder, "metrics")]
 
 
 def _overview(measured: Measured) -> Table:

@@ -691,8 +691,17 @@ def test_a_measurement_that_was_interrupted_goes_on_and_ends_as_one_that_was_not
     assert views == set(names[BATCH:])
     _, views = run("b")
     assert views == set(names)
-    for file in ("metrics.json", "metrics.md"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    files = ("metrics.json", "metrics.md", "metrics.html")
+    expected = [(tmp_path / "b" / file).read_bytes() for file in files]
+    assert [(tmp_path / "a" / file).read_bytes() for file in files] == expected
+    # A record that was changed since is computed again.
+    (cell,) = (c for c in (tmp_path / "a/cells").rglob("*.json") if '"v0"' in c.read_text())
+    record = json.loads(cell.read_text())
+    record["views"]["errors"]["v0"] /= 2
+    cell.write_text(json.dumps(record))
+    repaired, views = run("a")
+    assert repaired.exit_code == 0 and views == set(names[:BATCH])
+    assert [(tmp_path / "a" / file).read_bytes() for file in files] == expected
     values = json.loads((tmp_path / "a" / "metrics.json").read_text())["metrics"]
     assert values["edit.psnr_mean"]["identical"] == ["v1"]
     # Another picture of the same name is another cell.

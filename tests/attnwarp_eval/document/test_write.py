@@ -97,6 +97,16 @@ def test_a_page_holds_every_picture_and_nothing_from_elsewhere_in_8_mb(tmp_path)
     assert set(re.findall(r'(?:href="|url\()#([^")]*)', text)) <= set(identities)
 
 
+def test_a_list_is_one_in_markdown_and_on_a_page(tmp_path):
+    lines = "- a <b>name</b>\n- `code` - and a dash\n- last"
+    report = Report("Lists", ["no - list", lines], [Section("Notes", [lines])])
+    written = Parsed(python_markdown.markdown(markdown(report)))
+    opened = Parsed(page(report, tmp_path))
+    assert written.tags.count("ul") == opened.tags.count("ul") == 2
+    assert written.tags.count("li") == opened.tags.count("li") == 6
+    assert "b" not in opened.tags and "a <b>name</b>" in opened.text
+
+
 def test_names_of_metrics_link_to_their_meaning(tmp_path):
     meanings = Table(["metric"], [["warp.epe"], ["depth.bias"]], glossary=True)
     used = Table(["metric"], [["warp.epe.64"], ["warp.other"], ["depth.bias"]])

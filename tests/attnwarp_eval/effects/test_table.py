@@ -79,6 +79,11 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
     entries = collect(["spheres", "glass"], tmp_path, quick)
     # Seconds are among the entry's figures: measured again they would differ.
     assert entries[0] == first and made == ["spheres", "glass", "glass"]
+    written = {path: path.read_bytes() for path in tmp_path.glob("effects.*")}
+    assert {path.suffix for path in written} == {".json", ".md", ".html"}
+    (tmp_path / "effects.json").write_text('{"scenes": []}')
+    collect(["spheres", "glass"], tmp_path, quick)
+    assert {path: path.read_bytes() for path in written} == written and len(made) == 3
     (cell,) = (
         c for c in (tmp_path / "cells").rglob("*.json") if '"name": "glass"' in c.read_text()
     )
@@ -212,11 +217,9 @@ def test_a_dropped_light_shows_eight_times_as_strong_about_grey(small, monkeypat
     )
 
 
-def test_a_file_of_something_else_is_refused_and_one_scene_or_all_must_be_asked_for(tmp_path):
-    (tmp_path / "effects.json").write_text("{}")
+def test_one_scene_or_all_must_be_asked_for():
     runner = CliRunner()
     for arguments, words in (
-        (["--all", "--out", str(tmp_path)], "it is not a table of effects"),
         ([], "name one scene, or say --all"),
         (["spheres", "--all"], "name one scene, or say --all"),
         (["--all", "--json"], "--json is of one scene"),

@@ -1,18 +1,21 @@
 """What the truth's own error and time are measured with, held to errors that are known."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from effect_scenes import FLOOR, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
+from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.experiments import accuracy, suite
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
 from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study.store import Store
 
 
 def test_the_brute_force_finds_hits_known_in_closed_form():
@@ -103,8 +106,11 @@ def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio
             "depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4)
         )
 
-    write([panel("one")], tmp_path)
-    write([panel("two")], tmp_path)
+    for scene in ("one", "two"):  # as two calls do, of which each measures a scene
+        spec = {"probe": "accuracy", "protocol": 1, "name": scene}
+        record = {"id": digest(spec), "spec": spec, "panel": asdict(panel(scene))}
+        Store(tmp_path).write(record)
+        assert tmp_path / "accuracy.html" in write([panel(scene)], tmp_path)
     text = (tmp_path / "accuracy.md").read_text()
     assert (
         "**one**" in text
@@ -113,11 +119,20 @@ def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio
         and "25.00 %" in text
     )
     assert "| again |" in text and (tmp_path / "depth.svg").is_file()
-    assert [p["scene"] for p in json.loads((tmp_path / "accuracy.json").read_text())["panels"]] == [
-        "one",
-        "two",
-    ]
-    (tmp_path / "accuracy.json").write_text("[]")
+    measured = (tmp_path / "accuracy.json").read_text()
+    assert [p["scene"] for p in json.loads(measured)["panels"]] == ["one", "two"]
+    # The file is made of the cells: what was written into it since does not count.
+    (tmp_path / "accuracy.json").write_text(measured.replace("0.25", "0.75"))
+    write([panel("two")], tmp_path)
+    assert (tmp_path / "accuracy.json").read_text() == measured
+    (cell,) = (c for c in (tmp_path / "cells").rglob("*.json") if '"name": "one"' in c.read_text())
+    cell.write_text(cell.read_text().replace("0.25", "0.75"))
+    write([panel("two")], tmp_path)
+    panels = json.loads((tmp_path / "accuracy.json").read_text())["panels"]
+    assert [p["scene"] for p in panels] == ["two"]
+
+
+def test_an_unknown_scene_is_one_line(tmp_path):
     result = CliRunner().invoke(app, ["scenes", "accuracy", "nowhere", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "nowhere" in result.output
 
@@ -184,4 +199,12 @@ def test_panels_that_are_finished_are_read_and_not_measured_again(tmp_path, monk
     # Seconds are among a panel's figures: measured again they would differ.
     panels = json.loads((tmp_path / "accuracy.json").read_text())["panels"]
     assert panels[0] == record["panel"] and [p["question"] for p in panels] == ["depth", asked[1]]
+    written = {path: path.read_bytes() for path in tmp_path.glob("accuracy.*")}
     assert CliRunner().invoke(app, call).exit_code == 0 and len(asked) == 3
+    assert {path: path.read_bytes() for path in written} == written and len(written) == 3
+    # A panel that was changed since is measured again; an undefined error is read back as such.
+    (cell,) = (c for c in (tmp_path / "cells").rglob("*.json") if '"depth"' in c.read_text())
+    cell.write_text(cell.read_text().replace('"wrong": 0.0', '"wrong": 0.5', 1))
+    assert CliRunner().invoke(app, call).exit_code == 0 and asked[3:] == ["depth"]
+    record["panel"]["contestants"][0]["error"] = [None, None, None]
+    assert np.isnan(Panel.from_record(record).contestants[0].error).all()

@@ -51,7 +51,8 @@ def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
         f"bear-5-{kind}.png" for kind in flow.PAIRS
     )
     printed = result.stdout.splitlines()
-    assert printed[2].startswith("| bear | 5 | ") and printed[3:] == [str(tmp_path / "report.md")]
+    assert printed[2].startswith("| bear | 5 | ")
+    assert printed[3:] == [str(tmp_path / name) for name in ("report.md", "report.html")]
     text = (tmp_path / "report.md").read_text()
     assert (
         printed[2] in text.splitlines()
@@ -87,7 +88,8 @@ def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_p
     monkeypatch.setattr(flow, "measure_pair", counted)
     assert run(tmp_path / "a", "--yaws", "5,20").exit_code == 0 and measured == [20]
     assert run(tmp_path / "b", "--yaws", "5,20").exit_code == 0 and measured == [20, 5, 20]
-    for name in ("flow.json", "report.md", "figures/flow.svg", "bear-20-slip.png"):
+    names = ("flow.json", "report.md", "report.html", "figures/flow.svg", "bear-20-slip.png")
+    for name in names:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     # A picture that is gone is drawn again; a cell that was changed is measured again.
     (tmp_path / "a" / "bear-5-slip.png").unlink()

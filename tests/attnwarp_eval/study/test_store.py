@@ -13,8 +13,10 @@ from attnwarp_eval.canonical_json import canonical_json
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.store import Store, StoreError
+from attnwarp_eval.study.task import Task, results
 
 SPEC = {"probe": "depth", "scene": "abc", "seed": 0}
+TASK = Task("depth", SPEC, lambda tell: {"summary": {"x": 1.5}}, lambda record: record["summary"])
 
 
 def record(**extra):
@@ -63,7 +65,7 @@ def test_a_run_of_former_code_in_one_folder_is_read_and_resumed_where_it_is(tmp_
     assert store.done() == {record()["id"]}
     assert store.read(record()["id"])["summary"] == {"x": 1.5}
     former.write_bytes(whole[:20])
-    store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})
+    list(results(store, [TASK], 1))
     assert former.read_bytes() == whole and not new.exists()
 
 
@@ -121,7 +123,7 @@ def test_a_cell_of_another_content_is_refused_in_one_line_and_computed_anew(tmp_
     with pytest.raises(StoreError, match="run again, which computes it anew") as caught:
         store.read(record()["id"])
     assert "\n" not in str(caught.value)
-    assert store.resumed(SPEC, lambda: {"summary": {"x": 1.5}})["summary"] == {"x": 1.5}
+    assert list(results(store, [TASK], 1)) == [{"x": 1.5}]
     assert store.path(record()["id"]).read_bytes() == whole
 
 

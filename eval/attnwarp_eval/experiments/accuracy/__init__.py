@@ -11,20 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
-from attnwarp_eval.experiments.accuracy.panel import Panel
+from attnwarp_eval.experiments.accuracy.panel import PROTOCOL, Panel
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
-from attnwarp_eval.progress import Progress, silent
+from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.store import Store
-
-PROTOCOL = 1
-"""Raised whenever a panel would come out otherwise."""
+from attnwarp_eval.study.task import Task, results
 
 PICTURE_SCENES = ("spheres", "bear", "glass", "fog")
 GEOMETRY_SCENES = ("bear", "garden", "far")
@@ -53,16 +51,10 @@ def measure(
     from attnwarp_eval.truth.mitsuba import forget
 
     cells = _cells([load_scene(name) for name in names])
-    store = Store(out)
-    with store.lock():
-        for number, (question, scene) in enumerate(cells):
-
-            def tell(step: str, number: int = number) -> None:
-                progress(number, len(cells), step)
-
-            tell(f"{scene.name}: {question.__name__}")
-            yield _resumed(store, question, scene, rounds, tell)
-            forget()
+    tasks = (_task(question, scene, rounds) for question, scene in cells)
+    for panel in results(Store(out), tasks, len(cells), progress):
+        yield panel
+        forget()
 
 
 def _cells(scenes: Sequence[Scene]) -> list[tuple[Question, Scene]]:
@@ -80,16 +72,14 @@ def _cells(scenes: Sequence[Scene]) -> list[tuple[Question, Scene]]:
     return cells
 
 
-def _resumed(
-    store: Store, question: Question, scene: Scene, rounds: int, tell: Callable[[str], None]
-) -> Panel:
+def _task(question: Question, scene: Scene, rounds: int) -> Task[Panel]:
     import mitsuba
 
     from attnwarp_eval._open3d import open3d
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
 
-    spec: dict[str, Any] = {
+    spec: Json = {
         "probe": "accuracy",
         "protocol": PROTOCOL,
         "question": question.__name__,
@@ -102,11 +92,8 @@ def _resumed(
         spec |= {"appearance": APPEARANCE_PROTOCOL}
     else:
         spec |= {"open3d": open3d().__version__}
-    record = store.resumed(
-        spec, lambda: {"panel": _plain(question(scene, rounds=rounds, tell=tell))}
-    )
-    return Panel.from_json(record["panel"])
 
+    def compute(tell: Tell) -> Json:
+        return {"panel": without_nan(asdict(question(scene, rounds=rounds, tell=tell)))}
 
-def _plain(panel: Panel) -> dict[str, Any]:
-    return dict(without_nan(asdict(panel)))
+    return Task(f"{scene.name}: {question.__name__}", spec, compute, Panel.from_record)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from attnwarp.errors import InputError
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh
 
@@ -80,7 +81,7 @@ def depth(
     size: int = 512,
     rays: int = 500,
     rounds: int = 9,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = untold,
 ) -> Panel:
     """Error of depth with the hit as Open3D has it (float32) and refined on its triangle's plane in
     float64.

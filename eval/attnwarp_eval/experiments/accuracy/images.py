@@ -9,6 +9,7 @@ import numpy as np
 
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 
 SAMPLES = (1, 4, 16, 64)
@@ -21,7 +22,7 @@ def pictures(
     samples: Sequence[int] = SAMPLES,
     rounds: int = 7,
     reference: tuple[int, int] = (16, 256),
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = untold,
 ) -> Panel:
     """Error of the source's picture against a converged one, by samples a pixel, plan and Mitsuba's
     variant.

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from attnwarp_eval.statistics.intervals import Ratio, time_ratio
+from attnwarp_eval.study.record import Json, with_nan
+
+PROTOCOL = 1
+"""Raised whenever a panel would come out otherwise."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +66,26 @@ class Panel:
         return time_ratio([products[0].tolist()], [products[1].tolist()])
 
     @classmethod
-    def from_json(cls, fields: Mapping[str, Any]) -> Panel:
-        """A panel from the JSON of its fields.
+    def from_record(cls, record: Json) -> Panel:
+        """The panel of a cell.
 
         Raises:
-            KeyError, TypeError: a field is missing or of another kind.
+            LookupError, TypeError, ValueError: the record is of another kind or protocol.
         """
-        contestants = tuple(
-            Contestant(c["name"], tuple(c["error"]), tuple(c["seconds"]), c["more"])
-            for c in fields["contestants"]
-        )
+        if record["spec"]["protocol"] != PROTOCOL:
+            raise ValueError(f"protocol {record['spec']['protocol']}, expected {PROTOCOL}")
+        fields = record["panel"]
+        contestants = []
+        for c in fields["contestants"]:
+            error, low, high = (np.nan if value is None else value for value in c["error"])
+            contestants.append(
+                Contestant(c["name"], (error, low, high), tuple(c["seconds"]), with_nan(c["more"]))
+            )
         return cls(
             fields["question"],
             fields["scene"],
             fields["unit"],
-            contestants,
+            tuple(contestants),
             tuple(fields["again"]),
-            tuple(tuple(row) for row in fields["squares"]),
+            tuple(map(tuple, fields["squares"])),
         )

@@ -12,6 +12,7 @@ from attnwarp.camera import Camera
 from attnwarp_eval.cost import in_turn
 from attnwarp_eval.experiments.accuracy.geometry import every_triangle, triangles
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
+from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.two_view import Hits
 
@@ -29,7 +30,7 @@ def visibility(
     points: int = 500,
     rounds: int = 5,
     maps: Sequence[int] = MAPS,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Tell = untold,
 ) -> Panel:
     """Whether surface points of the middle target are seen by the source: by rays, and by depth
     maps of the source.

@@ -1,8 +1,7 @@
-"""accuracy.md, accuracy.json and their figures."""
+"""The report of accuracy, accuracy.json and the figures."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,48 +9,37 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp.errors import InputError
-from attnwarp_eval.canonical_json import write_json
+from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.experiments.accuracy.panel import Panel
-from attnwarp_eval.files import write_atomic
 from attnwarp_eval.statistics.intervals import Ratio
+from attnwarp_eval.study.store import Store
 
 
-def _read(path: Path) -> list[Panel]:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return []
-    try:
-        return [Panel.from_json(fields) for fields in json.loads(text)["panels"]]
-    except (ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{path}: it is no measurement of accuracy; name another folder with --out"
-        ) from None
+def _with_earlier(panels: Sequence[Panel], store: Store) -> list[Panel]:
+    """The panels, behind those of other questions and scenes that are stored, oldest first."""
+    asked = {(panel.question, panel.scene) for panel in panels}
+    ids = sorted(store.done(), key=lambda cell_id: store.path(cell_id).stat().st_mtime_ns)
+    stored = (store.whole(cell_id, Panel.from_record) for cell_id in ids)
+    earlier = {(panel.question, panel.scene): panel for panel in stored if panel is not None}
+    return [*(panel for key, panel in earlier.items() if key not in asked), *panels]
 
 
 def write(panels: Sequence[Panel], out: Path) -> list[Path]:
-    """accuracy.md, accuracy.json and the figures below ``out``; their paths.
+    """Write the report of panels, accuracy.json and the figures below ``out``; return their paths.
 
-    Panels of other scenes that are in ``accuracy.json`` already stay, so that scenes can be
-    measured one by one.
-
-    Raises:
-        InputError: an ``accuracy.json`` of something else.
+    Panels of other scenes that ``out`` has stay in the report, so that scenes can be measured one
+    by one.
     """
     from attnwarp_eval.cost import environment
     from attnwarp_eval.document import charts
     from attnwarp_eval.document.model import Picture, Report
-    from attnwarp_eval.document.write import markdown
+    from attnwarp_eval.document.write import write_files
     from attnwarp_eval.statistics.intervals import Interval
     from attnwarp_eval.truth.llvm import variant
 
     out.mkdir(parents=True, exist_ok=True)
     nan = float("nan")
-    merged = {
-        (panel.question, panel.scene): panel for panel in [*_read(out / "accuracy.json"), *panels]
-    }
-    panels = list(merged.values())
+    panels = _with_earlier(panels, Store(out))
 
     def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
@@ -96,16 +84,15 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
             " against itself: inside its band nothing is called faster or slower."
         ),
     ]
-    files = [out / "accuracy.md", out / "accuracy.json", *(path for _, path in drawn)]
     report = Report("Error of the truth itself, against time", lead, sections)
-    write_atomic(files[0], markdown(report).encode())
     data = {
         "environment": about,
         "variant": variant(),
-        "panels": [asdict(panel) for panel in panels],
+        "panels": without_nan([asdict(panel) for panel in panels]),
     }
-    write_json(files[1], data, sort_keys=False)
-    return files
+    write_json(out / "accuracy.json", data, sort_keys=False)
+    written = write_files(report, out, "accuracy")
+    return [out / "accuracy.json", *(path for _, path in drawn), *written]
 
 
 SHORT = {

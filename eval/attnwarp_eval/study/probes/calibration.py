@@ -19,7 +19,7 @@ from attnwarp.warp import EXACT_DEPTH_TOLERANCE, PRESETS, TAP_SPREAD
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.effects.table import USUAL, plan_words, said_by
+from attnwarp_eval.effects.table import USUAL, plan_words, transport_of
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.pictures import of_warp
@@ -123,7 +123,7 @@ class Calibration(Probe[Extra]):
             work.meter.count(pixels=size * size)
             draw = partial(of_warp, work.world, name, spec["spp"], truth, view)
             work.add(name, figures, draw)
-        return Extra(Transport(**said_by(work.world.scene)))
+        return Extra(Transport(**transport_of(work.world.scene)))
 
     def read_extra(self, data: Json) -> Extra:
         """From the record's entry ``effects``, if it has one."""

@@ -13,7 +13,7 @@ from attnwarp.warp.rules import EXACT_DEPTH_TOLERANCE
 from attnwarp.warp.settings import PRESETS, preset
 from attnwarp.warp.view import Surface, warp_surfaces
 from attnwarp_eval import metrics
-from attnwarp_eval.effects.table import plan_words, said_by
+from attnwarp_eval.effects.table import plan_words, transport_of
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout, Place
@@ -172,7 +172,7 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
         made = probe("calibration").sections(written_runs.results(study, cells), Layout(tmp_path))
         return [section for place, section in made if place == Place.APPENDIX]
 
-    (section,) = sections(fog={"effects": said_by(load_scene("fog"))}, old={})
+    (section,) = sections(fog={"effects": transport_of(load_scene("fog"))}, old={})
     ((scene, usual, beyond, missing, planned, full, why),) = section.tables[0].rows
     assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
     assert planned == full == "volpath" and "medium" in why

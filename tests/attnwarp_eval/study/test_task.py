@@ -1,0 +1,76 @@
+"""Tasks are stored and resumed as cells are. Oracles: squares, and the file system."""
+
+import json
+
+import pytest
+
+from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.study.store import Store, StoreError
+from attnwarp_eval.study.task import Task, results
+
+
+def squares(computed, interrupted=None):
+    """Of 2, 3 and 4, with a picture each; computing ``interrupted`` is stopped."""
+
+    def task(store, x):
+        def compute(tell):
+            if x == interrupted:
+                raise KeyboardInterrupt
+            tell(f"{x} times {x}")
+            computed.append(x)
+            path = store.root / f"{x}.png"
+            path.write_bytes(bytes(x))
+            return {"y": x * x, "pictures": [store.keep_picture(path, view=str(x))]}
+
+        return Task(f"{x} squared", {"x": x}, compute, lambda record: record["y"])
+
+    return lambda store: (task(store, x) for x in (2, 3, 4))
+
+
+def test_tasks_that_were_interrupted_go_on_and_leave_the_bytes_of_a_whole_run(tmp_path):
+    computed, told = [], []
+    with pytest.raises(KeyboardInterrupt):
+        list(
+            results(
+                Store(tmp_path / "a"), squares(computed, interrupted=4)(Store(tmp_path / "a")), 3
+            )
+        )
+    assert computed == [2, 3]
+    for folder, expected in (("a", [2, 3, 4]), ("b", [2, 3, 4, 2, 3, 4])):
+        store = Store(tmp_path / folder)
+        values = results(store, squares(computed)(store), 3, lambda *step: told.append(step))
+        assert list(values) == [4, 9, 16] and computed == expected
+    files = [p.relative_to(tmp_path / "b") for p in (tmp_path / "b").rglob("*") if p.is_file()]
+    assert len(files) == 7  # three records, three pictures and the lock
+    for file in files:
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    assert told[:4] == [
+        (0, 3, "2 squared"),
+        (1, 3, "3 squared"),
+        (2, 3, "4 squared"),
+        (2, 3, "4 times 4"),
+    ]
+
+
+@pytest.mark.parametrize("damage", ["digit", "cut", "other shape", "picture"])
+def test_a_damaged_record_is_computed_again(tmp_path, damage):
+    store, computed = Store(tmp_path), []
+    assert list(results(store, squares(computed)(store), 3)) == [4, 9, 16]
+    path = store.path(digest({"x": 3}))
+    whole = path.read_text()
+    if damage == "digit":
+        path.write_text(whole.replace('"y": 9', '"y": 8'))
+    elif damage == "cut":
+        path.write_text(whole[:-9])
+    elif damage == "other shape":  # sealed, as former code may have left it
+        store.write({"id": digest({"x": 3}), "spec": {"x": 3}})
+    else:
+        (tmp_path / "3.png").write_bytes(b"x")
+    assert list(results(store, squares(computed)(store), 3)) == [4, 9, 16]
+    assert computed == [2, 3, 4, 3] and path.read_text() == whole
+    assert json.loads(whole)["y"] == 9 and (tmp_path / "3.png").read_bytes() == bytes(3)
+
+
+def test_a_second_run_on_the_folder_is_refused(tmp_path):
+    with Store(tmp_path).lock(), pytest.raises(StoreError, match="another run is writing"):
+        next(results(Store(tmp_path), squares([])(Store(tmp_path)), 3))
