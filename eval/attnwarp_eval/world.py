@@ -16,7 +16,7 @@ from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.splats.surface import surface_splats
+from attnwarp_eval.splats.surface import SurfaceSamples, colored_samples, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
 from attnwarp_eval.two_view import TwoView
@@ -25,6 +25,7 @@ SPLATS_PROTOCOL = 1
 """Version of the sampling. Raise it when the same settings give other splats."""
 
 Features = npt.NDArray[np.float64]
+Samples = tuple[SurfaceSamples, npt.NDArray[np.float64]]
 
 
 class World:
@@ -56,6 +57,7 @@ class World:
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
         self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
+        self.samples: Callable[[int, int], Samples] = cache(self._samples)
 
     def add(self, camera: Camera) -> None:
         """Add a target camera under its name."""
@@ -89,6 +91,10 @@ class World:
         points = self.geometry.trace(self.camera(name).resize(size, size)).point
         background = 0.0 if name == self.source.name else np.nan
         return self._field(channels, seed).on_grid(points, background=background)
+
+    def _samples(self, count: int, seed: int) -> Samples:
+        """The points of ``count`` splats of every kind, with their colours."""
+        return colored_samples(self.scene, count, seed=seed, geometry=self.geometry)
 
     def _field(self, channels: int, seed: int) -> SolidField:
         """The feature field, as wide as the field of view at the scene's centre."""
@@ -135,9 +141,8 @@ def splats(
     stored = read_arrays("splats", key)
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
-        made = surface_splats(
-            scene_world.scene, seed=seed, geometry=scene_world.geometry, **settings
-        )
+        samples = scene_world.samples(count, seed)
+        made = surface_splats(scene_world.scene, seed=seed, samples=samples, **settings)
         write_arrays(
             "splats",
             key,
