@@ -40,6 +40,7 @@ PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("metrics", ("attnwarp_eval.metrics.",)),
     ("pictures for people", ("attnwarp_eval.study.pictures:",)),
     ("features warped", ("attnwarp.warp.features:",)),
+    ("positions and masks", ("attnwarp.warp.cpu:",)),
     ("splats rendered", ("attnwarp.render.",)),
     ("positions and masks", ("attnwarp.warp.",)),
     ("report", ("attnwarp_eval.report.",)),

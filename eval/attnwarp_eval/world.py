@@ -55,7 +55,7 @@ class World:
         # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
-        self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
+        self.edge: Callable[[str, int], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
         self.samples: Callable[[int, int], Samples] = cache(self._samples)
 
@@ -73,12 +73,15 @@ class World:
     def _pair(self, target: str, size: int) -> TwoView:
         """The exact relation of the source and a target, on a grid of ``size`` x ``size``."""
         return two_view(
-            self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size)
+            self.geometry,
+            self.source.resize(size, size),
+            self.targets[target].resize(size, size),
+            bands=(self.edge(self.source.name, size), self.edge(target, size)),
         )
 
-    def _edge(self, name: str) -> npt.NDArray[np.bool_]:
-        """(H, W) bool: the band around the depth and object edges of a view."""
-        return edge_band(self.geometry, self.camera(name))
+    def _edge(self, name: str, size: int) -> npt.NDArray[np.bool_]:
+        """(size, size) bool: the band around the depth and object edges of a view."""
+        return edge_band(self.geometry, self.camera(name).resize(size, size))
 
     def _image(self, name: str, spp: int) -> npt.NDArray[np.float32]:
         """(H, W, 3) sRGB truth of a view in [0, 1]."""
