@@ -16,7 +16,7 @@ from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.splats.surface import surface_splats
+from attnwarp_eval.splats.surface import SurfaceSamples, colored_samples, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
 from attnwarp_eval.two_view import TwoView
@@ -25,6 +25,7 @@ SPLATS_PROTOCOL = 1
 """Version of the sampling. Raise it when the same settings give other splats."""
 
 Features = npt.NDArray[np.float64]
+Samples = tuple[SurfaceSamples, npt.NDArray[np.float64]]
 
 
 class World:
@@ -54,8 +55,9 @@ class World:
         # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
-        self.edge: Callable[[str], npt.NDArray[np.bool_]] = cache(self._edge)
+        self.edge: Callable[[str, int], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
+        self.samples: Callable[[int, int], Samples] = cache(self._samples)
 
     def add(self, camera: Camera) -> None:
         """Add a target camera under its name."""
@@ -71,12 +73,15 @@ class World:
     def _pair(self, target: str, size: int) -> TwoView:
         """The exact relation of the source and a target, on a grid of ``size`` x ``size``."""
         return two_view(
-            self.geometry, self.source.resize(size, size), self.targets[target].resize(size, size)
+            self.geometry,
+            self.source.resize(size, size),
+            self.targets[target].resize(size, size),
+            bands=(self.edge(self.source.name, size), self.edge(target, size)),
         )
 
-    def _edge(self, name: str) -> npt.NDArray[np.bool_]:
-        """(H, W) bool: the band around the depth and object edges of a view."""
-        return edge_band(self.geometry, self.camera(name))
+    def _edge(self, name: str, size: int) -> npt.NDArray[np.bool_]:
+        """(size, size) bool: the band around the depth and object edges of a view."""
+        return edge_band(self.geometry, self.camera(name).resize(size, size))
 
     def _image(self, name: str, spp: int) -> npt.NDArray[np.float32]:
         """(H, W, 3) sRGB truth of a view in [0, 1]."""
@@ -89,6 +94,10 @@ class World:
         points = self.geometry.trace(self.camera(name).resize(size, size)).point
         background = 0.0 if name == self.source.name else np.nan
         return self._field(channels, seed).on_grid(points, background=background)
+
+    def _samples(self, count: int, seed: int) -> Samples:
+        """The points of ``count`` splats of every kind, with their colours."""
+        return colored_samples(self.scene, count, seed=seed, geometry=self.geometry)
 
     def _field(self, channels: int, seed: int) -> SolidField:
         """The feature field, as wide as the field of view at the scene's centre."""
@@ -135,9 +144,8 @@ def splats(
     stored = read_arrays("splats", key)
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
-        made = surface_splats(
-            scene_world.scene, seed=seed, geometry=scene_world.geometry, **settings
-        )
+        samples = scene_world.samples(count, seed)
+        made = surface_splats(scene_world.scene, seed=seed, samples=samples, **settings)
         write_arrays(
             "splats",
             key,

@@ -71,6 +71,7 @@ def surface_splats(
     opacity: float = 0.99,
     focus: float | None = None,
     geometry: Geometry | None = None,
+    samples: tuple[SurfaceSamples, Array] | None = None,
 ) -> Gaussians:
     """Splats that lie on the surfaces of a scene.
 
@@ -98,6 +99,8 @@ def surface_splats(
             equally dense; further out the density falls with the square of the distance. A third of
             the cameras' orbit if left out.
         geometry: ``Geometry(scene)``, if there is one already.
+        samples: of :func:`colored_samples` with this count, seed and focus, if there are some
+            already: splats of every kind and noise share them.
 
     Returns:
         Gaussians in float32 relative to the float64 scene centre, SH degree 0.
@@ -126,20 +129,16 @@ def surface_splats(
     for name, value in {"position_noise": position_noise, "normal_noise": normal_noise}.items():
         if not value >= 0:
             raise ValueError(f"{name}: got {value}, expected a number >= 0")
-    geometry = Geometry(scene) if geometry is None else geometry
-    if focus is None:
-        focus = scene.spec.cameras.radius / 3
-    samples = sample_surface(geometry, count, center=scene.center, focus=focus, seed=seed)
-    light = irradiance(scene, geometry, samples.point, samples.normal, samples.primitive_id)
-    color = object_albedo(scene, geometry, samples.point, samples.primitive_id) / np.pi * light
-    color += emitted(scene, geometry, samples.primitive_id)
+    if samples is None:
+        samples = colored_samples(scene, count, seed=seed, focus=focus, geometry=geometry)
+    points, color = samples
 
     noise = np.random.default_rng([seed, 1])
-    position, normal = samples.point - scene.center, samples.normal
+    position, normal = points.point - scene.center, points.normal
     if position_noise:
         position = (
             position
-            + noise.standard_normal(position.shape) * (position_noise * samples.spacing)[:, None]
+            + noise.standard_normal(position.shape) * (position_noise * points.spacing)[:, None]
         )
     if normal_noise:
         tilt = np.tan(
@@ -148,9 +147,9 @@ def surface_splats(
         tangent, bitangent = frames(normal)
         normal = normal + tilt[:, :1] * tangent + tilt[:, 1:] * bitangent
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    scales = np.repeat((size * samples.spacing)[:, None], 2 if kind == "2d" else 3, axis=1)
+    scales = np.repeat((size * points.spacing)[:, None], 2 if kind == "2d" else 3, axis=1)
     if kind == "3d":
-        scales[:, 2] = thickness * samples.spacing
+        scales[:, 2] = thickness * points.spacing
 
     def single(array: Array) -> torch.Tensor:
         return torch.from_numpy(array.astype(np.float32))
@@ -164,6 +163,35 @@ def surface_splats(
         sh=Gaussians.sh_from_rgb(single(to_srgb(color))),
         origin=scene.center,
     )
+
+
+def colored_samples(
+    scene: Scene,
+    count: int,
+    *,
+    seed: int = 0,
+    focus: float | None = None,
+    geometry: Geometry | None = None,
+) -> tuple[SurfaceSamples, Array]:
+    """Points on a scene's surfaces, and (N, 3) linear RGB that the truth has there.
+
+    Args:
+        scene, count, seed, focus, geometry: see :func:`surface_splats`.
+
+    Example:
+        >>> from attnwarp_eval.scene.file import load_scene
+        >>> samples, color = colored_samples(load_scene("spheres"), 20)
+        >>> samples.point.shape, color.shape
+        ((20, 3), (20, 3))
+    """
+    geometry = Geometry(scene) if geometry is None else geometry
+    if focus is None:
+        focus = scene.spec.cameras.radius / 3
+    samples = sample_surface(geometry, count, center=scene.center, focus=focus, seed=seed)
+    light = irradiance(scene, geometry, samples.point, samples.normal, samples.primitive_id)
+    color = object_albedo(scene, geometry, samples.point, samples.primitive_id) / np.pi * light
+    color += emitted(scene, geometry, samples.primitive_id)
+    return samples, color
 
 
 def quaternions_from_normals(normals: Array) -> Array:

@@ -12,7 +12,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -399,7 +399,8 @@ class _Runner:
     def _hand_out(self) -> None:
         """A cell for each worker that has none."""
         for worker in sorted(self.accepted - self.running.keys()):
-            cell = self.cells.take(self.scene.get(worker))
+            busy = {cell.probe for _, cell in self.running.values()}
+            cell = self.cells.take(self.scene.get(worker), busy)
             if cell is None:
                 break
             self.scene[worker] = cell.scene
@@ -521,15 +522,25 @@ class _Queue:
         self.scenes.setdefault(cell.scene, deque()).appendleft(cell)
         self.count += 1
 
-    def take(self, scene: str | None) -> Cell | None:
-        """The next cell for the worker that last computed one of ``scene``; None when nothing is
-        left.
+    def take(self, scene: str | None, busy: Collection[str] = ()) -> Cell | None:
+        """The next cell for a worker; None when nothing is left.
+
+        Args:
+            scene: of the cell that the worker computed last; None if it is its first.
+            busy: probes of the cells at work. A first cell is of another probe if there is one:
+                kernels that one worker compiles are on disk when the other needs them.
         """
         if not self.count:
             return None
+        new = scene is None
         if scene is None or not self.scenes.get(scene):
             left = {name: cells for name, cells in self.scenes.items() if cells}
             scene = max(left, key=lambda name: (name not in self.started, len(left[name])))
         self.started.add(scene)
         self.count -= 1
-        return self.scenes[scene].popleft()
+        cells = self.scenes[scene]
+        others = (k for k, cell in enumerate(cells) if cell.probe not in busy)
+        index = next(others, 0) if new else 0
+        cell = cells[index]
+        del cells[index]
+        return cell

@@ -21,11 +21,20 @@ EDGE_BAND = 2.0
 """Width in pixels, on each side, of the band around depth and object edges."""
 
 
-def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:
+def two_view(
+    geometry: Geometry,
+    source: Camera,
+    target: Camera,
+    *,
+    bands: tuple[Mask, Mask] | None = None,
+) -> TwoView:
     """Exact correspondence and visibility of every target pixel in the source view.
 
     No step has a length in it: scaling or moving the scene together with its cameras gives the same
     labels.
+
+    Args:
+        bands: :func:`edge_band` of the source and of the target, where they are computed already.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -60,10 +69,10 @@ def two_view(geometry: Geometry, source: Camera, target: Camera) -> TwoView:
     label = np.where(status >= _OUTSIDE, NONE, status).astype(np.uint8)
     label[hits.valid & (~same | (grazing & (status != _OUTSIDE)))] = AMBIGUOUS
 
-    edge = edge_band(geometry, target)
+    source_edge, target_edge = bands or (edge_band(geometry, c) for c in (source, target))
+    edge = target_edge.copy()
     inside = inside.reshape(shape)
     xy = xy.reshape(*shape, 2)
-    source_edge = edge_band(geometry, source)
     column, row = (np.floor(xy[inside]).astype(np.int64)).T
     edge[inside] |= source_edge[
         np.clip(row, 0, source.height - 1), np.clip(column, 0, source.width - 1)

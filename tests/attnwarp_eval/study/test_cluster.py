@@ -249,3 +249,22 @@ def test_a_scheduler_that_is_none_is_refused_in_one_line(home, monkeypatch, sche
     assert done.exit_code == 2
     assert message in done.stderr and "Traceback" not in done.stderr
     assert done.stderr.splitlines()[-1].startswith("attnwarp-eval: --scheduler: ")
+
+
+def test_workers_that_start_together_start_with_different_probes_and_get_every_cell_once():
+    cells = [
+        cluster_module.Cell({}, scene, "v", probe, 0)
+        for scene in "ab"
+        for probe in ("depth", "warp")
+    ]
+    queue = cluster_module._Queue(cells)
+    first = queue.take(None)
+    second = queue.take(None, {first.probe})
+    assert (first.title, second.title) == (
+        "a / v / depth",
+        "b / v / warp",
+    )  # no kernel is compiled twice
+    # From then on a worker takes what comes first, whatever the other is at.
+    rest = [queue.take("b", {"depth"}), queue.take("a", {"warp"})]
+    assert [cell.title for cell in rest] == ["b / v / depth", "a / v / warp"]
+    assert queue.take("a") is None

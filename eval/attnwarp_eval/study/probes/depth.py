@@ -79,7 +79,7 @@ class Depth(Probe[NoExtra]):
                     hits.depth,
                     normal=surface.normal,
                     true_normal=hits.normal,
-                    edge=world.edge(name),
+                    edge=world.edge(name, size),
                 )
             work.add(name, figures, partial(pictures.of_depth, surface, hits))
         return NoExtra()

@@ -191,7 +191,7 @@ class Fit(Probe[Curve]):
             with meter.stage("truth"):
                 hits = world.geometry.trace(camera)
                 image = export.picture(world.scene, camera, spec["spp"])
-                edge = world.edge(name)
+                edge = world.edge(name, spec["size"])
             meter.count(pixels=camera.width * camera.height, **surface.counters)
             with meter.stage("checks"):
                 measured = fitted.picture_error(np.asarray(surface.image), image)
