@@ -35,7 +35,7 @@ def data(folder: Data = CACHE / "data", workers: int = 2) -> None:
 
 @app.command()
 def train(stage: str, data: Data = CACHE / "data", out: Out = CACHE, threads: Threads = 1) -> None:
-    """Train a stage: plain-64, drawn-64, features-64, control-64, parts-64, parts-128, features-128, control-128, depth-64."""
+    """Train a stage: plain-64, drawn-64, features-64, control-64, local-64, steady-64, carried-64, parts-64, parts-128, features-128, control-128, depth-64."""
     from training.depth_editor import DEPTH_STAGES, train_depth_stage
     from training.editor import STAGES, train_stage
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,9 @@ MOST_THING_WEIGHT = 8.0
 """Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
 be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
 
+HALF_PLANES = 0.7
+"""Of the regions of composed results; the others are boxes."""
+
 INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
@@ -106,6 +109,9 @@ class Stage:
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
         shift: of the noise schedule, see :func:`scheduler`.
         noisy_from: :data:`NOISY_SHARE` of the steps are drawn from here on.
+        composed: share of the open pairs at settled steps whose result has one answer in a region and another
+            outside it. Without them the network takes a thing to have one colour, and its late steps undo
+            an answer that holds in a part only.
     """
 
     size: int
@@ -121,6 +127,7 @@ class Stage:
     draws: bool = True
     shift: float = SHIFT
     noisy_from: int = 850
+    composed: float = 0.0
 
 
 STAGES = {
@@ -128,12 +135,16 @@ STAGES = {
     "drawn-64": Stage(64, 5_000, 8e-4, 200, start="plain-64", seed=5, unclear=0.5),
     "features-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="features", seed=2),
     "control-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="control", seed=2),
+    "local-64": Stage(64, 4_000, 8e-4, 200, start="drawn-64", seed=6, unclear=0.6, noisy_from=700, composed=0.7),
+    "steady-64": Stage(64, 12_000, 8e-4, 600, start="local-64", seed=7, composed=0.7),
+    "carried-64": Stage(64, 4_000, 6e-4, 600, start="steady-64", inject="features", seed=8, composed=0.7),
     "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),
     "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
     "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
     "control-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="control", seed=3, parts=595),
 }  # fmt: skip
-"""Trained in this order: ``small-plain`` is the last stage without injection, ``small`` the last "features" stage."""
+"""``small-plain`` is "drawn-64" and ``small`` "features-64". Those from "local-64" on are to follow them: features carry
+*where* better after composed pairs, but the first of such stages, with mostly open instructions, edited worse."""
 
 
 class EditorNet(torch.nn.Module):
@@ -391,6 +402,14 @@ class Pairs:
             return ambiguous_instruction(row.kind, thing, rng)
         return instruction(row.kind, thing, self.worlds.looks[row.world, row.target], rng)
 
+    def composed(self, row: Row, rng: np.random.Generator) -> npt.NDArray[np.float32]:
+        """(S, S, 3) result with an answer drawn anew in a region whose edge goes through what is edited."""
+        other = answered(self.worlds, row, rng)
+        region = cut_region(self.thing(row) > 0, rng)
+        return np.where(
+            region[..., None], self.picture(row, other.target), self.picture(row, row.target)
+        )
+
     def weight(self, row: Row) -> npt.NDArray[np.float32]:
         """(h, w) weight of the cells, see :data:`THING_WEIGHT`."""
         cells = self.size // BLOCK
@@ -403,9 +422,12 @@ class Pairs:
 
     def batch(
         self, count: int, rng: np.random.Generator, generator: torch.Generator, *, t: Tensor | None = None,
-        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR, noisy_from: int = 600,
+        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR, noisy_from: int = 600, composed: float = 0.0,
     ) -> Batch:  # fmt: skip
-        """Draw ``count`` pairs; where the instruction is unclear, the noise picks the target."""
+        """Draw ``count`` pairs; where the instruction is unclear, the noise picks the target.
+
+        Of the unclear ones at steps below :data:`SETTLED`, the share ``composed`` has a second answer in a region.
+        """
         if self.tokenizer is None:
             raise ValueError("tokenizer: got None, which a batch of instructions needs")
         cells = self.size // BLOCK
@@ -414,12 +436,45 @@ class Pairs:
         for k, row in enumerate(rows):
             if row.unclear:
                 noise[k] = settled(noise[k], row.target, row.kind)
+        texts = [self.text(r, rng) for r in rows]
+        if t is None:
+            t = draw_steps(count, rng, noisy_from)
+        results = [self.picture(r, r.target) for r in rows]
+        if composed:
+            for k, row in enumerate(rows):
+                if row.unclear and t[k] < SETTLED and rng.uniform() < composed:
+                    results[k] = self.composed(row, rng)
         return Batch(
-            self.latents([self.picture(r, r.source) for r in rows]), self.latents([self.picture(r, r.target) for r in rows]),
-            noise, tokens_of(self.tokenizer, [self.text(r, rng) for r in rows]),
-            draw_steps(count, rng, noisy_from) if t is None else t,
+            self.latents([self.picture(r, r.source) for r in rows]), self.latents(results),
+            noise, tokens_of(self.tokenizer, texts), t,
             torch.from_numpy(np.stack([self.weight(r) for r in rows]))[:, None], rows,
         )  # fmt: skip
+
+
+def answered(worlds: Worlds, row: Row, rng: np.random.Generator) -> Row:
+    """The row with an answer of its own."""
+    valid = worlds.valid[row.world]
+    allowed = worlds.sources(row.world, row.kind)
+    source = row.source if row.source in allowed else int(allowed[0])
+    looks = worlds.looks[row.world]
+    targets = [
+        k for k in GROUPS[row.kind]
+        if valid[k] and k != source and not np.array_equal(looks[k], looks[source])
+    ]  # fmt: skip
+    return replace(row, source=source, target=int(rng.choice(targets)))
+
+
+def cut_region(thing: npt.NDArray[np.bool_], rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """(S, S) a half-plane at any angle, or a box, whose edge goes through a pixel of the thing."""
+    size = len(thing)
+    pixels = np.argwhere(thing)
+    y0, x0 = pixels[int(rng.integers(len(pixels)))] if len(pixels) else (size // 2, size // 2)
+    y, x = np.mgrid[0:size, 0:size]
+    if rng.uniform() < HALF_PLANES:
+        angle = rng.uniform(0, 2 * math.pi)
+        return (x - x0) * math.cos(angle) + (y - y0) * math.sin(angle) > 0
+    y1, x1 = rng.integers(0, size, 2)
+    return (y >= min(y0, y1)) & (y <= max(y0, y1)) & (x >= min(x0, x1)) & (x <= max(x0, x1))
 
 
 def draw_steps(count: int, rng: np.random.Generator, noisy_from: int) -> Tensor:
@@ -476,6 +531,8 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         )  # fmt: skip
         constants |= {key: getattr(editor_injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
+    if stage.composed:
+        constants["HALF_PLANES"] = HALF_PLANES
     fields = asdict(stage)
     # Checkpoints from before a field existed do not name it.
     for key, before in (
@@ -483,6 +540,7 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         ("unclear", UNCLEAR),
         ("draws", False),
         ("shift", 1),
+        ("composed", 0.0),
     ):
         if fields[key] == before:
             del fields[key]
@@ -566,7 +624,12 @@ def _step(
         rng: np.random.Generator, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, float]]:
         batch = pairs.batch(
-            stage.batch, rng, generator, unclear=stage.unclear, noisy_from=stage.noisy_from
+            stage.batch,
+            rng,
+            generator,
+            unclear=stage.unclear,
+            noisy_from=stage.noisy_from,
+            composed=stage.composed,
         )
         before, tokens = dropped(batch, empty, rng)
         a = alphas[batch.t]

@@ -20,13 +20,14 @@ from attnwarp.camera import Camera
 from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
-from training.editing_pairs import GROUPS, SIZE
+from training.editing_pairs import SIZE
 from training.editor import (
     T_STEPS,
     Batch,
     EditorNet,
     Pairs,
     Row,
+    answered,
     draw_steps,
     loss_of,
     noised,
@@ -222,7 +223,7 @@ def injected_loss(
     b = _rebuilt(pairs, b, rows)
     no_text = torch.from_numpy(rng.uniform(size=count) < NO_TEXT)
     b = replace(b, tokens=torch.where(no_text[:, None], empty, b.tokens))
-    sources = [_answered(pairs, s, rng) for s in sources]
+    sources = [answered(pairs.worlds, s, rng) for s in sources]
     noise = torch.randn(b.noise.shape, generator=generator)
     noise = torch.stack([settled(n, s.target, s.kind) for n, s in zip(noise, sources, strict=True)])
     a = replace(_rebuilt(pairs, b, sources), noise=noise)
@@ -256,19 +257,6 @@ def injected_loss(
         second = net(noised(shown, b.noise, alpha), b.before, t, b.tokens)
     loss_b = loss_of(second, target, b.weight, alpha)
     return loss_a + loss_b, {"recorded": float(loss_a.detach()), "injected": float(loss_b.detach())}
-
-
-def _answered(pairs: Pairs, row: Row, rng: np.random.Generator) -> Row:
-    """The row with an answer of its own."""
-    valid = pairs.worlds.valid[row.world]
-    allowed = pairs.worlds.sources(row.world, row.kind)
-    source = row.source if row.source in allowed else int(allowed[0])
-    looks = pairs.worlds.looks[row.world]
-    targets = [
-        k for k in GROUPS[row.kind]
-        if valid[k] and k != source and not np.array_equal(looks[k], looks[source])
-    ]  # fmt: skip
-    return replace(row, source=source, target=int(rng.choice(targets)))
 
 
 def _rebuilt(pairs: Pairs, batch: Batch, rows: list[Row]) -> Batch:

@@ -163,6 +163,43 @@ def test_an_unclear_pair_ends_in_the_answer_that_its_noise_picks(pairs):
         assert row.target == GROUPS[row.kind][int(scores.argmax())]
 
 
+def answers_of(pairs, row):
+    """Pictures of all answers that a row may have, by look."""
+    valid = pairs.worlds.valid[row.world]
+    return {k: pairs.picture(row, k) for k in GROUPS[row.kind] if valid[k] and k != row.source}
+
+
+def test_a_composed_result_has_one_answer_in_a_region_and_its_own_elsewhere(pairs):
+    steps = torch.tensor([300, 849, 850, 999] * 8)
+    rng, generator = np.random.default_rng(1), torch.Generator().manual_seed(1)
+    batch = pairs.batch(32, rng, generator, t=steps, unclear=1.0, composed=1.0)
+    results = pairs.coder.decode(batch.after).sample.permute(0, 2, 3, 1).numpy()
+    shared = 0
+    for row, t, result in zip(batch.rows, steps.tolist(), results, strict=True):
+        pictures = answers_of(pairs, row)
+        own = np.abs(result - pictures[row.target]).max(axis=2) < 1e-4
+        if t >= 850 or not row.unclear:  # the noise is still to choose, or nothing is open
+            assert own.all()
+            continue
+        other = [np.abs(result - p).max(axis=2) < 1e-4 for p in pictures.values()]
+        assert any((own | o).all() for o in other)
+        shared += not own.all()
+    # Of 16 settled pairs a few have an edge beside what changes.
+    assert shared >= 10
+
+
+def test_regions_cut_the_thing_and_take_half_of_it_on_average():
+    thing = np.zeros((64, 64), dtype=bool)
+    thing[20:50, 10:40] = True
+    rng = np.random.default_rng(0)
+    shares = np.array(
+        [(editor.cut_region(thing, rng) & thing).sum() / thing.sum() for _ in range(400)]
+    )
+    # A half-plane and its complement are as likely; boxes are smaller than their complements.
+    assert 0.3 < shares.mean() < 0.5
+    assert ((shares > 0) & (shares < 1)).mean() > 0.95
+
+
 def test_noise_that_got_its_answer_is_as_white_as_before():
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn((4000, 48, 2, 2), generator=generator)
