@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import functools
+import gc
 import io
 import json
 import os
@@ -883,6 +885,8 @@ def main() -> None:
     """Entry point of the console script."""
     from attnwarp.errors import missing_extra
 
+    # The interpreter looks for garbage once more as it ends: half a second of torch's objects.
+    atexit.register(gc.freeze)
     try:
         try:
             app()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -141,12 +140,8 @@ def inspect(
 def _quick_start() -> Iterator[None]:
     """Neither garbage collection, a fifth of the time of imports that leave no garbage, nor threads
     of torch, which wait by spinning; the renderer has threads of its own.
-
-    The interpreter looks for garbage once more as it ends, for a second after the picture. Frozen
-    objects are left out.
     """
     gc.disable()
-    atexit.register(gc.freeze)
     import torch
 
     from attnwarp.render.threads import set_thread_count

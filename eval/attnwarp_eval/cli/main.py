@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 
 import typer
@@ -65,6 +67,8 @@ def main() -> None:
 
     from attnwarp.errors import missing_extra
 
+    # The interpreter looks for garbage once more as it ends: half a second of torch's objects.
+    atexit.register(gc.freeze)
     try:
         try:
             app()
