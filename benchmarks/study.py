@@ -2,9 +2,9 @@
 
 The study runs in this process, in a new folder with an empty cache of derived files. A thread looks
 every 20 ms what the main thread is at, and gives that part the CPU seconds of all threads since the
-last look. CPU seconds depend less on what else a machine does than wall seconds. Two workers take
-as long as the sum of all parts over two, if nothing else needs the cores. Kernels that numba has on
-disk already are not compiled: ``NUMBA_CACHE_DIR`` names an empty folder to include compilation.
+last look. CPU seconds depend less on what else a machine does than wall seconds. Each further
+worker imports the packages anew. Kernels that numba has on disk already are not compiled:
+``NUMBA_CACHE_DIR`` names an empty folder to include compilation.
 """
 
 from __future__ import annotations
