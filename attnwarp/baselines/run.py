@@ -29,6 +29,7 @@ from attnwarp.baselines.settings import BaselineSettings, Budget
 from attnwarp.baselines.work import Method, Work
 from attnwarp.camera import Camera
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.folder import Folder
@@ -177,11 +178,14 @@ class _Run:
         self.total = sum(
             len(part.views) * work.settings.steps + part.iterations for part in method.rounds
         )
+        settings = work.settings.to_dict()
+        noised = settings.get("start") or settings.get("starts")
         self.folder.claim(
             {
                 "method": name,
                 "instruction": work.instruction,
-                "settings": work.settings.to_dict(),
+                "settings": settings,
+                **({"start_protocol": START_PROTOCOL} if noised else {}),
                 "budget": asdict(self.budget),
                 "rounds": [
                     {

@@ -16,6 +16,13 @@ Prediction = Literal["epsilon", "sample", "v_prediction"]
 PUBLISHED_STEPS = 1000
 """Steps of Stable Diffusion, whose numbers publications give."""
 
+START_PROTOCOL = 2
+"""Of edits that start from partly noised pictures: what their published timestep means.
+
+It stands for Stable Diffusion's share of signal (:func:`steps_as_published`). Up to 1, it was a
+step of the editor's own schedule. Manifests and studies record it, so that no run mixes the two.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class Schedule:

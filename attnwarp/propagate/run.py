@@ -20,6 +20,7 @@ from attnwarp import check, losses
 from attnwarp.camera import Camera
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
@@ -244,6 +245,7 @@ class _Run:
             {
                 "instruction": instruction,
                 "settings": settings.to_dict(),
+                **({"start_protocol": START_PROTOCOL} if settings.start else {}),
                 "source": self.names[source],
                 **({"chain": [self.names[view] for view in chain]} if chain else {}),
                 "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],

@@ -241,6 +241,27 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
         run("by_view", ByViewSettings(**none), folder=tmp_path, budget=Budget(seconds=5))
 
 
+def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(run, tmp_path):
+    noised = IGS2GSSettings(steps=1, iterations=0)
+    run("igs2gs", noised, folder=tmp_path)
+    path = tmp_path / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["start_protocol"]  # as folders had it when a start was such a step
+    path.write_text(json.dumps(manifest))
+    before = files(tmp_path)
+    with pytest.raises(
+        InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"
+    ):
+        run("igs2gs", noised, folder=tmp_path)
+    assert files(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_only_a_folder_with_a_start_says_what_a_start_means(name, whole):
+    manifest = json.loads((whole(name)[0] / "manifest.json").read_text())
+    assert ("start_protocol" in manifest) == (name in ("igs2gs", "dge"))
+
+
 def test_segments_leave_the_original_outside(run, scene):
     left = np.zeros((32, 32), dtype=bool)
     left[:, :16] = True

@@ -351,6 +351,25 @@ def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
         run((moved, views, images), editor, finished[1])
 
 
+def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(
+    finished, scene, editor, tmp_path
+):
+    settings = preset("released", stages=1, views_per_stage=1, steps=1, iterations=0)
+    run(scene, editor, tmp_path, settings)
+    path = tmp_path / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["start_protocol"]  # as folders had it when a start was such a step
+    path.write_text(json.dumps(manifest))
+    before = files(tmp_path)
+    with pytest.raises(
+        InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"
+    ):
+        run(scene, editor, tmp_path, settings)
+    assert files(tmp_path) == before
+    # Without a start nothing changed, and folders of before go on.
+    assert "start_protocol" not in json.loads((finished[1] / "manifest.json").read_text())
+
+
 def test_segments_leave_the_original_or_black_outside(scene, editor):
     images = scene[2]
     left = np.zeros((32, 32), dtype=bool)

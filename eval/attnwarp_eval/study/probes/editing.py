@@ -24,6 +24,7 @@ import torch
 from pydantic import Field
 
 from attnwarp import check
+from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
@@ -71,10 +72,6 @@ inside the edited object."""
 
 STOPWATCH = Stopwatch()
 """Seconds of the methods that this process has run."""
-
-START_PROTOCOL = 2
-"""Of methods that start from partly noised pictures. Up to 1, a published timestep was a number of
-the editor's own schedule; it stands for Stable Diffusion's share of signal."""
 
 CHOSEN_BY = ("multiview.delta_e_above.edit_inside", "fidelity.mse.edit_inside")
 """What the variant for a given time is chosen by; less is better."""
