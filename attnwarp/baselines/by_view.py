@@ -62,6 +62,8 @@ def by_view(
 
 class _ByView:
     def __init__(self, work: Work, settings: ByViewSettings) -> None:
+        if settings.start is not None:
+            work.starts_at(settings.start[0], "start")
         self.work, self.settings = work, settings
         alone = settings.start is not None and settings.noise == "fresh"
         views = range(len(work.sizes))

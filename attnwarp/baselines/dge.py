@@ -80,6 +80,7 @@ class _DGE:
             drawn = sorted(order[: settings.views].tolist())
             views = by_angle(work.scene.cameras, drawn)
             self.rounds.append(Round((tuple(views),), tuple(views), iterations))
+        work.starts_at(min(self._start(number) for number in range(len(self.rounds))), "starts")
 
     def rows(self, number: int, group: Sequence[int]) -> int:
         with_keys = sum(self._with_keys(number))

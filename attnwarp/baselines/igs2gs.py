@@ -62,6 +62,7 @@ def igs2gs(
 class _IGS2GS:
     def __init__(self, work: Work, settings: IGS2GSSettings) -> None:
         work.takes("igs2gs", "picture")
+        work.starts_at(settings.start[0], "start")
         self.work, self.settings = work, settings
         views = tuple(range(len(work.sizes)))
         # Each edit has a timestep of its own, so none shares a pass with another.

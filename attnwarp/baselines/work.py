@@ -13,6 +13,7 @@ from torch import Tensor
 
 from attnwarp.baselines.settings import BaselineSettings
 from attnwarp.editing.editor import Editor, shared_noise
+from attnwarp.editing.schedule import steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.editing import Guide, guided
 from attnwarp.propagate.pictures import Image, Size, composite, edit_size, resized
@@ -159,6 +160,22 @@ class Work:
                 f"editor: {method} is made for {kinds[guide]}, got {kinds[self.editor.guide]};"
                 " choose another editor or method"
             )
+
+    def starts_at(self, lowest: int, field: str) -> None:
+        """Raise ValueError unless the settings' steps fit below a timestep to start from.
+
+        Args:
+            lowest: timestep of Stable Diffusion; where it fits, all above it do.
+            field: of the settings, for the error.
+        """
+        steps = self.settings.steps
+        try:
+            steps_as_published(self.editor.schedule, lowest, steps)
+        except ValueError:
+            raise ValueError(
+                f"{field}: {lowest} leaves too few timesteps for {steps} steps on this editor's"
+                " schedule; start higher or take fewer steps"
+            ) from None
 
     def seed(self, purpose: int, *numbers: int) -> int:
         """A seed of its own for each purpose and numbers such as a round and a view."""

@@ -67,6 +67,7 @@ def test_the_command_gives_what_the_library_gives_and_says_where(place):
         (("dge", "--preset", "relesed"), "preset: got 'relesed'"),
         (("dge", "--set", "epipolarr=2"), "setting: got 'epipolarr'"),
         (("igs2gs", "--set", "every=0"), "every: got 0, expected a whole number >= 1"),
+        (("dge", "--set", "steps=9", "--set", "starts=[998, 3]"), "starts: 3 leaves too few"),
         (("igs2gs",), 'holds an edit of other method ("by_view", now "igs2gs")'),
     ],
 )

@@ -232,6 +232,33 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
             IGS2GSSettings(start=wrong)
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        ("dge", replace(QUICK["dge"], steps=20, starts=(998, 10)), "starts: 10 .* for 20 steps"),
+        ("igs2gs", IGS2GSSettings(start=(18, 980)), "start: 18 .* for 20 steps"),
+        ("by_view", ByViewSettings(start=(18, 980)), "start: 18 .* for 20 steps"),
+    ],
+)
+def test_a_start_too_low_for_the_steps_is_named_before_any_work(
+    name, settings, message, run, editor, tmp_path
+):
+    def refused():
+        with pytest.raises(ValueError, match=message):
+            run(name, settings, folder=tmp_path)
+
+    rows, _ = rows_of(editor.unet, refused)
+    assert not rows
+    assert not any(tmp_path.iterdir())
+
+
+def test_the_lowest_start_that_the_steps_fit_below_is_taken(run):
+    one_round = replace(QUICK["dge"], iterations=0)
+    run("igs2gs", IGS2GSSettings(steps=3, iterations=0, start=(2, 2)))  # timesteps 2, 1 and 0
+    # A start of a round that does not come is not asked for.
+    assert run("dge", replace(one_round, steps=3, starts=(2, 0))).counters["rounds"] == 1
+
+
 def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
     none = {"steps": 2, "iterations": 0}
     run("by_view", ByViewSettings(**none), folder=tmp_path)
