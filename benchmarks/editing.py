@@ -6,7 +6,7 @@ all views. A plan's fit and edit are resumed in --work.
     python -m benchmarks.editing DATA --work FOLDER --out reports/editing/time.md
 
 With --ratio, in its place: the seconds of propagation against those of the same views edited one by
-one, tuning apart, in turn in one process.
+one. Neither tunes. They take turns in one process.
 
     python -m benchmarks.editing --ratio --rounds 9
 """

@@ -28,10 +28,10 @@ def igs2gs(
 ) -> Baseline:
     """Edit every view from its noised render, tune the splats, and begin again.
 
-    Each edit draws a timestep T of Stable Diffusion, noises the view's render by the current splats
-    to the share of signal that T stands for, and denoises it under the guidance of the original
-    picture. Views of a round see the splats as they were at its beginning; the authors' code also
-    takes one step of tuning between two edits.
+    Each edit draws a timestep T of Stable Diffusion. It noises the view's render by the current
+    splats to the share of signal that T stands for. It then denoises it under the guidance of the
+    original picture. Views of a round see the splats as they were at its beginning; the authors'
+    code also takes one step of tuning between two edits.
 
     Args:
         gaussians, cameras, images, instruction, options: see :func:`by_view`.

@@ -131,16 +131,16 @@ def stable_diffusion_alphas() -> Tensor:
 def steps_as_published(schedule: Schedule, start: int, steps: int) -> list[int]:
     """The steps of a schedule that stand for steps of Stable Diffusion, as publications give them.
 
-    A method that noises a picture to a published timestep T relies on the share of the picture that
-    is left there, sqrt(alpha-bar), and not on the number T. So each of Stable Diffusion's steps
-    that fall evenly from ``start`` (:func:`steps_from`) becomes the step whose alpha-bar is nearest
-    to it. With Stable Diffusion's own schedule that is the same step.
+    A method noises a picture to a published timestep T. It relies on the share of the picture that
+    is left there, sqrt(alpha-bar), and not on the number T. So Stable Diffusion's steps fall evenly
+    from ``start`` (:func:`steps_from`), and each becomes the step of the nearest alpha-bar. With
+    Stable Diffusion's own schedule that is the same step.
 
     Stable Diffusion's last step still shows some of the picture, and methods rely on it. So it does
     not become the pure noise that another schedule may end in. Where neighbours have the same
-    nearest step, each is one below the other, so that no step is taken twice. A range of T is drawn
-    from on Stable Diffusion's clock, each draw becomes a step here: so shares of signal come as
-    often as published.
+    nearest step, each is one below the other, so that no step is taken twice. Of a range, T is
+    drawn on Stable Diffusion's clock, and each draw becomes a step here. So shares of signal come
+    as often as published.
 
     Args:
         schedule: of the editor.
