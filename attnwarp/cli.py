@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import atexit
 import functools
-import gc
 import io
 import json
 import os
@@ -31,6 +29,7 @@ from attnwarp.editing.command import (
     edit_image,
 )
 from attnwarp.errors import InputWarning
+from attnwarp.process import skip_last_collection
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -885,8 +884,7 @@ def main() -> None:
     """Entry point of the console script."""
     from attnwarp.errors import missing_extra
 
-    # The interpreter looks for garbage once more as it ends: half a second of torch's objects.
-    atexit.register(gc.freeze)
+    skip_last_collection()
     try:
         try:
             app()

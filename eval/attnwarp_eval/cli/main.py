@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import sys
 
 import typer
 
+from attnwarp.process import skip_last_collection
 from attnwarp_eval.cli import (
     cache,
     compare,
@@ -67,8 +66,7 @@ def main() -> None:
 
     from attnwarp.errors import missing_extra
 
-    # The interpreter looks for garbage once more as it ends: half a second of torch's objects.
-    atexit.register(gc.freeze)
+    skip_last_collection()
     try:
         try:
             app()
