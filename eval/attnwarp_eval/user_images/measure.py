@@ -6,8 +6,9 @@ The metrics are pure functions of :mod:`attnwarp_eval.metrics`; this module read
 from __future__ import annotations
 
 import hashlib
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -215,8 +216,9 @@ def measure(
     if inputs.source_edit is not None and any("source_edit" in figure.needs for figure in wanted):
         source = read_picture(inputs.source_edit, inputs.background)  # before the long part
     gathered = _Gathered()
-    tasks = _tasks(inputs, folders, views, loaded, device)
-    for batch in results(store, tasks, len(tasks), progress):
+    needed = [name for name in folders["renders"] if any(name in names for names in views.values())]
+    tasks = _tasks(inputs, folders, views, needed, loaded, device)
+    for batch in results(store, tasks, math.ceil(len(needed) / BATCH), progress):
         gathered.add(batch)
     _rows(inputs, source, views, loaded, gathered, done)
     return done
@@ -447,10 +449,14 @@ def _tasks(
     inputs: Inputs,
     folders: Mapping[str, Mapping[str, Path]],
     views: Mapping[_Figure, Sequence[str]],
+    needed: Sequence[str],
     loaded: Mapping[Kind, Any],
     device: str,
-) -> list[Task[_Gathered]]:
-    """Batches of views with what the figures need, each picture read once."""
+) -> Iterator[Task[_Gathered]]:
+    """Batches of the views ``needed`` with what the figures need, each picture read once.
+
+    A batch's files are hashed when its task is taken, just before they are read.
+    """
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
@@ -471,10 +477,6 @@ def _tasks(
 
     def distance(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> float:
         return float(loaded["perceptual"].distance([a], [b])[0])
-
-    needed = [
-        name for name in folders["renders"] if any(name in names for names in members.values())
-    ]
 
     def gather(batch: Sequence[str]) -> _Gathered:
         result = _Gathered()
@@ -526,7 +528,8 @@ def _tasks(
         )
 
     # Encoders take a batch at once and round differently in another one: a batch is the cell.
-    return [task(needed[start : start + BATCH]) for start in range(0, len(needed), BATCH)]
+    for start in range(0, len(needed), BATCH):
+        yield task(needed[start : start + BATCH])
 
 
 def _sha256(path: Path) -> str:

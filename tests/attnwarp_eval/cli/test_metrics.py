@@ -1,5 +1,6 @@
 """`attnwarp-eval metrics` on a person's own pictures, and `attnwarp-eval encoders`."""
 
+import hashlib
 import json
 import math
 
@@ -14,6 +15,7 @@ from attnwarp.encoders import load_encoder
 from attnwarp.errors import InputError
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.metrics.registry import metric
+from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
 from attnwarp_eval.user_images.measure import BATCH, inside, read_picture
 
@@ -708,6 +710,32 @@ def test_a_measurement_that_was_interrupted_goes_on_and_ends_as_one_that_was_not
     write(tmp_path / "renders" / "v0.png", random_picture(random))
     changed, views = run("a")
     assert changed.exit_code == 0 and views == set(names[:BATCH])
+
+
+def test_a_picture_rewritten_during_the_run_is_stored_under_its_new_hash(tmp_path, monkeypatch):
+    random = np.random.default_rng(9)
+    first, last, rewritten = (random_picture(random, (8, 8)) for _ in range(3))
+    for group in ("renders", "edited"):
+        write(tmp_path / group / "v0.png", first)
+        write(tmp_path / group / "v1.png", last)
+    monkeypatch.setattr(measure, "BATCH", 1)
+    told = []
+
+    def rewrite(number, total, step):
+        told.append((number, total))
+        if number == 0:
+            write(tmp_path / "edited" / "v1.png", rewritten)
+
+    inputs = measure.Inputs(renders=tmp_path / "renders", edited=tmp_path / "edited")
+    off = dict.fromkeys(("clip", "dino", "perceptual"), "none")
+    measure.measure(inputs, off, Store(tmp_path / "out"), progress=rewrite)
+    assert told == [(0, 2), (1, 2), (2, 2)]
+    records = [json.loads(path.read_text()) for path in (tmp_path / "out/cells").rglob("*.json")]
+    (record,) = (r for r in records if "v1" in r["spec"]["files"]["edited"])
+    content = (tmp_path / "edited" / "v1.png").read_bytes()
+    assert record["spec"]["files"]["edited"]["v1"] == hashlib.sha256(content).hexdigest()
+    difference = (rewritten.astype(np.float64) - last) / 255
+    assert record["views"]["errors"]["v1"] == pytest.approx((difference**2).mean(), rel=1e-5)
 
 
 def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
