@@ -79,7 +79,7 @@ def metrics(
             renders, edited, originals, source_edit, prompt, source_prompt, mask, _color(background)
         )
         kinds: dict[Any, str | None] = {"clip": clip, "dino": dino, "perceptual": perceptual}
-        with progress() as show, resumable(lambda: "finished views are kept"):
+        with progress() as show, resumable(lambda: "finished batches of views are kept"):
             measured = measure.measure(inputs, kinds, Store(out), device=device, progress=show)
         paths = write.write(measured, out)
     if as_json:

@@ -173,7 +173,7 @@ def measure(
         encoders: kind -> name, see :func:`attnwarp.encoders.load_encoder`; "none" leaves its
             figures out. A kind that is not named, or named None, takes the bundled one, and its
             figures are left out where there is none.
-        store: finished views are read from there and written there, so that a call that was killed
+        store: finished batches are read from there and written there, so that a killed call
             goes on where it was. Views are known by the content of their files.
         device: "cpu" or "cuda", for real encoders.
         progress: told of each batch of views.

@@ -687,7 +687,7 @@ def test_a_measurement_that_was_interrupted_goes_on_and_ends_as_one_that_was_not
         return CliRunner().invoke(app, command), set(read[read_before:])
 
     killed, _ = run("a")
-    assert killed.exit_code == 130 and "finished views are kept" in killed.stderr
+    assert killed.exit_code == 130 and "finished batches of views are kept" in killed.stderr
     done, views = run("a")
     assert done.exit_code == 0, done.output
     assert views == set(names[BATCH:])
