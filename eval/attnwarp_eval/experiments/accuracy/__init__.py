@@ -14,9 +14,10 @@ from pathlib import Path
 
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import without_nan
+from attnwarp_eval.experiments.accuracy.earlier import check_overwriting
 from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
-from attnwarp_eval.experiments.accuracy.panel import PROTOCOL, Panel
+from attnwarp_eval.experiments.accuracy.panel import Panel, panel_spec
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
 from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
@@ -45,12 +46,14 @@ def measure(
         progress: told of each step of each panel.
 
     Raises:
-        InputError: a scene that cannot be used; another run is writing to ``out``.
+        InputError: a scene that cannot be used; another run is writing to ``out``; panels of its
+            accuracy.json would be lost.
     """
     from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.truth.mitsuba import forget
 
     cells = _cells([load_scene(name) for name in names])
+    check_overwriting(out, {(question.__name__, scene.name) for question, scene in cells})
     tasks = (_task(question, scene, rounds) for question, scene in cells)
     for panel in results(Store(out), tasks, len(cells), progress):
         yield panel
@@ -73,25 +76,7 @@ def _cells(scenes: Sequence[Scene]) -> list[tuple[Question, Scene]]:
 
 
 def _task(question: Question, scene: Scene, rounds: int) -> Task[Panel]:
-    import mitsuba
-
-    from attnwarp_eval._open3d import open3d
-    from attnwarp_eval.truth.llvm import variant
-    from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
-
-    spec: Json = {
-        "probe": "accuracy",
-        "protocol": PROTOCOL,
-        "question": question.__name__,
-        "scene": scene.content_hash,
-        "name": scene.name,
-        "rounds": rounds,
-    }
-    if question is pictures:
-        spec |= {"mitsuba": mitsuba.__version__, "variant": variant()}
-        spec |= {"appearance": APPEARANCE_PROTOCOL}
-    else:
-        spec |= {"open3d": open3d().__version__}
+    spec = panel_spec(question.__name__, scene.name, scene.content_hash, rounds)
 
     def compute(tell: Tell) -> Json:
         return {"panel": without_nan(asdict(question(scene, rounds=rounds, tell=tell)))}

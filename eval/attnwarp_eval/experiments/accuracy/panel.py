@@ -12,6 +12,9 @@ from attnwarp_eval.study.record import Json, with_nan
 PROTOCOL = 1
 """Raised whenever a panel would come out otherwise."""
 
+QUESTIONS = ("pictures", "depth", "visibility")
+"""In the order of the report."""
+
 
 @dataclass(frozen=True)
 class Contestant:
@@ -89,3 +92,33 @@ class Panel:
             tuple(fields["again"]),
             tuple(map(tuple, fields["squares"])),
         )
+
+
+def panel_spec(question: str, name: str, content: str, rounds: int) -> Json:
+    """What decides a panel.
+
+    Args:
+        question: "pictures", "depth" or "visibility".
+        name: of the scene.
+        content: its hash.
+        rounds: of every timing.
+    """
+    spec: Json = {
+        "probe": "accuracy",
+        "protocol": PROTOCOL,
+        "question": question,
+        "scene": content,
+        "name": name,
+        "rounds": rounds,
+    }
+    if question == "pictures":
+        import mitsuba
+
+        from attnwarp_eval.truth.llvm import variant
+        from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL
+
+        spec |= {"mitsuba": mitsuba.__version__, "variant": variant()}
+        return spec | {"appearance": APPEARANCE_PROTOCOL}
+    from attnwarp_eval._open3d import open3d
+
+    return spec | {"open3d": open3d().__version__}

@@ -10,25 +10,20 @@ from typing import Any
 import numpy as np
 
 from attnwarp_eval.canonical_json import without_nan, write_json
-from attnwarp_eval.experiments.accuracy.panel import Panel
+from attnwarp_eval.experiments.accuracy.earlier import check_overwriting, with_earlier
+from attnwarp_eval.experiments.accuracy.panel import QUESTIONS, Panel
 from attnwarp_eval.statistics.intervals import Ratio
 from attnwarp_eval.study.store import Store
-
-
-def _with_earlier(panels: Sequence[Panel], store: Store) -> list[Panel]:
-    """The panels, behind those of other questions and scenes that are stored, oldest first."""
-    asked = {(panel.question, panel.scene) for panel in panels}
-    ids = sorted(store.done(), key=lambda cell_id: store.path(cell_id).stat().st_mtime_ns)
-    stored = (store.whole(cell_id, Panel.from_record) for cell_id in ids)
-    earlier = {(panel.question, panel.scene): panel for panel in stored if panel is not None}
-    return [*(panel for key, panel in earlier.items() if key not in asked), *panels]
 
 
 def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     """Write the report of panels, accuracy.json and the figures below ``out``; return their paths.
 
     Panels of other scenes that ``out`` has stay in the report, so that scenes can be measured one
-    by one.
+    by one. Panels of other versions, variants or contents of a scene are left out by name.
+
+    Raises:
+        InputError: ``accuracy.json`` has panels that would be lost.
     """
     from attnwarp_eval.cost import environment
     from attnwarp_eval.document import charts
@@ -39,7 +34,8 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
 
     out.mkdir(parents=True, exist_ok=True)
     nan = float("nan")
-    panels = _with_earlier(panels, Store(out))
+    check_overwriting(out, {(panel.question, panel.scene) for panel in panels})
+    panels, left_out = with_earlier(panels, Store(out))
 
     def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
@@ -54,7 +50,7 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         return seconds, Interval(mean, low, high, 1, 1, 0, nan, nan)
 
     drawn = []
-    for question in ("pictures", "depth", "visibility"):
+    for question in QUESTIONS:
         selected = [panel for panel in panels if panel.question == question]
         if not selected:
             continue
@@ -84,6 +80,12 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
             " against itself: inside its band nothing is called faster or slower."
         ),
     ]
+    if left_out:
+        lead.append(
+            f"Left out: {', '.join(f'{question} of {scene}' for question, scene in left_out)}. They"
+            " were measured with other versions, another variant, or of another content of the"
+            " scene. Measure these scenes again to have them here."
+        )
     report = Report("Error of the truth itself, against time", lead, sections)
     data = {
         "environment": about,

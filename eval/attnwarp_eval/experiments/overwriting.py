@@ -1,0 +1,52 @@
+"""Tables that a later call overwrites: what only they hold must not be lost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from attnwarp.errors import InputError
+from attnwarp_eval.study.store import Store
+
+Key = tuple[str, ...]
+"""What names a row, such as a question and a scene."""
+
+
+def check_nothing_is_lost(
+    path: Path, table: str, fields: Sequence[str], available: Collection[Key]
+) -> set[Key]:
+    """Check that a table can be overwritten: its folder has cells, and each row will be there.
+
+    A folder without cells has results from elsewhere, such as a published report. Made again they
+    would be others, so none of them is overwritten.
+
+    Args:
+        path: of the table's JSON, in the run's folder; there may be none yet.
+        table: the key of the list of rows.
+        fields: the keys of a row that name it.
+        available: the rows that the call makes or reads from cells.
+
+    Returns:
+        The rows of the table.
+
+    Raises:
+        InputError: a row would be lost, or the file is not such a table.
+    """
+    if not path.exists():
+        return set()
+    remedy = "name another folder with --out, or move the file away"
+    try:
+        rows = json.loads(path.read_bytes())[table]
+        stored = {tuple(str(row[field]) for field in fields) for row in rows}
+    except (ValueError, LookupError, TypeError, RecursionError, OSError):
+        raise InputError(f"{path}: is not a file that this command wrote; {remedy}") from None
+    lost = sorted(stored.difference(available) if Store(path.parent).done() else stored)
+    if lost:
+        more = f" and {len(lost) - 3} more" if len(lost) > 3 else ""
+        names = ", ".join(" of ".join(key) for key in lost[:3])
+        raise InputError(
+            f"{path}: {names}{more} would be lost, as this call cannot restore them from the"
+            f" folder's cells; {remedy}"
+        )
+    return stored
