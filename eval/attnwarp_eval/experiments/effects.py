@@ -6,11 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
 from attnwarp_eval.effects.table import Settings, measure_entry, report, side_by_side
+from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
@@ -30,7 +32,8 @@ def collect(
     """Make the table's entries and write them, with their pictures, below ``out``.
 
     Each entry is a cell of the run's folder, and so are its pictures. After an interruption, or
-    when one scene has changed, only what is missing is made.
+    when one scene has changed, only what is missing is made. A table that is there stays until all
+    of its rows are made again.
 
     Args:
         names: scenes' names or paths.
@@ -42,14 +45,24 @@ def collect(
         The entries, as they stand in ``effects.json``.
 
     Raises:
-        InputError: a scene that is unknown or contradicts itself, or another run that is writing to
-            ``out``.
+        InputError: a scene that is unknown or contradicts itself, two scenes of one name, another
+            run that is writing to ``out``, or rows of its ``effects.json`` that would be lost.
     """
+    from attnwarp_eval.scene.file import load_scene
+
     store = Store(out)
-    tasks = _tasks(names, store, settings)
+    scenes = [load_scene(name) for name in names]
+    _check_names(names, scenes)
+    asked = {(scene.name,) for scene in scenes}
+    stored = check_nothing_is_lost(out / "effects.json", "scenes", ("scene",), asked)
+    tasks, parts = _tasks(scenes, store, settings), 1 + settings.pictures
     entries: dict[str, dict[str, Any]] = {}
-    for scene, part in results(store, tasks, len(names) * (1 + settings.pictures), progress):
-        entries.setdefault(scene, {}).update(part)
+    for done, (name, part) in enumerate(
+        results(store, tasks, len(scenes) * parts, progress), start=1
+    ):
+        entries.setdefault(name, {}).update(part)
+        if not stored <= {(scene.name,) for scene in scenes[: done // parts]}:
+            continue
         # What is done can be read while the rest is at work.
         about = environment()
         data = {"environment": about, "scenes": [entries[name] for name in sorted(entries)]}
@@ -58,12 +71,26 @@ def collect(
     return list(entries.values())
 
 
-def _tasks(names: Sequence[str], store: Store, settings: Settings) -> Iterator[Task[Part]]:
-    from attnwarp_eval.scene.file import load_scene
+def _check_names(names: Sequence[str], scenes: Sequence[Scene]) -> None:
+    """Check that no two scenes have one name, which names the row and the picture.
+
+    Raises:
+        InputError: two have.
+    """
+    first: dict[str, tuple[str, Scene]] = {}
+    for path, scene in zip(names, scenes, strict=True):
+        other, same = first.setdefault(scene.name, (path, scene))
+        if same.content_hash != scene.content_hash:
+            raise InputError(
+                f"{other} and {path}: two scenes have the name {scene.name!r}, expected one of"
+                " each name in a table; rename one of them"
+            )
+
+
+def _tasks(scenes: Sequence[Scene], store: Store, settings: Settings) -> Iterator[Task[Part]]:
     from attnwarp_eval.truth.mitsuba import forget
 
-    for name in names:
-        scene = load_scene(name)
+    for scene in scenes:
         yield _entry(scene, settings)
         if settings.pictures:
             yield _pictures(scene, store)

@@ -12,6 +12,7 @@ from effect_scenes import FLOOR, SCENES, SKY, SUN, ball, make
 from scipy import stats
 from typer.testing import CliRunner
 
+from attnwarp.errors import InputError
 from attnwarp_eval import cost
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.colors import to_linear
@@ -19,7 +20,7 @@ from attnwarp_eval.effects import detect, saving, table
 from attnwarp_eval.effects.table import Settings, side_by_side
 from attnwarp_eval.experiments import effects
 from attnwarp_eval.experiments.effects import collect
-from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.file import load_scene, scene_folders
 from attnwarp_eval.truth import mitsuba
 from attnwarp_eval.truth.plan import everything_on, plan
 
@@ -54,11 +55,17 @@ def test_the_table_has_every_scene_and_goes_on_where_it_was(small, monkeypatch, 
         and " | path | not asked | " in text
     )
     assert text.count(".jpg)") == 3 and "3 scenes, 0 of their plans certified" in text
+    # A smaller table does not replace a larger one.
+    written = {path: path.read_bytes() for path in tmp_path.glob("effects.*")}
+    with pytest.raises(InputError, match=r"effects.json: mirror, opposed would be lost.* --out"):
+        collect(["glass"], tmp_path, quick)
+    assert {path: path.read_bytes() for path in written} == written
     # Another setting is another entry; a picture that is gone is drawn again.
+    (tmp_path / "effects.json").unlink()
     collect(["glass"], tmp_path, Settings(prove=False, rounds=3))
     picture = (tmp_path / "mirror.jpg").read_bytes()
     (tmp_path / "mirror.jpg").unlink()
-    collect(["mirror"], tmp_path, quick)
+    collect(["glass", "mirror"], tmp_path, quick)
     assert made[3:] == ["glass"] and (tmp_path / "mirror.jpg").read_bytes() == picture
 
 
@@ -67,7 +74,7 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
 
     def interrupted(scene, *more):
         made.append(scene.name)
-        if made == ["spheres", "glass"]:
+        if made in (["spheres", "glass"], ["spheres", "glass", "glass", "glass"]):
             raise KeyboardInterrupt
         return real(scene, *more)
 
@@ -88,8 +95,31 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
         c for c in (tmp_path / "cells").rglob("*.json") if '"name": "glass"' in c.read_text()
     )
     cell.write_bytes(cell.read_bytes()[:-9])
+    # Interrupted again: the complete table stays until all of its rows are made.
+    with pytest.raises(KeyboardInterrupt):
+        collect(["spheres", "glass"], tmp_path, quick)
+    assert {path: path.read_bytes() for path in written} == written
     assert collect(["spheres", "glass"], tmp_path, quick)[0] == first
-    assert made[3:] == ["glass"]
+    assert made[3:] == ["glass", "glass"]
+    assert (tmp_path / "effects.json").read_bytes() != written[tmp_path / "effects.json"]
+
+
+def test_rows_that_no_cell_has_are_not_overwritten_and_a_name_is_one_scene(tmp_path):
+    path = tmp_path / "effects.json"
+    for content, words in (
+        ('{"scenes": [{"scene": "opposed"}]}', "opposed would be lost"),
+        ('{"scenes": [{"sce', "is not a file that this command wrote"),
+    ):
+        path.write_text(content)
+        with pytest.raises(InputError, match=words):
+            collect(["opposed"], tmp_path, Settings())
+        assert path.read_text() == content and [*tmp_path.iterdir()] == [path]
+    text = (scene_folders()[-1] / "opposed.yaml").read_text()
+    (tmp_path / "opposed.yaml").write_text(text.replace("bounces: auto", "bounces: 2"))
+    names = ["opposed", str(tmp_path / "opposed.yaml")]
+    with pytest.raises(InputError, match="two scenes have the name 'opposed'"):
+        collect(names, tmp_path / "out", Settings())
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_proof_stands_in_the_table_with_its_bound_and_the_smallest_difference(small, tmp_path):
