@@ -208,7 +208,7 @@ async def _browse(url):
         assert "view: yaw075" in await tab.run("document.body.innerText")
         after = await tab.picture()
         assert (before[:, 340:] != after[:, 340:]).mean() > 0.02
-        for x, y in ((560, 360), (600, 330), (640, 380), (700, 420)):
+        for x, y in ((690, 190), (800, 190), (790, 350)):
             await tab.click(x, y)
             await asyncio.sleep(3)
             if await tab.run("document.querySelector('pre').innerText.length > 20"):
