@@ -7,6 +7,7 @@ what their processors return, so every processor works, and none has to be repla
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -304,14 +305,19 @@ class Call:
     """One pass of the UNet.
 
     Attributes:
-        timestep: of the pass.
+        timesteps: as the UNet got them.
         latent_size: (h, w).
         batch: rows.
     """
 
-    timestep: float
+    timesteps: Any
     latent_size: Size
     batch: int
+
+    @functools.cached_property
+    def timestep(self) -> float:
+        """Of the pass. Reading it waits for a GPU, so only hooks that need it do."""
+        return float(torch.as_tensor(self.timesteps).reshape(-1)[0])
 
 
 @contextmanager
@@ -326,8 +332,7 @@ def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterat
     def begin(_: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         sample = args[0] if args else kwargs["sample"]
         timestep = args[1] if len(args) > 1 else kwargs["timestep"]
-        value = float(torch.as_tensor(timestep).reshape(-1)[0])
-        now[:] = [Call(value, (sample.shape[-2], sample.shape[-1]), sample.shape[0])]
+        now[:] = [Call(timestep, (sample.shape[-2], sample.shape[-1]), sample.shape[0])]
 
     def after(layer: Layer) -> Callable[..., Tensor | None]:
         def call(_: Any, __: Any, output: Tensor) -> Tensor | None:

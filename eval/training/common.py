@@ -118,7 +118,7 @@ def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """A training run that can be killed and resumed: its state is written after every epoch.
+    """A training run that can be killed and resumed: its state is written after epochs.
 
     Attributes:
         path: of the checkpoint.
@@ -126,12 +126,14 @@ class Run:
         epochs: how many in all.
         recipe: the other settings of the result, see :func:`settings`; written into the checkpoint,
             which can be resumed with no other.
+        every: least seconds between two checkpoints; 0 writes one after each epoch.
     """
 
     path: Path
     state: dict[str, Any]
     epochs: int
     recipe: Mapping[str, Any]
+    every: float = 0.0
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
         """Run the epochs that are left; each draws from generators seeded by its number, so a
@@ -141,7 +143,7 @@ class Run:
             InputError: the checkpoint is of another recipe, or from before recipes were written
                 into them.
         """
-        first, seconds = 0, 0.0
+        first, seconds, saved = 0, 0.0, time.perf_counter()
         recipe = {"epochs": self.epochs, **self.recipe}
         if self.path.exists():
             stored = torch.load(self.path, weights_only=True)
@@ -156,6 +158,9 @@ class Run:
             seconds += spent
             words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
             print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
+            if number + 1 < self.epochs and time.perf_counter() - saved < self.every:
+                continue
+            saved = time.perf_counter()
             states = {name: thing.state_dict() for name, thing in self.state.items()}
             about = {"epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)}
             write_atomically(self.path, functools.partial(torch.save, {**states, **about}))
@@ -181,7 +186,11 @@ def minutes(*paths: Path) -> float | None:
     """Total training time of some checkpoints; None if one is missing or does not record it."""
     total = 0.0
     for path in paths:
-        seconds = torch.load(path, weights_only=True).get("seconds") if path.exists() else None
+        seconds = (
+            torch.load(path, weights_only=True, map_location="cpu").get("seconds")
+            if path.exists()
+            else None
+        )
         if seconds is None:
             return None
         total += seconds

@@ -14,8 +14,9 @@ from attnwarp.editing.editor import Image, edit
 from training.assess import Figure, figure
 from training.depth_editor import Prompts, attributes_of
 from training.editing_pairs import GROUPS, load_pairs
-from training.editor import TOKENS, Row
+from training.editor import TOKENS
 from training.editor_assess import SEED, nearest
+from training.editor_pictures import Row
 from training.worlds import sentence
 
 STEPS = 20
@@ -136,7 +137,7 @@ def assess_depth_editor(
     editor = load_editor(str(folder), guidance=DEPTH_GUIDANCE)
     size = editor.unet.config.sample_size * editor.factor
     tests = load_pairs(data, "edit-test", count=worlds)
-    results = assess_depth(editor, Prompts(tests, size, None))
+    results = assess_depth(editor, Prompts(tests, size))
     return depth_card(folder.name, results, {**facts, "size": size, "guidance": DEPTH_GUIDANCE})
 
 

@@ -8,7 +8,7 @@ Latents, noise schedule and loss are those of :mod:`training.editor`, and so are
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,28 +20,27 @@ import yaml
 from tokenizers import Tokenizer
 
 from attnwarp.editing.controlnet import control_image
-from attnwarp.editing.latents import CHANNELS
+from attnwarp.editing.latents import BLOCK, CHANNELS
 from training.clip import true_of
-from training.common import Run, groups
 from training.editing_pairs import LOOKS, PAIRS_PROTOCOL, SIZE, VIEWS, Worlds, load_pairs
 from training.editor import (
-    EMA,
     HEADS,
     LAYERS,
-    STEPS_AN_EPOCH,
     TEXT_WIDTH,
     WIDTHS,
     EditorNet,
-    Pairs,
-    Row,
     draw_steps,
-    falling_rate,
+    halves,
     loss_of,
     noised,
-    picked,
     scheduler,
+    tokenizer_of,
     tokens_of,
 )
+from training.editor_answers import codes
+from training.editor_pictures import Pictures, Row
+from training.editor_pool import Pool, Rows, points_of
+from training.steps import Task, train_steps
 from training.worlds import sentence
 
 Tensor = torch.Tensor
@@ -54,6 +53,9 @@ NOISY_FROM = 600
 
 NO_PROMPT = 0.1
 """Probability that the prompt is left out, for guidance."""
+
+PROMPTS = 64
+"""Made ahead for each world."""
 
 NAMES_PLACE = 0.8
 """Probability that a prompt names the ground, and that it names the time of day, each."""
@@ -74,6 +76,7 @@ class DepthStage:
         start: the editor's stage whose text encoder and UNet this one starts from.
         batch: pictures a step.
         seed: of everything random.
+        parts: worlds of parts that the stage it starts from has seen; only the words are of these.
     """
 
     size: int
@@ -83,9 +86,12 @@ class DepthStage:
     start: str
     batch: int = 8
     seed: int = 0
+    parts: int = 0
 
 
-DEPTH_STAGES = {"depth-64": DepthStage(64, 6_000, 1e-3, 200, start="plain-64", seed=5)}
+DEPTH_STAGES = {
+    "depth": DepthStage(64, 6_000, 1e-3, 1800, start="plain", batch=512, seed=5, parts=1190)
+}
 
 
 class DepthNet(torch.nn.Module):
@@ -117,12 +123,13 @@ class DepthNet(torch.nn.Module):
 
     def forward(self, noisy: Tensor, control: Tensor, t: Tensor, tokens: Tensor) -> Tensor:
         """(B, 48, h, w) predicted latents, of (B, 3, 4 h, 4 w) control pictures and (B, 24) tokens."""
-        context = self.text(tokens).last_hidden_state
-        down, middle = self.controlnet(noisy, t, context, control, return_dict=False)
-        return self.unet(
-            noisy, t, context, down_block_additional_residuals=down, mid_block_additional_residual=middle,
-            return_dict=False,
-        )[0]  # fmt: skip
+        with halves(noisy.device):
+            context = self.text(tokens).last_hidden_state
+            down, middle = self.controlnet(noisy, t, context, control, return_dict=False)
+            return self.unet(
+                noisy, t, context, down_block_additional_residuals=down, mid_block_additional_residual=middle,
+                return_dict=False,
+            )[0].float()  # fmt: skip
 
 
 @functools.cache
@@ -165,8 +172,8 @@ def draw_prompt(look: Sequence[int], rng: np.random.Generator) -> tuple[str, npt
             return text, np.array(values)
 
 
-class Prompts(Pairs):
-    """Draws depth maps with a prompt and the picture that it describes, from worlds."""
+class Prompts(Pictures):
+    """Depth maps of worlds and the pictures that belong to them, one by one."""
 
     def control(self, row: Row) -> npt.NDArray[np.float32]:
         """(S, S, 3) control picture of a row's depth map."""
@@ -178,36 +185,80 @@ class Prompts(Pairs):
             return np.zeros((*depth.shape, 3), dtype=np.float32)
         return control_image(depth[:, ::-1] if row.flip else depth)
 
+
+class PromptPool(Pool):
+    """Depth maps, prompts and pictures of worlds on one device.
+
+    Args:
+        worlds, tokenizer, device: see :class:`training.editor_pool.Pool`.
+        prompts: made ahead for each world.
+    """
+
+    def __init__(
+        self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, prompts: int = PROMPTS,
+        tables: Mapping[str, Tensor] | None = None,
+    ) -> None:  # fmt: skip
+        tables = prompts_of(worlds, tokenizer, prompts) if tables is None else tables
+        super().__init__(worlds, tokenizer, device, tables=tables)
+        self.depth = torch.from_numpy(worlds.depth).to(self.device).view(-1)
+
+    def control(self, rows: Rows, size: int) -> Tensor:
+        """(B, 3, S, S) control pictures, see :func:`attnwarp.editing.controlnet.control_image`."""
+        number = (rows.world * VIEWS + rows.view)[:, None, None] * SIZE**2
+        # One pixel of each block: a mean over an edge would be a depth where nothing is.
+        depth = self.depth[number + self.pixels(rows, size, SIZE // size)[..., -1]]
+        near = torch.where(depth.isfinite(), 1 / (depth + 1e-5), 0.0)
+        near = near / near.amax(dim=(1, 2), keepdim=True).clamp(min=1e-30)
+        return near[:, None].expand(-1, 3, -1, -1)
+
     def prompted(
-        self, rng: np.random.Generator, noise: Tensor, world: int | None = None
-    ) -> tuple[Row, str]:
-        """Draw a picture and its prompt; where the prompt is true of several, the noise picks one.
+        self, noise: Tensor, generator: torch.Generator, *, size: int
+    ) -> tuple[Rows, Tensor]:
+        """Draw pictures and (B, 24) tokens of their prompts; where one is true of several, the noise picks.
 
         Args:
-            rng: to draw from.
-            noise: (48, h, w) of the latents.
-            world: any if left out.
+            noise: (B, 48, h, w) of the latents.
+            generator: on the pool's device.
+            size: of the pictures in px.
         """
-        worlds = self.worlds
-        world = int(rng.integers(len(worlds))) if world is None else world
-        view = int(rng.integers(VIEWS))
-        valid = np.flatnonzero(worlds.valid[world])
-        looks = attributes_of(worlds, world)
-        text, values = draw_prompt(looks[int(rng.choice(valid))], rng)
-        candidates = valid[true_of(values[None], looks[valid])[:, 0]]
-        look = picked(noise, candidates.tolist())
-        corner = self.corner(world, view, rng) if self.size < SIZE else (0, 0, 1)
-        row = Row(world, view, look, look, "color", False, corner, bool(rng.uniform() < 0.5))
-        return row, text
+        count = len(noise)
+        tokens, true = self.tables["prompts"], self.tables["true"]
+        world = self.integers(len(tokens), count, generator)
+        view = self.integers(VIEWS, count, generator)
+        prompt = self.integers(tokens.shape[1], count, generator)
+        scores = noise.mean(dim=(2, 3)) @ codes().to(noise).T
+        look = scores.masked_fill(~true[world, prompt], -torch.inf).argmax(dim=1)
+        y, x, zoom = self.corner(world, view, size, generator)
+        flip = self.uniform(generator, count) < 0.5
+        zero = torch.zeros_like(world)
+        rows = Rows(world, view, look, look, zero, flip & False, y, x, zoom, flip)
+        return rows, tokens[world, prompt].long()
+
+
+def prompts_of(worlds: Worlds, tokenizer: Tokenizer, prompts: int = PROMPTS) -> dict[str, Tensor]:
+    """:func:`training.editor_pool.points_of`, (N, P, 24) tokens of prompts and the (N, P, LOOKS) looks they are true of."""
+    rng = np.random.default_rng(32)
+    texts, true = [], np.zeros((len(worlds), prompts, LOOKS), dtype=bool)
+    for world in range(len(worlds)):
+        looks, valid = attributes_of(worlds, world), np.flatnonzero(worlds.valid[world])
+        for number in range(prompts):
+            text, values = draw_prompt(looks[int(rng.choice(valid))], rng)
+            texts.append(text)
+            true[world, number, valid] = true_of(values[None], looks[valid])[:, 0]
+    tokens = torch.tensor(
+        [code.ids for code in tokenizer.encode_batch(texts)], dtype=torch.int16
+    ).view(len(worlds), prompts, -1)
+    return {"points": points_of(worlds), "prompts": tokens, "true": torch.from_numpy(true)}
 
 
 def recipe_of(name: str, stage: DepthStage) -> dict[str, Any]:
     """Everything that a stage's result depends on."""
-    from training import editor
+    from training import editor, steps
 
     constants = {key: getattr(editor, key) for key in editor.CONSTANTS}
+    constants |= steps.constants()
     constants |= {
-        "CONTROL_WIDTHS": CONTROL_WIDTHS, "NO_PROMPT": NO_PROMPT, "NAMES_PLACE": NAMES_PLACE,
+        "CONTROL_WIDTHS": CONTROL_WIDTHS, "NO_PROMPT": NO_PROMPT, "NAMES_PLACE": NAMES_PLACE, "PROMPTS": PROMPTS,
     }  # fmt: skip
     return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
 
@@ -216,7 +267,7 @@ def first_net(tokenizer: Tokenizer, stage: DepthStage, out: Path) -> DepthNet:
     """The networks that a stage starts from."""
     size = tokenizer.get_vocab_size()
     first = EditorNet(size, stage.size, draws=False)
-    stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
+    stored = torch.load(out / f"{stage.start}.pt", weights_only=True, map_location="cpu")["average"]
     first.load_state_dict(
         {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
     )
@@ -224,8 +275,9 @@ def first_net(tokenizer: Tokenizer, stage: DepthStage, out: Path) -> DepthNet:
 
 
 def train_depth_stage(
-    name: str, data: Path, out: Path, *, stage: DepthStage | None = None, threads: int = 1
-) -> Path:
+    name: str, data: Path, out: Path, *, stage: DepthStage | None = None, threads: int = 1,
+    device: torch.device | str = "cpu", pool: PromptPool | None = None,
+) -> Path:  # fmt: skip
     """Train a stage, or go on with it; the checkpoint's path.
 
     Args:
@@ -234,58 +286,47 @@ def train_depth_stage(
         out: folder of checkpoints, with the one that the stage starts from.
         stage: in place of the one of that name.
         threads: of torch.
+        device: of torch; on a GPU matrices are multiplied in bfloat16.
+        pool: on that device, if it is there already.
     """
-    from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-
     stage = DEPTH_STAGES[name] if stage is None else stage
+    device = torch.device(device)
     torch.set_num_threads(threads)
     torch.manual_seed(stage.seed)
-    tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
-    prompts = Prompts(load_pairs(data, "edit-train", count=stage.worlds), stage.size, tokenizer)
-    net = first_net(tokenizer, stage, out)
-    average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
-    optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
-    alphas = scheduler().alphas_cumprod
+    tokenizer = tokenizer_of(stage, out)
+    if pool is None:
+        pool = PromptPool(load_pairs(data, "edit-train", count=stage.worlds), tokenizer, device)
+    net = first_net(tokenizer, stage, out).to(device)
+    alphas = scheduler().alphas_cumprod.to(device)
+    empty = tokens_of(tokenizer, [""])[0].to(device)
 
-    def epoch(number: int) -> dict[str, float]:
-        rng = np.random.default_rng([stage.seed, number])
-        generator = torch.Generator().manual_seed(1_000_003 * stage.seed + number)
-        net.train()
-        total = 0.0
-        for step in range(STEPS_AN_EPOCH):
-            for group in optimizer.param_groups:
-                group["lr"] = falling_rate(number * STEPS_AN_EPOCH + step, stage.steps, stage.peak)
-            loss = depth_loss(prompts, net, alphas, stage.batch, rng, generator)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-            optimizer.step()
-            average.update_parameters(net)
-            total += float(loss.detach()) / STEPS_AN_EPOCH
-        return {"loss": total}
-
+    draw = functools.partial(depth_inputs, pool, alphas, empty, stage.size)
+    task = Task(1.0, stage.batch, draw, functools.partial(depth_loss, net))
     checkpoint = out / f"{name}.pt"
-    state = {"net": net, "average": average, "optimizer": optimizer}
-    Run(checkpoint, state, stage.steps // STEPS_AN_EPOCH, recipe_of(name, stage)).train(epoch)
+    train_steps(net, stage, [task], checkpoint, recipe_of(name, stage), device)
     return checkpoint
 
 
-def depth_loss(
-    prompts: Prompts, net: DepthNet, alphas: Tensor, count: int, rng: np.random.Generator,
-    generator: torch.Generator,
-) -> Tensor:  # fmt: skip
-    """The loss of ``count`` pictures at steps drawn at random."""
-    assert prompts.tokenizer is not None
-    cells = prompts.size // 4
-    noise = torch.randn((count, CHANNELS, cells, cells), generator=generator)
-    drawn = [prompts.prompted(rng, noise[k]) for k in range(count)]
-    rows, texts = [row for row, _ in drawn], [text for _, text in drawn]
-    texts = ["" if rng.uniform() < NO_PROMPT else text for text in texts]
-    t = draw_steps(count, rng, NOISY_FROM)
-    a = alphas[t]
-    picture = prompts.latents([prompts.picture(row, row.target) for row in rows])
-    control = torch.from_numpy(np.stack([prompts.control(row) for row in rows])).permute(0, 3, 1, 2)
-    weight = torch.from_numpy(np.stack([prompts.weight(row) for row in rows]))[:, None]
-    tokens = tokens_of(prompts.tokenizer, texts)
-    prediction = net(noised(picture, noise, a), control, t, tokens)
-    return loss_of(prediction, picture, weight, a)
+def depth_inputs(
+    pool: PromptPool, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
+) -> dict[str, Tensor]:  # fmt: skip
+    """Pictures at steps drawn at random as the network gets them, with their targets."""
+    cells = size // BLOCK
+    noise = torch.randn((count, CHANNELS, cells, cells), generator=generator, device=pool.device)
+    rows, tokens = pool.prompted(noise, generator, size=size)
+    left_out = pool.uniform(generator, count) < NO_PROMPT
+    tokens = torch.where(left_out[:, None], empty, tokens)
+    t = draw_steps(count, generator, NOISY_FROM)
+    alpha = alphas[t]
+    picture = pool.latents(pool.pictures(rows, rows.target, size))
+    return {
+        "noisy": noised(picture, noise, alpha), "control": pool.control(rows, size), "t": t, "tokens": tokens,
+        "target": picture, "weight": pool.weight(rows, size), "alpha": alpha,
+    }  # fmt: skip
+
+
+def depth_loss(net: DepthNet, x: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of :func:`depth_inputs`."""
+    prediction = net(x["noisy"], x["control"], x["t"], x["tokens"])
+    loss = loss_of(prediction, x["target"], x["weight"], x["alpha"])
+    return loss, {"loss": loss.detach()}

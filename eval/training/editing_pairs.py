@@ -83,9 +83,9 @@ class PairSplit:
 
 
 PAIR_SPLITS = {
-    "edit-train": PairSplit(10_000_000, 600),
+    "edit-train": PairSplit(10_000_000, 1800),
     "edit-test": PairSplit(11_000_000, 40, test=True),
-    "parts-train": PairSplit(12_000_000, 595, parts=True),
+    "parts-train": PairSplit(12_000_000, 1190, parts=True),
     "parts-test": PairSplit(13_000_000, 51, test=True, parts=True),
 }
 

@@ -7,14 +7,13 @@ noisy latents. It predicts the edited picture itself, from betas whose last step
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from tokenizers import (
     Tokenizer,
@@ -26,24 +25,24 @@ from tokenizers import (
     trainers,
 )
 
-from attnwarp.editing.latents import BLOCK, CHANNELS, HaarLatents
+from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
-from training.common import Run, groups
+from training import editor_pool, steps
+from training.assemblies import KINDS as ASSEMBLIES
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
-    LOOKS,
     PAIR_SPLITS,
     PAIRS_PROTOCOL,
-    SIZE,
-    THING,
-    VIEWS,
-    Worlds,
+    PARTS,
     ambiguous_instruction,
     edit_looks,
     instruction,
     load_mixed,
 )
+from training.editor_pool import Batch, Pool
+from training.steps import Task, train_steps
+from training.worlds import OBJECTS
 
 Tensor = torch.Tensor
 
@@ -63,30 +62,17 @@ SD_BETAS = (0.00085, 0.012)
 """Stable Diffusion's, first and last."""
 SHIFT = 16.0
 """How many times the signal-to-noise amplitude of Stable Diffusion's is at a step, see :func:`scheduler`."""
-COARSE = 12
-"""The first channels of the latents are means and coarse details (:func:`attnwarp.editing.latents.haar_basis`)."""
 DROP = 0.05
 """Probability that the text, the picture or both are left out, each."""
 UNCLEAR = 0.35
 """Share of pairs whose instruction leaves the answer to the noise."""
 KINDS = {"color": 0.45, "material": 0.15, "pattern": 0.05, "ground": 0.2, "time": 0.15}
-EMA = 0.999
-WARM = 200
-STEPS_AN_EPOCH = 100
-THING_WEIGHT = 0.25
-MOST_THING_WEIGHT = 8.0
-"""Cells of the thing weigh 0.25 / (its share of the picture), at least 1 and at most 8: small things would hardly
-be learned. The mask depends on the picture before alone, so the best prediction stays the same."""
-
-HALF_PLANES = 0.7
-"""Of the regions of composed results; the others are boxes."""
-
 INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
 CONSTANTS = (
     "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_SHARE",
-    "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS", "EMA", "WARM", "STEPS_AN_EPOCH", "THING_WEIGHT", "MOST_THING_WEIGHT",
+    "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS",
 )  # fmt: skip
 """What every stage's result depends on."""
 
@@ -112,6 +98,7 @@ class Stage:
         composed: share of the open pairs at settled steps whose result has one answer in a region and another
             outside it. Without them the network takes a thing to have one colour, and its late steps undo
             an answer that holds in a part only.
+        large: share of the steps on pictures of twice that size, a quarter as many at a time.
     """
 
     size: int
@@ -120,7 +107,7 @@ class Stage:
     worlds: int
     start: str | None = None
     inject: str = "none"
-    batch: int = 8
+    batch: int = 256
     seed: int = 0
     parts: int = 0
     unclear: float = UNCLEAR
@@ -128,23 +115,20 @@ class Stage:
     shift: float = SHIFT
     noisy_from: int = 850
     composed: float = 0.0
+    large: float = 0.0
 
 
 STAGES = {
-    "plain-64": Stage(64, 24_000, 1e-3, 200, draws=False, shift=1, noisy_from=600),
-    "drawn-64": Stage(64, 5_000, 8e-4, 200, start="plain-64", seed=5, unclear=0.5),
-    "features-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="features", seed=2),
-    "control-64": Stage(64, 2_500, 4e-4, 200, start="drawn-64", inject="control", seed=2),
-    "local-64": Stage(64, 4_000, 8e-4, 200, start="drawn-64", seed=6, unclear=0.6, noisy_from=700, composed=0.7),
-    "steady-64": Stage(64, 12_000, 8e-4, 600, start="local-64", seed=7, composed=0.7),
-    "carried-64": Stage(64, 4_000, 6e-4, 600, start="steady-64", inject="features", seed=8, composed=0.7),
-    "parts-64": Stage(64, 16_000, 6e-4, 200, start="drawn-64", seed=4, parts=595),
-    "parts-128": Stage(128, 16_000, 6e-4, 600, start="parts-64", seed=1, parts=595),
-    "features-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="features", seed=3, parts=595),
-    "control-128": Stage(128, 6_000, 4e-4, 600, start="parts-128", inject="control", seed=3, parts=595),
+    "plain": Stage(64, 11_500, 1.5e-3, 1800, parts=1190, draws=False, large=0.2, seed=11),
+    "drawn": Stage(64, 12_000, 1.2e-3, 1800, parts=1190, start="plain", composed=0.7, large=0.25, seed=12),
+    "features": Stage(
+        64, 7_800, 8e-4, 1800, parts=1190, start="drawn", inject="features", composed=0.7, large=0.25, seed=13
+    ),
+    "control": Stage(
+        64, 7_800, 8e-4, 1800, parts=1190, start="drawn", inject="control", composed=0.7, large=0.25, seed=13
+    ),
 }  # fmt: skip
-"""``small-plain`` is "drawn-64" and ``small`` "features-64". Those from "local-64" on are to follow them: features carry
-*where* better after composed pairs, but the first of such stages, with mostly open instructions, edited worse."""
+"""``small-plain`` is "drawn" and ``small`` "features"."""
 
 
 class EditorNet(torch.nn.Module):
@@ -175,8 +159,17 @@ class EditorNet(torch.nn.Module):
 
     def forward(self, noisy: Tensor, before: Tensor, t: Tensor, tokens: Tensor) -> Tensor:
         """(B, 48, h, w) predicted latents of the edited pictures."""
-        context = self.text(tokens).last_hidden_state
-        return self.unet(torch.cat([noisy, before], dim=1), t, context, return_dict=False)[0]
+        with halves(noisy.device):
+            context = self.text(tokens).last_hidden_state
+            both = torch.cat([noisy, before], dim=1)
+            return self.unet(both, t, context, return_dict=False)[0].float()
+
+
+def halves(device: torch.device) -> torch.autocast:
+    """Matrices multiplied in bfloat16 where the device is a GPU; pictures, targets and losses stay in float32."""
+    on_gpu = device.type == "cuda"
+    # A recorded graph cannot use weights that were converted outside it.
+    return torch.autocast(device.type, torch.bfloat16, enabled=on_gpu, cache_enabled=False)
 
 
 def scheduler(shift: float = 1.0) -> Any:
@@ -206,20 +199,27 @@ def scheduler(shift: float = 1.0) -> Any:
     return DDIMScheduler(**settings | {"rescale_betas_zero_snr": False, "trained_betas": betas})
 
 
-def make_tokenizer(count: int = 20_000, worlds: int = 200) -> Tokenizer:
-    """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two."""
+def make_tokenizer(count: int = 20_000, worlds: int = 200, *, parts: bool = False) -> Tokenizer:
+    """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two.
+
+    Args:
+        count: of instructions, four times as many with parts.
+        worlds: whose looks they name.
+        parts: whether to learn the words for parts and for things that have them too.
+    """
     rng = np.random.default_rng(20)
     split = PAIR_SPLITS["edit-train"]
     corpus = []
     drawn = [edit_looks(k, split)[0] for k in range(worlds)]
-    for k in range(count):
-        looks = drawn[k % worlds]
+    things = len(OBJECTS) + (len(ASSEMBLIES) * len(PARTS) if parts else 0)
+    for k in range(count * (4 if parts else 1)):
+        looks, thing = drawn[k % worlds], k % things
         kind = list(KINDS)[int(rng.integers(len(KINDS)))]
         look = looks[int(rng.choice(list(GROUPS[kind])))]
         row = np.array([look.finish, look.color, look.second, look.ground, look.time])
-        corpus.append(instruction(kind, k % 25, row, rng))
+        corpus.append(instruction(kind, thing, row, rng))
         if kind in AMBIGUOUS:
-            corpus.append(ambiguous_instruction(kind, k % 25, rng))
+            corpus.append(ambiguous_instruction(kind, thing, rng))
     tokenizer = Tokenizer(models.BPE())
     tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
@@ -244,249 +244,17 @@ def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
     )
 
 
-def codes() -> Tensor:
-    """(LOOKS, 48) orthonormal directions, one an answer, in the channels of fine details.
-
-    A picture's own mean there is nearly 0, so noise mixed with a picture still tells which it picks.
-    Rows of the cosine transform, without the constant one.
-    """
-    fine = CHANNELS - COARSE
-    k = torch.arange(1, LOOKS + 1, dtype=torch.float64)[:, None]
-    c = torch.arange(fine, dtype=torch.float64)[None]
-    rows = (2 / fine) ** 0.5 * torch.cos(math.pi * (c + 0.5) * k / fine)
-    return torch.cat([torch.zeros((LOOKS, COARSE)), rows.float()], dim=1)
+def draw_steps(count: int, generator: torch.Generator, noisy_from: int) -> Tensor:
+    """(count,) steps, more of them noisy, on the generator's device."""
+    place = {"generator": generator, "device": generator.device}
+    noisy = torch.randint(noisy_from, T_STEPS, (count,), **place)
+    rest = torch.randint(0, noisy_from, (count,), **place)
+    return torch.where(torch.rand(count, **place) < NOISY_SHARE, noisy, rest)
 
 
-def picked(noise: Tensor, candidates: Sequence[int]) -> int:
-    """The answer that a noise picks: the look whose direction is nearest to the noise's mean over the picture.
-
-    Directions are orthonormal and the noise is white, so every candidate is picked as often.
-
-    Args:
-        noise: (48, h, w).
-        candidates: indices of looks.
-    """
-    scores = codes()[list(candidates)] @ noise.mean(dim=(1, 2))
-    return int(candidates[int(scores.argmax())])
-
-
-def settled(noise: Tensor, answer: int, kind: str) -> Tensor:
-    """The noise with the answer that it picks among a kind's exchanged for another.
-
-    The two answers' shares of the noise's mean change places, so that the result is white noise that picks
-    ``answer``. A pick among the answers that a world happens to have would be a riddle: neither the noise
-    nor the text tells which these are, and the best prediction of a riddle is a mixture of colours.
-
-    Args:
-        noise: (48, h, w), white.
-        answer: index of the look to be picked.
-        kind: a key of :data:`training.editing_pairs.GROUPS`.
-    """
-    directions, mean = codes(), noise.mean(dim=(1, 2))
-    best = picked(noise, GROUPS[kind])
-    shift = (directions[best] - directions[answer]) @ mean * (directions[answer] - directions[best])
-    return noise + shift[:, None, None]
-
-
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Pairs with their noise.
-
-    Attributes:
-        before, after: (B, 48, h, w) latents.
-        noise: (B, 48, h, w).
-        tokens: (B, 24).
-        t: (B,) steps.
-        weight: (B, 1, h, w) of the cells.
-        world, view, source, target: what each pair shows; which pixels, in ``corner``: (y, x, zoomed).
-        unclear: whether the noise picked the answer.
-    """
-
-    before: Tensor
-    after: Tensor
-    noise: Tensor
-    tokens: Tensor
-    t: Tensor
-    weight: Tensor
-    rows: list[Row]
-
-
-@dataclass(frozen=True)
-class Row:
-    """Which pictures a pair is made of."""
-
-    world: int
-    view: int
-    source: int
-    target: int
-    kind: str
-    unclear: bool
-    corner: tuple[int, int, int]
-    flip: bool
-
-
-class Pairs:
-    """Draws batches of pairs from worlds.
-
-    Args:
-        worlds: at :data:`training.editing_pairs.SIZE`.
-        size: of the pictures in px, 64 or 128. At 64, half of the pictures are a quarter of the full one about
-            the thing, so that things come large and small.
-        tokenizer: of the instructions; :meth:`batch` needs it.
-    """
-
-    def __init__(self, worlds: Worlds, size: int, tokenizer: Tokenizer | None) -> None:
-        self.worlds, self.size, self.tokenizer = worlds, size, tokenizer
-        self.coder = HaarLatents()
-
-    def corner(self, world: int, view: int, rng: np.random.Generator) -> tuple[int, int, int]:
-        """Where a picture is cut from: (y, x, px of the full picture to one of the cut)."""
-        step = SIZE // self.size
-        if step == 1 or rng.uniform() < 0.5:
-            return 0, 0, step
-        seen = np.argwhere(self.worlds.ids[world, view] == THING)
-        y, x = seen[int(rng.integers(len(seen)))] if len(seen) else (SIZE // 2, SIZE // 2)
-        low = [
-            int(np.clip(v - rng.uniform(0.25, 0.75) * self.size, 0, SIZE - self.size))
-            for v in (y, x)
-        ]
-        return low[0], low[1], 1
-
-    def cut(self, full: npt.NDArray[Any], row: Row) -> npt.NDArray[np.float32]:
-        """The part of a full picture (128, 128, ...) that a row shows, as means of blocks."""
-        y, x, n = row.corner
-        part = full[y : y + n * self.size, x : x + n * self.size].astype(np.float32)
-        part = part.reshape(self.size, n, self.size, n, *full.shape[2:]).mean(axis=(1, 3))
-        return part[:, ::-1] if row.flip else part
-
-    def picture(self, row: Row, look: int) -> npt.NDArray[np.float32]:
-        """(S, S, 3) in [-1, 1]."""
-        return self.cut(self.worlds.images[row.world, row.view, look], row) / 127.5 - 1
-
-    def thing(self, row: Row) -> npt.NDArray[np.float32]:
-        """(S, S) share of each pixel that the thing covers."""
-        return self.cut(self.worlds.ids[row.world, row.view] == THING, row)
-
-    def latents(self, pictures: Sequence[npt.NDArray[np.float32]]) -> Tensor:
-        """(B, 48, h, w) of (S, S, 3) pictures."""
-        x = torch.from_numpy(np.ascontiguousarray(np.stack(pictures))).permute(0, 3, 1, 2)
-        return self.coder.encode(x, return_dict=False)[0]
-
-    def row(self, rng: np.random.Generator, kinds: dict[str, float], unclear: float) -> Row:
-        """Draw a pair."""
-        worlds = self.worlds
-        while True:
-            world, view = int(rng.integers(len(worlds))), int(rng.integers(VIEWS))
-            kind = str(
-                rng.choice(list(kinds), p=np.array(list(kinds.values())) / sum(kinds.values()))
-            )
-            valid = worlds.valid[world]
-            targets = [k for k in GROUPS[kind] if valid[k]]
-            open_ended = kind in AMBIGUOUS and rng.uniform() < unclear
-            source = int(rng.choice(worlds.sources(world, kind)))
-            targets = [
-                k
-                for k in targets
-                if k != source
-                and not np.array_equal(worlds.looks[world, k], worlds.looks[world, source])
-            ]
-            if targets:
-                break
-        corner, flip = self.corner(world, view, rng), bool(rng.uniform() < 0.5)
-        return Row(world, view, source, int(rng.choice(targets)), kind, open_ended, corner, flip)
-
-    def text(self, row: Row, rng: np.random.Generator) -> str:
-        """The instruction of a row."""
-        thing = int(self.worlds.things[row.world])
-        if row.unclear:
-            return ambiguous_instruction(row.kind, thing, rng)
-        return instruction(row.kind, thing, self.worlds.looks[row.world, row.target], rng)
-
-    def composed(self, row: Row, rng: np.random.Generator) -> npt.NDArray[np.float32]:
-        """(S, S, 3) result with an answer drawn anew in a region whose edge goes through what is edited."""
-        other = answered(self.worlds, row, rng)
-        region = cut_region(self.thing(row) > 0, rng)
-        return np.where(
-            region[..., None], self.picture(row, other.target), self.picture(row, row.target)
-        )
-
-    def weight(self, row: Row) -> npt.NDArray[np.float32]:
-        """(h, w) weight of the cells, see :data:`THING_WEIGHT`."""
-        cells = self.size // BLOCK
-        if row.kind in ("ground", "time"):
-            return np.ones((cells, cells), dtype=np.float32)
-        mask = self.thing(row)
-        share = mask.reshape(cells, BLOCK, cells, BLOCK).mean(axis=(1, 3))
-        gain = np.clip(THING_WEIGHT / max(float(mask.mean()), 1e-3), 1, MOST_THING_WEIGHT)
-        return (1 + (gain - 1) * (share > 0)).astype(np.float32)
-
-    def batch(
-        self, count: int, rng: np.random.Generator, generator: torch.Generator, *, t: Tensor | None = None,
-        kinds: dict[str, float] | None = None, unclear: float = UNCLEAR, noisy_from: int = 600, composed: float = 0.0,
-    ) -> Batch:  # fmt: skip
-        """Draw ``count`` pairs; where the instruction is unclear, the noise picks the target.
-
-        Of the unclear ones at steps below :data:`SETTLED`, the share ``composed`` has a second answer in a region.
-        """
-        if self.tokenizer is None:
-            raise ValueError("tokenizer: got None, which a batch of instructions needs")
-        cells = self.size // BLOCK
-        noise = torch.randn((count, CHANNELS, cells, cells), generator=generator)
-        rows = [self.row(rng, kinds or KINDS, unclear) for _ in range(count)]
-        for k, row in enumerate(rows):
-            if row.unclear:
-                noise[k] = settled(noise[k], row.target, row.kind)
-        texts = [self.text(r, rng) for r in rows]
-        if t is None:
-            t = draw_steps(count, rng, noisy_from)
-        results = [self.picture(r, r.target) for r in rows]
-        if composed:
-            for k, row in enumerate(rows):
-                if row.unclear and t[k] < SETTLED and rng.uniform() < composed:
-                    results[k] = self.composed(row, rng)
-        return Batch(
-            self.latents([self.picture(r, r.source) for r in rows]), self.latents(results),
-            noise, tokens_of(self.tokenizer, texts), t,
-            torch.from_numpy(np.stack([self.weight(r) for r in rows]))[:, None], rows,
-        )  # fmt: skip
-
-
-def answered(worlds: Worlds, row: Row, rng: np.random.Generator) -> Row:
-    """The row with an answer of its own."""
-    valid = worlds.valid[row.world]
-    allowed = worlds.sources(row.world, row.kind)
-    source = row.source if row.source in allowed else int(allowed[0])
-    looks = worlds.looks[row.world]
-    targets = [
-        k for k in GROUPS[row.kind]
-        if valid[k] and k != source and not np.array_equal(looks[k], looks[source])
-    ]  # fmt: skip
-    return replace(row, source=source, target=int(rng.choice(targets)))
-
-
-def cut_region(thing: npt.NDArray[np.bool_], rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """(S, S) a half-plane at any angle, or a box, whose edge goes through a pixel of the thing."""
-    size = len(thing)
-    pixels = np.argwhere(thing)
-    y0, x0 = pixels[int(rng.integers(len(pixels)))] if len(pixels) else (size // 2, size // 2)
-    y, x = np.mgrid[0:size, 0:size]
-    if rng.uniform() < HALF_PLANES:
-        angle = rng.uniform(0, 2 * math.pi)
-        return (x - x0) * math.cos(angle) + (y - y0) * math.sin(angle) > 0
-    y1, x1 = rng.integers(0, size, 2)
-    return (y >= min(y0, y1)) & (y <= max(y0, y1)) & (x >= min(x0, x1)) & (x <= max(x0, x1))
-
-
-def draw_steps(count: int, rng: np.random.Generator, noisy_from: int) -> Tensor:
-    """(count,) steps, more of them noisy."""
-    noisy = rng.integers(noisy_from, T_STEPS, count)
-    rest = rng.integers(0, noisy_from, count)
-    return torch.from_numpy(np.where(rng.uniform(size=count) < NOISY_SHARE, noisy, rest))
-
-
-def dropped(batch: Batch, empty: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """The conditions, left out at random: (before, tokens)."""
-    draw = torch.from_numpy(rng.uniform(size=len(batch.t)))
+    draw = torch.rand(len(batch.t), generator=generator, device=generator.device)
     no_text = (draw < DROP) | ((draw >= 2 * DROP) & (draw < 3 * DROP))
     no_picture = (draw >= DROP) & (draw < 3 * DROP)
     before = torch.where(no_picture[:, None, None, None], 0.0, batch.before)
@@ -506,17 +274,12 @@ def loss_of(prediction: Tensor, target: Tensor, weight: Tensor, alphas: Tensor) 
     return (by_step[:, None, None, None] * weight * error).mean()
 
 
-def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
-    """The learning rate: linear up to ``peak``, constant, and down to a fiftieth over the last 30 %."""
-    if step < warm:
-        return peak * (step + 1) / warm
-    left = (total - step) / (0.3 * total)
-    return peak * min(1.0, 0.02 + 0.98 * left)
-
-
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
     constants = {key: globals()[key] for key in CONSTANTS}
+    constants |= steps.constants()
+    names = ("SENTENCES", "POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT", "HALF_PLANES")
+    constants |= {key: getattr(editor_pool, key) for key in names}
     if stage.draws:
         from training import editor_draws
 
@@ -531,25 +294,37 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
         )  # fmt: skip
         constants |= {key: getattr(editor_injection, key) for key in names}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
-    if stage.composed:
-        constants["HALF_PLANES"] = HALF_PLANES
-    fields = asdict(stage)
-    # Checkpoints from before a field existed do not name it.
-    for key, before in (
-        ("parts", 0),
-        ("unclear", UNCLEAR),
-        ("draws", False),
-        ("shift", 1),
-        ("composed", 0.0),
-    ):
-        if fields[key] == before:
-            del fields[key]
-    return {"stage": name, **fields, "constants": constants, "pairs": PAIRS_PROTOCOL}
+    return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
+
+
+class HasParts(Protocol):
+    """What :func:`tokenizer_of` reads of a stage."""
+
+    @property
+    def parts(self) -> int: ...
+
+
+def tokenizer_of(stage: HasParts, out: Path) -> Tokenizer:
+    """The tokenizer of the worlds that a stage sees, made where it is missing."""
+    path = out / ("tokenizer-parts.json" if stage.parts else "tokenizer.json")
+    if not path.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        make_tokenizer(parts=bool(stage.parts)).save(str(path))
+    return Tokenizer.from_file(str(path))
+
+
+def pool_of(stage: Stage, data: Path, tokenizer: Tokenizer, device: torch.device | str) -> Pool:
+    """The pictures and sentences that a stage is trained on; pictures are rendered where they are missing."""
+    counts: dict[str, int | None] = {"edit-train": stage.worlds}
+    if stage.parts:
+        counts["parts-train"] = stage.parts
+    return Pool(load_mixed(data, counts), tokenizer, device)
 
 
 def train_stage(
-    name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1
-) -> Path:
+    name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1, device: torch.device | str = "cpu",
+    pool: Pool | None = None,
+) -> Path:  # fmt: skip
     """Train a stage, or go on with it; the checkpoint's path.
 
     Args:
@@ -558,102 +333,81 @@ def train_stage(
         out: folder of checkpoints.
         stage: in place of the one of that name.
         threads: of torch.
+        device: of torch; on a GPU matrices are multiplied in bfloat16.
+        pool: on that device, if it is there already.
     """
-    from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-
     stage = STAGES[name] if stage is None else stage
+    device = torch.device(device)
     torch.set_num_threads(threads)
     torch.manual_seed(stage.seed)
-    out.mkdir(parents=True, exist_ok=True)
-    words = out / "tokenizer.json"
-    if not words.exists():
-        make_tokenizer().save(str(words))
-    tokenizer = Tokenizer.from_file(str(words))
-    counts: dict[str, int | None] = {"edit-train": stage.worlds}
-    if stage.parts:
-        counts["parts-train"] = stage.parts
-    pairs = Pairs(load_mixed(data, counts), stage.size, tokenizer)
+    tokenizer = tokenizer_of(stage, out)
+    pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
     net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
     if stage.start is not None:
-        stored = torch.load(out / f"{stage.start}.pt", weights_only=True)["average"]
-        weights = {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
-        begins = stage.draws and not STAGES[stage.start].draws
+        stored = torch.load(out / f"{stage.start}.pt", weights_only=True, map_location="cpu")
+        weights = {
+            k.removeprefix("module."): v for k, v in stored["average"].items() if k != "n_averaged"
+        }
+        begins = stage.draws and not any(k.startswith("unet.draw.") for k in weights)
         if begins:
             weights |= {k: v for k, v in net.state_dict().items() if k.startswith("unet.draw.")}
         net.load_state_dict(weights)
         if begins and not (out / f"{name}.pt").exists():
             from training.editor_draws import teach_draws
 
-            teach_draws(net, tokenizer, pairs.worlds, seed=stage.seed)
-    average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
-    optimizer = torch.optim.AdamW(groups(net, 0.01), lr=stage.peak, betas=(0.9, 0.99))
-    alphas = scheduler(stage.shift).alphas_cumprod
-    empty = tokens_of(tokenizer, [""])[0]
-    step_loss = _step(stage, pairs, net, alphas, empty)
-
-    def epoch(number: int) -> dict[str, float]:
-        rng = np.random.default_rng([stage.seed, number])
-        generator = torch.Generator().manual_seed(1_000_003 * stage.seed + number)
-        net.train()
-        sums: dict[str, float] = {}
-        for step in range(STEPS_AN_EPOCH):
-            for group in optimizer.param_groups:
-                group["lr"] = falling_rate(number * STEPS_AN_EPOCH + step, stage.steps, stage.peak)
-            loss, parts = step_loss(rng, generator)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
-            optimizer.step()
-            average.update_parameters(net)
-            for key, value in parts.items():
-                sums[key] = sums.get(key, 0.0) + value / STEPS_AN_EPOCH
-        return sums
-
+            teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
+    net.to(device)
+    alphas = scheduler(stage.shift).alphas_cumprod.to(device)
+    empty = tokens_of(tokenizer, [""])[0].to(device)
     checkpoint = out / f"{name}.pt"
-    state = {"net": net, "average": average, "optimizer": optimizer}
-    Run(checkpoint, state, stage.steps // STEPS_AN_EPOCH, recipe_of(name, stage)).train(epoch)
+    train_steps(
+        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device
+    )  # fmt: skip
     return checkpoint
 
 
-def _step(
-    stage: Stage, pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor
-) -> Callable[[np.random.Generator, torch.Generator], tuple[Tensor, dict[str, float]]]:
-    """One step's loss, and what to print of it."""
+def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Tensor) -> list[Task]:
+    """What a stage's steps are of: plain pairs or injected ones, small pictures or large ones."""
+    tasks = []
+    for size, share in ((stage.size, 1 - stage.large), (2 * stage.size, stage.large)):
+        if share == 0:
+            continue
+        count = max(2, stage.batch // (size // stage.size) ** 2)
+        injected = 0.0 if stage.inject == "none" else INJECTED_SHARE
+        draw = functools.partial(plain_inputs, pool, stage, alphas, empty, size)
+        # Some plain steps among those with injection, so that clear instructions are not forgotten.
+        tasks.append(Task(share * (1 - injected), count, draw, functools.partial(plain_loss, net)))
+        if injected:
+            from training import editor_injection
 
-    def plain(
-        rng: np.random.Generator, generator: torch.Generator
-    ) -> tuple[Tensor, dict[str, float]]:
-        batch = pairs.batch(
-            stage.batch,
-            rng,
-            generator,
-            unclear=stage.unclear,
-            noisy_from=stage.noisy_from,
-            composed=stage.composed,
-        )
-        before, tokens = dropped(batch, empty, rng)
-        a = alphas[batch.t]
-        prediction = net(noised(batch.after, batch.noise, a), before, batch.t, tokens)
-        loss = loss_of(prediction, batch.after, batch.weight, a)
-        # Of an unchanged picture, for comparison: 1 means nothing is edited.
-        nothing = loss_of(batch.before, batch.after, batch.weight, a)
-        return loss, {"loss": float(loss.detach()), "unedited": float(nothing)}
+            inject = stage.inject == "features"
+            drawn = functools.partial(
+                editor_injection.inputs, pool, alphas, empty, size, inject=inject, noisy_from=stage.noisy_from
+            )  # fmt: skip
+            loss = functools.partial(editor_injection.injected_loss, net, inject=inject)
+            tasks.append(Task(share * injected, count // 2, drawn, loss))
+    return tasks
 
-    if stage.inject == "none":
-        return plain
 
-    def injected(
-        rng: np.random.Generator, generator: torch.Generator
-    ) -> tuple[Tensor, dict[str, float]]:
-        from training.editor_injection import injected_loss
+def plain_inputs(
+    pool: Pool, stage: Stage, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
+) -> dict[str, Tensor]:  # fmt: skip
+    """Pairs as the network gets them, with their targets."""
+    t = draw_steps(count, generator, stage.noisy_from)
+    batch = pool.batch(
+        count, generator, size=size, t=t, kinds=KINDS, unclear=stage.unclear, composed=stage.composed
+    )  # fmt: skip
+    before, tokens = dropped(batch, empty, generator)
+    a = alphas[t]
+    return {
+        "noisy": noised(batch.after, batch.noise, a), "before": before, "t": t, "tokens": tokens, "target": batch.after,
+        "weight": batch.weight, "alpha": a, "source": batch.before,
+    }  # fmt: skip
 
-        # Some plain steps among them, so that clear instructions are not forgotten.
-        if rng.uniform() >= INJECTED_SHARE:
-            loss, parts = plain(rng, generator)
-            return loss, {f"plain {key}": value for key, value in parts.items()}
-        inject = stage.inject == "features"
-        return injected_loss(
-            pairs, net, alphas, empty, stage.batch // 2, rng, generator, inject=inject, noisy_from=stage.noisy_from,
-        )  # fmt: skip
 
-    return injected
+def plain_loss(net: EditorNet, x: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of :func:`plain_inputs`, and that of an unchanged picture beside it: the same means nothing is edited."""
+    prediction = net(x["noisy"], x["before"], x["t"], x["tokens"])
+    loss = loss_of(prediction, x["target"], x["weight"], x["alpha"])
+    nothing = loss_of(x["source"], x["target"], x["weight"], x["alpha"])
+    return loss, {"loss": loss.detach(), "unedited": nothing}

@@ -22,7 +22,7 @@ from training.editing_pairs import (
     instruction,
     load_pairs,
 )
-from training.editor import Pairs, Row
+from training.editor_pictures import Pictures, Row
 from training.worlds import COLORS
 
 SEED = 77
@@ -79,7 +79,7 @@ def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> li
         size: of the pictures in px.
         noises: of an open instruction, for each of a quarter of the worlds.
     """
-    pairs = Pairs(worlds, size, None)
+    pairs = Pictures(worlds, size)
     results = []
     outside: list[float] = []
     for kind in ("color", "material", "ground", "time"):
@@ -121,7 +121,7 @@ def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> li
     return results
 
 
-def _open(answer: Answer, pairs: Pairs, noises: int) -> Figure:
+def _open(answer: Answer, pairs: Pictures, noises: int) -> Figure:
     """How often an open instruction's result is nearer to one of the true answers than to the picture before."""
     worlds = pairs.worlds
     right, groups = [], []
@@ -143,7 +143,7 @@ def _open(answer: Answer, pairs: Pairs, noises: int) -> Figure:
     )
 
 
-def _row(pairs: Pairs, world: int, kind: str, rng: np.random.Generator) -> Row:
+def _row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -> Row:
     """A pair of looks of a world; half of the pictures are cut about the thing, as in training."""
     worlds = pairs.worlds
     assert kind in AMBIGUOUS
@@ -160,11 +160,11 @@ def _row(pairs: Pairs, world: int, kind: str, rng: np.random.Generator) -> Row:
             return row
 
 
-def _picture(pairs: Pairs, row: Row, look: int) -> Image:
+def _picture(pairs: Pictures, row: Row, look: int) -> Image:
     return np.clip((pairs.picture(row, look) + 1) / 2, 0, 1)
 
 
-def _mask(pairs: Pairs, row: Row, what: int) -> npt.NDArray[np.bool_]:
+def _mask(pairs: Pictures, row: Row, what: int) -> npt.NDArray[np.bool_]:
     return pairs.cut(pairs.worlds.ids[row.world, row.view] == what, row) > 0.99
 
 

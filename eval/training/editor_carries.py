@@ -30,8 +30,8 @@ from attnwarp.editing.editor import Image, edit
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from training.assess import Figure, figure
 from training.editing_pairs import GROUPS, SIZE, VIEWS, Worlds
-from training.editor import Pairs, Row
 from training.editor_assess import SEED, nearest
+from training.editor_pictures import Pictures, Row
 
 INSTRUCTION = "change its color"
 """One sentence for all pictures of a batch; which colour comes out is the noise's choice."""
@@ -74,7 +74,7 @@ class Case:
 
 def cases_of(worlds: Worlds, size: int) -> list[Case]:
     """Both whole views of every world whose thing is large enough."""
-    pairs = Pairs(worlds, size, None)
+    pairs = Pictures(worlds, size)
     cases = []
     for world in range(len(worlds)):
         rng = np.random.default_rng([SEED, world, 5])

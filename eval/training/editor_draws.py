@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 from tokenizers import Tokenizer
+from torch import Tensor
 
+from attnwarp.editing.latents import CHANNELS
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -19,7 +21,8 @@ from training.editing_pairs import (
     ambiguous_instruction,
     instruction,
 )
-from training.editor import CHANNELS, TOKENS, EditorNet, Tensor, codes, tokens_of
+from training.editor import TOKENS, EditorNet, tokens_of
+from training.editor_answers import codes
 
 DRAW_STEPS = 3_000
 """Of the layers alone."""

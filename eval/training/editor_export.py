@@ -12,26 +12,27 @@ from tokenizers import Tokenizer
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
 from training.depth_editor import DEPTH_STAGES, DepthNet
-from training.editor import STAGES, STEPS_AN_EPOCH, TOKENS, EditorNet, scheduler
+from training.editor import STAGES, TOKENS, EditorNet, scheduler, tokenizer_of
+from training.steps import STEPS_AN_EPOCH
 
 
 def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
     """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
-    tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
+    tokenizer = tokenizer_of(STAGES[stage], out)
     net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size, draws=STAGES[stage].draws)
     return net, tokenizer, *_load(net, out / f"{stage}.pt")
 
 
 def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, int, float]:
     """As :func:`averaged`, of a stage of :mod:`training.depth_editor`."""
-    tokenizer = Tokenizer.from_file(str(out / "tokenizer.json"))
+    tokenizer = tokenizer_of(DEPTH_STAGES[stage], out)
     net = DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size)
     return net, tokenizer, *_load(net, out / f"{stage}.pt")
 
 
 def _load(net: torch.nn.Module, checkpoint: Path) -> tuple[int, float]:
     """Load a checkpoint's averaged weights; its steps so far and their seconds."""
-    stored = torch.load(checkpoint, weights_only=True)
+    stored = torch.load(checkpoint, weights_only=True, map_location="cpu")
     average = {k.removeprefix("module."): v for k, v in stored["average"].items()}
     del average["n_averaged"]
     net.load_state_dict(average)

@@ -8,31 +8,21 @@ Features of an unrelated picture change nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
-from attnwarp.editing.latents import BLOCK
+from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
-from training.editing_pairs import SIZE
-from training.editor import (
-    T_STEPS,
-    Batch,
-    EditorNet,
-    Pairs,
-    Row,
-    answered,
-    draw_steps,
-    loss_of,
-    noised,
-    settled,
-)
+from training.editing_pairs import SIZE, VIEWS, Worlds
+from training.editor import T_STEPS, EditorNet, draw_steps, loss_of, noised
+from training.editor_answers import settled
+from training.editor_pool import Batch, Pool, Rows
 
 FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05
 """Features are mixed in with the paper's falling weight at that step, give or take the spread.
@@ -60,24 +50,22 @@ INJECTED_KINDS = {"color": 0.6, "material": 0.25, "ground": 0.15}
 
 EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
-Mask = npt.NDArray[np.bool_]
 
-
-def region(cells: int, rng: np.random.Generator) -> Mask:
-    """(h, w) where features go over: everything, a half, or a box."""
-    mask = np.zeros((cells, cells), dtype=bool)
-    draw = rng.uniform()
-    if draw < 0.4:
-        mask[:] = True
-    elif draw < 0.7:
-        half = cells // 2
-        rows = [mask[:half], mask[half:], mask[:, :half], mask[:, half:]]
-        rows[int(rng.integers(4))][:] = True
-    else:
-        side = rng.integers(cells // 4, 3 * cells // 4 + 1, 2)
-        low = [int(rng.integers(cells - s + 1)) for s in side]
-        mask[low[0] : low[0] + side[0], low[1] : low[1] + side[1]] = True
-    return mask
+def regions(cells: int, count: int, pool: Pool, generator: torch.Generator) -> Tensor:
+    """(B, h, w) bool, where features go over: everything (40 %), a half (30 %), or a box."""
+    line = torch.arange(cells, device=pool.device)
+    y, x = line[None, :, None], line[None, None, :]
+    draw = pool.uniform(generator, count)[:, None, None]
+    which = pool.integers(4, count, generator)[:, None, None]
+    along = torch.where(which < 2, y, x)
+    half = (along < cells // 2) == (which % 2 == 0)
+    box = torch.ones((count, cells, cells), dtype=torch.bool, device=pool.device)
+    for place in (y, x):
+        side = cells // 4 + pool.integers(3 * cells // 4 + 1 - cells // 4, count, generator)
+        low = (pool.uniform(generator, count) * (cells - side + 1)).long()
+        low, side = low[:, None, None], side[:, None, None]
+        box = box & (place >= low) & (place < low + side)
+    return (draw < 0.4) | torch.where(draw < 0.7, half, box)
 
 
 class Moves:
@@ -108,129 +96,166 @@ class Moves:
         """a (M moved + (1 - M) new) + (1 - a) new for (B, n, C) tokens."""
         index, mask = self.level(layer.level)
         moved = recorded.gather(1, index[:, :, None].expand_as(recorded))
-        mixed = torch.lerp(new, moved, self.weight[:, None, None])
+        mixed = torch.lerp(new, moved, self.weight[:, None, None].to(new))
         return torch.where(mask[:, :, None], mixed, new)
 
 
-def view_warp(pairs: Pairs, source: Row, target: Row) -> FeatureWarp:
-    """The exact warp between two views of a world on the grid of the whole picture's latents."""
-    worlds, cells = pairs.worlds, pairs.size // BLOCK
+def view_warp(worlds: Worlds, world: int, target: int, cells: int) -> FeatureWarp:
+    """The exact warp to a view of a world from its other one, on a grid of the whole picture."""
 
-    def camera(row: Row) -> Camera:
-        K, pose = worlds.K[row.world, row.view], worlds.world_to_camera[row.world, row.view]
-        return Camera(K, pose, SIZE, SIZE)
+    def camera(view: int) -> Camera:
+        return Camera(worlds.K[world, view], worlds.world_to_camera[world, view], SIZE, SIZE)
 
-    def surface(row: Row) -> Surface:
-        return Surface(worlds.depth[row.world, row.view].astype(np.float64))
+    def surface(view: int) -> Surface:
+        return Surface(worlds.depth[world, view].astype(np.float64))
 
+    source = 1 - target
     view = warp_surfaces(camera(source), camera(target), surface(target), surface(source), EXACT)
     return view.at((cells, cells))
 
 
+def view_moves(worlds: Worlds, size: int) -> tuple[Tensor, Tensor]:
+    """(N, 2, cells^2) index into the other view's cells, and mask, for whole pictures of that size."""
+    cells = size // BLOCK
+    index = np.zeros((len(worlds), VIEWS, cells**2), dtype=np.int16)
+    mask = np.zeros(index.shape, dtype=bool)
+    for world in range(len(worlds)):
+        for target in range(VIEWS):
+            warp = view_warp(worlds, world, target, cells)
+            xy = np.clip(np.nan_to_num(warp.correspondence.xy.numpy()), 0, cells - 1e-6)
+            index[world, target] = (xy.astype(np.int64) @ [1, cells]).ravel()
+            mask[world, target] = warp.mask.numpy().ravel()
+    return torch.from_numpy(index), torch.from_numpy(mask)
+
+
 def draw_moves(
-    pairs: Pairs, rows: Sequence[Row], rng: np.random.Generator
-) -> tuple[list[Row], list[str], Tensor, Tensor]:
-    """For each of B's rows: A's row, the way, (B, cells^2) index into A's cells and mask."""
-    cells = pairs.size // BLOCK
-    y, x = np.mgrid[0:cells, 0:cells]
-    sources, ways, indices, masks = [], [], [], []
-    for row in rows:
-        way = str(rng.choice(list(WAYS), p=list(WAYS.values())))
-        source, inside = row, np.ones((cells, cells), dtype=bool)
-        if way == "mirrored":
-            source, index = replace(row, flip=not row.flip), y * cells + (cells - 1 - x)
-        elif way == "shifted":
-            source, index, inside = _shifted(pairs, row, rng)
-        elif way == "other view":
-            # Crops and mirror images have cameras of their own; the whole picture has the world's.
-            row = replace(row, corner=(0, 0, SIZE // pairs.size), flip=False)
-            source = replace(row, view=1 - row.view)
-            warp = view_warp(pairs, source, row)
-            xy = warp.correspondence.xy.numpy()
-            index = np.clip(np.nan_to_num(xy), 0, cells - 1e-6).astype(np.int64) @ [1, cells]
-            inside = warp.mask.numpy()
-        else:
-            index = y * cells + x
-            if way == "unrelated":
-                world = int(rng.integers(len(pairs.worlds)))
-                source = replace(row, world=world, corner=pairs.corner(world, row.view, rng))
-        ways.append(way)
-        sources.append(source)
-        indices.append(index.ravel())
-        masks.append((inside & region(cells, rng)).ravel())
-    return sources, ways, torch.from_numpy(np.stack(indices)), torch.from_numpy(np.stack(masks))
+    pool: Pool, rows: Rows, size: int, generator: torch.Generator
+) -> tuple[Rows, Rows, Tensor, Tensor, Tensor]:
+    """For each of B's rows: the way's place in :data:`WAYS` and where features come from.
+
+    Returns:
+        B's rows (another view's warp needs the whole picture), A's rows, (B,) ways, (B, cells^2) index into A's
+        cells and mask.
+    """
+    cells, count = size // BLOCK, len(rows)
+    names = list(WAYS)
+    shares = torch.tensor(list(WAYS.values()), device=pool.device)
+    way = torch.multinomial(shares, count, replacement=True, generator=generator)
+    line = torch.arange(cells, device=pool.device)
+    y, x = line[None, :, None], line[None, None, :]
+    index = (y * cells + x).expand(count, cells, cells)
+    inside = torch.ones((count, cells, cells), dtype=torch.bool, device=pool.device)
+
+    def of(name: str) -> Tensor:
+        return way == names.index(name)
+
+    zero = torch.zeros_like(rows.x)
+    whole = replace(
+        rows, y=zero, x=zero, zoom=torch.full_like(zero, SIZE // size), flip=torch.zeros_like(rows.flip)
+    )  # fmt: skip
+    rows = whole.where(of("other view"), rows)
+    source = replace(
+        rows,
+        flip=rows.flip ^ of("mirrored"),
+        view=torch.where(of("other view"), 1 - rows.view, rows.view),
+    )
+    index = torch.where(of("mirrored")[:, None, None], y * cells + (cells - 1 - x), index)
+
+    # The same picture cut elsewhere; a whole one cannot be.
+    cut = of("shifted") & (SIZE - rows.zoom * size > 0)
+    by = []
+    for low in (rows.y, rows.x):
+        drawn = pool.integers(2 * (cells // 4) + 1, count, generator) - cells // 4
+        least, most = -(low // BLOCK), (SIZE - size - low) // BLOCK
+        by.append(torch.where(cut, torch.maximum(torch.minimum(drawn, most), least), 0))
+    source = replace(source, y=source.y + by[0] * BLOCK, x=source.x + by[1] * BLOCK)
+    along = torch.where(rows.flip, -by[1], by[1])
+    from_y, from_x = y - by[0][:, None, None], x - along[:, None, None]
+    within = (from_y >= 0) & (from_y < cells) & (from_x >= 0) & (from_x < cells)
+    shifted = from_y.clamp(0, cells - 1) * cells + from_x.clamp(0, cells - 1)
+    index = torch.where(cut[:, None, None], shifted, index)
+    inside = torch.where(cut[:, None, None], within, inside)
+
+    warp_index, warp_mask = pool.moves(size)
+    other = of("other view")[:, None, None]
+    index = torch.where(
+        other, warp_index[rows.world, rows.view].long().view(-1, cells, cells), index
+    )
+    inside = torch.where(other, warp_mask[rows.world, rows.view].view(-1, cells, cells), inside)
+
+    strange = pool.rows(count, generator, size=size, kinds=INJECTED_KINDS, unclear=1.0)
+    strange = replace(strange, view=rows.view, kind=rows.kind, source=rows.source, flip=rows.flip)
+    source = strange.where(of("unrelated"), source)
+    mask = inside & regions(cells, count, pool, generator)
+    return rows, source, way, index.flatten(1), mask.flatten(1)
 
 
-def _shifted(
-    pairs: Pairs, row: Row, rng: np.random.Generator
-) -> tuple[Row, npt.NDArray[np.int64], Mask]:
-    """The same picture cut elsewhere, and which of its cells shows each of the row's."""
-    cells, n = pairs.size // BLOCK, row.corner[2]
-    y, x = np.mgrid[0:cells, 0:cells]
-    most = SIZE - n * pairs.size
-    if most == 0:  # the whole picture cannot be cut elsewhere
-        return row, y * cells + x, np.ones((cells, cells), dtype=bool)
-    block = n * BLOCK
-    by = [
-        int(
-            np.clip(
-                rng.integers(-cells // 4, cells // 4 + 1), -(low // block), (most - low) // block
-            )
-        )
-        for low in row.corner[:2]
-    ]
-    corner = (row.corner[0] + by[0] * block, row.corner[1] + by[1] * block, n)
-    from_y, from_x = y - by[0], x + by[1] if row.flip else x - by[1]
-    inside = (from_y >= 0) & (from_y < cells) & (from_x >= 0) & (from_x < cells)
-    index = np.clip(from_y, 0, cells - 1) * cells + np.clip(from_x, 0, cells - 1)
-    return replace(row, corner=corner), index, inside
-
-
-def falling_weight(t: Tensor, rng: np.random.Generator) -> Tensor:
+def falling_weight(t: Tensor, generator: torch.Generator) -> Tensor:
     """(B,) weights of the features at (B,) time steps, near the paper's decay."""
-    spread = torch.from_numpy(rng.uniform(-WEIGHT_SPREAD, WEIGHT_SPREAD, len(t))).float()
+    draw = torch.rand(len(t), generator=generator, device=t.device)
+    spread = WEIGHT_SPREAD * (2 * draw - 1)
     return (FIRST_WEIGHT * (t + 1) / T_STEPS + spread).clamp(LEAST_WEIGHT, 1)
 
 
-def injected_loss(
-    pairs: Pairs, net: EditorNet, alphas: Tensor, empty: Tensor, count: int, rng: np.random.Generator,
-    generator: torch.Generator, *, inject: bool = True, noisy_from: int = 850,
-) -> tuple[Tensor, dict[str, float]]:  # fmt: skip
-    """The loss of ``count`` pairs of runs, each against its own target; the runs share their steps.
+def inputs(
+    pool: Pool, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator, *,
+    inject: bool = True, noisy_from: int = 850,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Pairs of runs A and B as the network gets them, with their targets; the runs of a pair share their step.
 
     Args:
-        pairs: to draw from.
-        net: being trained.
+        pool: to draw from.
         alphas: alpha-bar of the steps.
         empty: tokens of no text.
-        count: of pairs; twice as many pictures go through the network.
-        rng, generator: to draw from.
-        inject: False is the control: the same runs, nothing goes over, B's target is its own answer.
+        size: of the pictures in px.
+        count: of pairs.
+        generator: on the pool's device.
+        inject: False is the control: nothing goes over, B's target is its own answer.
         noisy_from: more of the steps are drawn from here on.
     """
-    noisy = np.flatnonzero(alphas.numpy() < MOST_ALPHA)
-    carried = torch.from_numpy(rng.uniform(size=count) < CARRIED)
-    t = torch.where(
-        carried, draw_steps(count, rng, noisy_from), torch.from_numpy(rng.choice(noisy, count))
-    )
-    b = pairs.batch(count, rng, generator, t=t, kinds=INJECTED_KINDS, unclear=1.0)
-    sources, ways, index, mask = draw_moves(pairs, b.rows, rng)
-    # "Other view" needs the whole picture, so B's rows may have changed with A's.
-    rows = [
-        replace(r, corner=s.corner, flip=s.flip) if way == "other view" else r
-        for r, s, way in zip(b.rows, sources, ways, strict=True)
-    ]
-    b = _rebuilt(pairs, b, rows)
-    no_text = torch.from_numpy(rng.uniform(size=count) < NO_TEXT)
-    b = replace(b, tokens=torch.where(no_text[:, None], empty, b.tokens))
-    sources = [answered(pairs.worlds, s, rng) for s in sources]
-    noise = torch.randn(b.noise.shape, generator=generator)
-    noise = torch.stack([settled(n, s.target, s.kind) for n, s in zip(noise, sources, strict=True)])
-    a = replace(_rebuilt(pairs, b, sources), noise=noise)
-    related = torch.tensor([way != "unrelated" for way in ways])
-    cells = pairs.size // BLOCK
-    weight = falling_weight(t, rng)
-    moves = Moves(cells, index, mask, weight)
+    cells = size // BLOCK
+    carried = pool.uniform(generator, count) < CARRIED
+    noisy = (alphas < MOST_ALPHA).nonzero()[:, 0]
+    least = noisy[pool.integers(len(noisy), count, generator)]
+    t = torch.where(carried, draw_steps(count, generator, noisy_from), least)
+    b = pool.batch(count, generator, size=size, t=t, kinds=INJECTED_KINDS, unclear=1.0)
+    rows, sources, way, index, mask = draw_moves(pool, b.rows, size, generator)
+    b = _rebuilt(pool, b, rows, size)
+    no_text = pool.uniform(generator, count) < NO_TEXT
+    tokens = torch.where(no_text[:, None], empty, b.tokens)
+    sources = pool.answered(sources, generator)
+    noise = torch.randn((count, CHANNELS, cells, cells), generator=generator, device=pool.device)
+    noise = settled(noise, sources.target, sources.kind)
+    a = _rebuilt(pool, b, sources, size)
+    related = way != list(WAYS).index("unrelated")
+    target = shown = b.after
+    if inject:
+        answer = torch.where(related, sources.target, rows.target)
+        wanted = pool.latents(pool.pictures(rows, answer, size))
+        warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
+        target = torch.where(warped, wanted, b.after)
+        own = MOST_OWN * pool.uniform(generator, count)
+        own = torch.where(carried, own, 1.0)[:, None, None, None]
+        shown = torch.lerp(target, b.after, own)
+    alpha = alphas[t]
+    return {
+        "t": t, "alpha": alpha, "tokens": tokens, "index": index, "mask": mask, "share": falling_weight(t, generator),
+        "noisy A": noised(a.after, noise, alpha), "before A": a.before, "target A": a.after, "weight A": a.weight,
+        "noisy B": noised(shown, b.noise, alpha), "before B": b.before, "target B": target, "weight B": b.weight,
+    }  # fmt: skip
+
+
+def injected_loss(
+    net: EditorNet, x: Mapping[str, Tensor], *, inject: bool = True
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The loss of pairs of runs (:func:`inputs`), each against its own target.
+
+    Args:
+        net: being trained.
+        x: of :func:`inputs`.
+        inject: False is the control: the same runs, nothing goes over.
+    """
+    moves = Moves(x["noisy A"].shape[-1], x["index"], x["mask"], x["share"])
     recorded: dict[str, Tensor] = {}
 
     def keep(layer: Layer, features: Tensor, call: Call) -> None:
@@ -240,31 +265,21 @@ def injected_loss(
         return moves.blend(layer, recorded[layer.name], features)
 
     layers = choose_layers(net.unet)
-    alpha = alphas[t]
     with hooked(net.unet, layers, keep):
-        first = net(noised(a.after, a.noise, alpha), a.before, t, a.tokens)
-    loss_a = loss_of(first, a.after, a.weight, alpha)
-    target = shown = b.after
-    if inject:
-        answers = [replace(r, target=s.target) for r, s in zip(rows, sources, strict=True)]
-        wanted = pairs.latents([pairs.picture(r, r.target) if k else pairs.picture(o, o.target) for r, o, k in zip(answers, rows, related.tolist(), strict=True)])  # fmt: skip
-        warped = mask.view(count, 1, cells, cells) & related[:, None, None, None]
-        target = torch.where(warped, wanted, b.after)
-        own = torch.from_numpy(rng.uniform(0, MOST_OWN, count)).float()
-        own = torch.where(carried, own, 1.0)[:, None, None, None]
-        shown = torch.lerp(target, b.after, own)
+        first = net(x["noisy A"], x["before A"], x["t"], x["tokens"])
+    loss_a = loss_of(first, x["target A"], x["weight A"], x["alpha"])
     with hooked(net.unet, layers, blend if inject else keep):
-        second = net(noised(shown, b.noise, alpha), b.before, t, b.tokens)
-    loss_b = loss_of(second, target, b.weight, alpha)
-    return loss_a + loss_b, {"recorded": float(loss_a.detach()), "injected": float(loss_b.detach())}
+        second = net(x["noisy B"], x["before B"], x["t"], x["tokens"])
+    loss_b = loss_of(second, x["target B"], x["weight B"], x["alpha"])
+    return loss_a + loss_b, {"recorded": loss_a.detach(), "injected": loss_b.detach()}
 
 
-def _rebuilt(pairs: Pairs, batch: Batch, rows: list[Row]) -> Batch:
+def _rebuilt(pool: Pool, batch: Batch, rows: Rows, size: int) -> Batch:
     """The batch with the pictures of other rows."""
     return replace(
         batch,
-        before=pairs.latents([pairs.picture(r, r.source) for r in rows]),
-        after=pairs.latents([pairs.picture(r, r.target) for r in rows]),
-        weight=torch.from_numpy(np.stack([pairs.weight(r) for r in rows]))[:, None],
+        before=pool.latents(pool.pictures(rows, rows.source, size)),
+        after=pool.latents(pool.pictures(rows, rows.target, size)),
+        weight=pool.weight(rows, size),
         rows=rows,
     )

@@ -11,8 +11,8 @@ from PIL import ImageDraw
 
 from attnwarp.editing.editor import Image
 from training.editing_pairs import GROUPS, SIZE, Worlds
-from training.editor import Pairs, Row
 from training.editor_assess import Answer
+from training.editor_pictures import Pictures, Row
 
 INSTRUCTIONS = (
     "make it red",
@@ -39,7 +39,7 @@ def sheet(
         size: of the pictures in px.
         instructions: one a column.
     """
-    pairs = Pairs(worlds, size, None)
+    pairs = Pictures(worlds, size)
     rows = []
     for world in np.linspace(0, len(worlds) - 1, ROWS).astype(int).tolist():
         rng = np.random.default_rng([world, 6])

@@ -150,77 +150,6 @@ def test_the_noise_picks_every_answer_as_often():
     assert np.abs(counts[candidates] - 600).max() < 110
 
 
-def test_an_unclear_pair_ends_in_the_answer_that_its_noise_picks(pairs):
-    batch = pairs.batch(30, np.random.default_rng(0), torch.Generator().manual_seed(0), unclear=1.0)
-    unclear = [(k, row) for k, row in enumerate(batch.rows) if row.unclear]
-    assert len(unclear) > 20
-    for k, row in unclear:
-        looks = pairs.worlds.looks[row.world]
-        assert pairs.worlds.valid[row.world, row.target]
-        assert not np.array_equal(looks[row.target], looks[row.source])
-        # Among all answers of the kind, so that no world needs to be known for it.
-        scores = codes()[list(GROUPS[row.kind])] @ batch.noise[k].mean(dim=(1, 2))
-        assert row.target == GROUPS[row.kind][int(scores.argmax())]
-
-
-def answers_of(pairs, row):
-    """Pictures of all answers that a row may have, by look."""
-    valid = pairs.worlds.valid[row.world]
-    return {k: pairs.picture(row, k) for k in GROUPS[row.kind] if valid[k] and k != row.source}
-
-
-def test_a_composed_result_has_one_answer_in_a_region_and_its_own_elsewhere(pairs):
-    steps = torch.tensor([300, 849, 850, 999] * 8)
-    rng, generator = np.random.default_rng(1), torch.Generator().manual_seed(1)
-    batch = pairs.batch(32, rng, generator, t=steps, unclear=1.0, composed=1.0)
-    results = pairs.coder.decode(batch.after).sample.permute(0, 2, 3, 1).numpy()
-    shared = 0
-    for row, t, result in zip(batch.rows, steps.tolist(), results, strict=True):
-        pictures = answers_of(pairs, row)
-        own = np.abs(result - pictures[row.target]).max(axis=2) < 1e-4
-        if t >= 850 or not row.unclear:  # the noise is still to choose, or nothing is open
-            assert own.all()
-            continue
-        other = [np.abs(result - p).max(axis=2) < 1e-4 for p in pictures.values()]
-        assert any((own | o).all() for o in other)
-        shared += not own.all()
-    # Of 16 settled pairs a few have an edge beside what changes.
-    assert shared >= 10
-
-
-def test_regions_cut_the_thing_and_take_half_of_it_on_average():
-    thing = np.zeros((64, 64), dtype=bool)
-    thing[20:50, 10:40] = True
-    rng = np.random.default_rng(0)
-    shares = np.array(
-        [(editor.cut_region(thing, rng) & thing).sum() / thing.sum() for _ in range(400)]
-    )
-    # A half-plane and its complement are as likely; boxes are smaller than their complements.
-    assert 0.3 < shares.mean() < 0.5
-    assert ((shares > 0) & (shares < 1)).mean() > 0.95
-
-
-def test_noise_that_got_its_answer_is_as_white_as_before():
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn((4000, 48, 2, 2), generator=generator)
-    answers = torch.randint(len(GROUPS["color"]), (4000,), generator=generator)
-    given = torch.stack(
-        [editor.settled(n, int(a), "color") for n, a in zip(noise, answers, strict=True)]
-    )
-    assert torch.allclose(
-        given - given.mean((2, 3), True), noise - noise.mean((2, 3), True), atol=1e-5
-    )
-    flat = given.flatten(1).double().numpy()
-    # Means and covariances of 4,000 normals have standard deviations of about 1 / sqrt(4000); six of them.
-    assert np.abs(flat.mean(axis=0)).max() < 6 / 4000**0.5
-    assert np.abs(np.cov(flat.T) - np.eye(192)).max() < 6 * (2 / 4000) ** 0.5
-    mean = given.mean(dim=(2, 3)) @ codes()[list(GROUPS["color"])].T
-    assert mean.argmax(dim=1).tolist() == answers.tolist()
-    # The shares that the noise has of the answers are the same numbers, two of them exchanged.
-    own = noise.mean(dim=(2, 3)) @ codes()[list(GROUPS["color"])].T
-    assert torch.allclose(mean.sort(dim=1).values, own.sort(dim=1).values, atol=1e-5)
-
-
 def checkpoint(folder):
     return torch.load(folder / "drawn-64.pt", weights_only=True)
 
@@ -284,40 +213,6 @@ def check_export(folder):
     assert np.abs(mine - theirs).max() < 1e-5
     assert np.abs(mine - picture).max() > 0.01
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 20e6
-
-
-def test_moved_cells_of_the_recorded_picture_show_what_the_targets_cells_show(pairs):
-    rng = np.random.default_rng(1)
-    batch = pairs.batch(60, rng, torch.Generator().manual_seed(1), kinds={"color": 1.0})
-    sources, ways, index, mask = draw_moves(pairs, batch.rows, rng)
-    errors: dict[str, list[float]] = {}
-    for row, source, way, cells, inside in zip(batch.rows, sources, ways, index, mask, strict=True):
-        if way == "unrelated":
-            continue
-        if way == "other view":
-            row = dataclasses.replace(row, corner=source.corner, flip=source.flip)
-        a, b = (
-            pairs.latents([pairs.picture(r, row.source)])[0, :3].flatten(1) for r in (source, row)
-        )
-        if inside.any():
-            errors.setdefault(way, []).append(float((a[:, cells] - b)[:, inside].abs().mean()))
-    assert set(errors) == {"same", "mirrored", "shifted", "other view"}
-    for way, values in errors.items():
-        # Means of cells are exact but for another view, where a cell is the nearest one and light differs with the side.
-        assert np.mean(values) < (0.35 if way == "other view" else 1e-5), way
-    halves = mask.float().mean(dim=1)
-    assert (halves == 1).any() and ((halves > 0) & (halves < 1)).any()
-
-
-def test_the_weight_of_features_falls_as_the_papers_does():
-    alone = decay(0.9)
-    t = torch.arange(999, -1, -50).repeat_interleave(500)
-    weight = editor_injection.falling_weight(t, np.random.default_rng(0)).reshape(20, 500)
-    for step, drawn in enumerate(weight):
-        # Uniform by 0.15: 500 draws have a standard error of 0.004; the least weight moves the last ones.
-        paper = alone(step, 20)
-        assert float(drawn.mean()) == pytest.approx(max(paper, 0.1), abs=0.05), step
-        assert float((drawn - paper).abs().max()) < 0.2
 
 
 def test_the_blend_moves_masks_and_mixes_tokens():
