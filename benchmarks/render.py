@@ -402,14 +402,14 @@ def table(result: dict[str, Any]) -> str:
 def _sentences(models: Mapping[str, Any]) -> list[str]:
     def terms(model: Mapping[str, Any], unit: str) -> str:
         factors = [(name, value) for name, value in model.items() if isinstance(value, list)]
-        said = [
+        costs = [
             f"{f:.3g} {unit} a {name.rstrip('s')} [{low:.3g}, {high:.3g}]"
             for name, (f, low, high) in factors
         ]
         fitted = (
             f"R^2 {model['r2']:.3f}, half of the cases within {100 * model['typical_error']:.0f} %"
         )
-        return f"{' + '.join(said)}; {fitted}"
+        return f"{' + '.join(costs)}; {fitted}"
 
     names = {
         "time": ("forward, processor time", "ns"),
@@ -418,8 +418,8 @@ def _sentences(models: Mapping[str, Any]) -> list[str]:
         "memory_both": ("memory, forward and backward", "bytes"),
     }
     return [
-        f"- {said} = {terms(models[key], unit)}"
-        for key, (said, unit) in names.items()
+        f"- {title} = {terms(models[key], unit)}"
+        for key, (title, unit) in names.items()
         if models[key]
     ]
 
