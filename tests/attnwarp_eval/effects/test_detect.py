@@ -22,7 +22,8 @@ from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.truth import Geometry, mitsuba
 from attnwarp_eval.truth.mitsuba import build
-from attnwarp_eval.truth.plan import Pass, Plan, beam, plan
+from attnwarp_eval.truth.passes import Pass, Plan, beam
+from attnwarp_eval.truth.plan import plan
 from attnwarp_eval.truth.shading import emitted, irradiance, object_albedo
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")

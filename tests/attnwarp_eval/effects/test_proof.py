@@ -14,7 +14,8 @@ from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import equivalence
 from attnwarp_eval.truth.mitsuba import render_plan
-from attnwarp_eval.truth.plan import DROPPABLE, Lens, everything_on, plan, without
+from attnwarp_eval.truth.passes import Lens
+from attnwarp_eval.truth.plan import DROPPABLE, everything_on, plan, without
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 
