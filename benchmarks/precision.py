@@ -29,20 +29,8 @@ from torch import Tensor
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import api, constants, cpu, reference
-from attnwarp.render.interface import Inputs
+from attnwarp.render.interface import OUTPUTS, Inputs
 from benchmarks import command
-
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
-"""What is compared: fields of a Render."""
 
 MODES = [
     ("2d", "intersection", False),

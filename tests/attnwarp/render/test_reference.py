@@ -13,18 +13,9 @@ import torch
 from attnwarp import Gaussians
 from attnwarp.render import constants, harmonics, render
 from attnwarp.render.api import normal_from_depth
+from attnwarp.render.interface import OUTPUTS
 
 BACKENDS = ("reference", "cpu")
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
 
 
 @pytest.mark.usefixtures("one_thread")
