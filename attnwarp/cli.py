@@ -573,9 +573,9 @@ def edit(
         check_segmenter(segmenter, words)
         _check_out(out)
 
-        from attnwarp.propagate.settings import preset as choices
+        import attnwarp.propagate.settings
 
-        settings = choices(preset.value, **changes)
+        settings = attnwarp.propagate.settings.preset(preset.value, **changes)
         _use_threads(threads)
         dataset = _read_views(
             data,
@@ -801,11 +801,10 @@ def baseline(
     with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
         changes = _assignments(change or [], {})
         _check_out(out)
-        from attnwarp.baselines.settings import Budget
-        from attnwarp.baselines.settings import preset as choices
+        import attnwarp.baselines.settings
 
-        settings = choices(method.value, preset, **changes)
-        budget = Budget(seconds, network_rows)
+        settings = attnwarp.baselines.settings.preset(method.value, preset, **changes)
+        budget = attnwarp.baselines.settings.Budget(seconds, network_rows)
         _use_threads(threads)
         from attnwarp.baselines.command import edit_dataset
 

@@ -240,7 +240,7 @@ def _pairs(
     high = np.clip(np.ceil(xy + spread[:, None]), 0, [width, height]).astype(np.int64)
     sides = np.where((depths.numpy() > near)[:, None], np.maximum(high - low, 0), 0)
     areas = sides.prod(axis=1)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    pieces: list[tuple[Tensor, Tensor, Tensor]] = []
     cuts = [0, *(np.flatnonzero(np.diff(np.cumsum(areas) // 4_000_000)) + 1), len(areas)]
     for begin, end in itertools.pairwise(cuts):
         ids = np.repeat(np.arange(begin, end), areas[begin:end])
@@ -267,13 +267,13 @@ def _pairs(
             tile_x, tile_y = torch.from_numpy(x // TILE), torch.from_numpy(y // TILE)
             keep &= (tile_x >= low_x.floor()) & (tile_x < high_x.ceil())
             keep &= (tile_y >= low_y.floor()) & (tile_y < high_y.ceil())
-        found.append((i[keep], torch.from_numpy(y * width + x)[keep], alphas[keep]))
-    ids_all = torch.cat([f[0] for f in found])
-    pixels = torch.cat([f[1] for f in found])
+        pieces.append((i[keep], torch.from_numpy(y * width + x)[keep], alphas[keep]))
+    ids_all = torch.cat([f[0] for f in pieces])
+    pixels = torch.cat([f[1] for f in pieces])
     order = torch.argsort(pixels * len(depths) + rank[ids_all])
     ids_all, pixels = ids_all[order], pixels[order]
     if stop:
-        logs = torch.log1p(-torch.cat([f[2] for f in found])[order].clamp(max=0.999).double())
+        logs = torch.log1p(-torch.cat([f[2] for f in pieces])[order].clamp(max=0.999).double())
         along = torch.cumsum(logs, 0)
         first = torch.searchsorted(pixels, pixels)
         # What is left of the light after each: it only falls along a ray, so all behind the first

@@ -12,8 +12,6 @@ medians of the ratios within a round.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
 import subprocess
@@ -30,6 +28,7 @@ import torch
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset, write_ply, write_transforms
+from benchmarks import command
 
 SPLATS = 200_000
 SIZE = 592
@@ -152,21 +151,16 @@ def table(result: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.inspecting", description="Time the first picture of inspect."
-    )
+    parser = command.parser("inspecting", "Time the first picture of inspect.")
     parser.add_argument("--rounds", type=int, default=5, help="times it is drawn (default 5)")
     parser.add_argument(
         "--against", type=Path, action="append", default=[], help="another checkout to take turns"
     )
-    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
     options = parser.parse_args(arguments)
     here = Path(__file__).resolve().parent.parent
     result = measure([here, *(path.resolve() for path in options.against)], options.rounds)
     print(table(result))
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
+    command.write_figures(options.out, result)
 
 
 if __name__ == "__main__":

@@ -17,12 +17,9 @@ also rendered with each splat moved by what float32 may round of a pixel's posit
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,19 +29,8 @@ from torch import Tensor
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
 from attnwarp.render import api, constants, cpu, reference
-from attnwarp.render.interface import Inputs
-
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
-"""What is compared: fields of a Render."""
+from attnwarp.render.interface import OUTPUTS, Inputs
+from benchmarks import command
 
 MODES = [
     ("2d", "intersection", False),
@@ -275,23 +261,18 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.precision",
-        description="Measure the renderer's error against the ratio of scales.",
+    parser = command.parser(
+        "precision", "Measure the renderer's error against the ratio of scales."
     )
     parser.add_argument("--quick", action="store_true", help="ratios 1 and 1e6, 2 pictures each")
     parser.add_argument("--pictures", type=int, default=12, help="of each ratio and mode (12)")
-    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)  # small tensors: threads would only wait for each other
     thin = needles(WIDTHS, 20 if options.quick else 200)
     print(needle_table(thin) + "\n")
     rows = run((1e0, 1e6), 2) if options.quick else run(RATIOS, options.pictures)
     print(table(rows))
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        figures = {"needles": thin, "ratios": rows}
-        options.out.write_text(json.dumps(figures, indent=1) + "\n")
+    command.write_figures(options.out, {"needles": thin, "ratios": rows})
 
 
 if __name__ == "__main__":

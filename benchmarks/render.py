@@ -23,9 +23,7 @@ of such scenes, which a grid of cases is not; it says how well the cases determi
 
 from __future__ import annotations
 
-import argparse
 import gc
-import json
 import platform
 import resource
 import statistics
@@ -46,6 +44,7 @@ from attnwarp.render import _pool
 from attnwarp.render.api import render
 from attnwarp.render.threads import run_jobs, thread_count
 from attnwarp_eval.cost import in_turn
+from benchmarks import command
 
 FLOPS_PER_PAIR = 45
 GSPLAT_SECONDS = 90.0
@@ -402,14 +401,14 @@ def table(result: dict[str, Any]) -> str:
 def _sentences(models: Mapping[str, Any]) -> list[str]:
     def terms(model: Mapping[str, Any], unit: str) -> str:
         factors = [(name, value) for name, value in model.items() if isinstance(value, list)]
-        said = [
+        costs = [
             f"{f:.3g} {unit} a {name.rstrip('s')} [{low:.3g}, {high:.3g}]"
             for name, (f, low, high) in factors
         ]
         fitted = (
             f"R^2 {model['r2']:.3f}, half of the cases within {100 * model['typical_error']:.0f} %"
         )
-        return f"{' + '.join(said)}; {fitted}"
+        return f"{' + '.join(costs)}; {fitted}"
 
     names = {
         "time": ("forward, processor time", "ns"),
@@ -418,27 +417,19 @@ def _sentences(models: Mapping[str, Any]) -> list[str]:
         "memory_both": ("memory, forward and backward", "bytes"),
     }
     return [
-        f"- {said} = {terms(models[key], unit)}"
-        for key, (said, unit) in names.items()
+        f"- {title} = {terms(models[key], unit)}"
+        for key, (title, unit) in names.items()
         if models[key]
     ]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.render", description="Time the CPU renderer."
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="256 x 256 with 10k and 50k splats only, 3 rounds"
-    )
-    parser.add_argument(
-        "--rounds", type=int, default=7, help="times each case is measured (default 7)"
-    )
+    parser = command.parser("render", "Time the CPU renderer.")
+    command.add_turns(parser, "256 x 256 with 10k and 50k splats only, 3 rounds", rounds=7)
     parser.add_argument(
         "--no-gsplat", action="store_true", help="leave out gsplat's torch reference"
     )
-    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
     options = parser.parse_args(arguments)
     sizes, counts = (
         ([256], [10_000, 50_000]) if options.quick else ([256, 512], [10_000, 50_000, 200_000])
@@ -453,9 +444,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     most = 0 if options.no_gsplat else 1_500_000 if options.quick else 12_000_000
     result = run(cases, 3 if options.quick else options.rounds, most)
     print(table(result))
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
+    command.write_figures(options.out, result)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ PARTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("compiled kernels read from disk", ("numba.core.caching:", "numba.core.serialize:")),
     ("imports", ("importlib._bootstrap:_find_and_load",)),
     ("pictures: textures and scenes", ("attnwarp_eval.truth.mitsuba.build:load_world",)),
-    ("pictures: light", ("attnwarp_eval.truth.mitsuba.",)),
+    ("pictures: light", ("attnwarp_eval.truth.mitsuba.", "attnwarp_eval.truth.pictures:")),
     ("splats on surfaces", ("attnwarp_eval.world:splats",)),
     ("truth: rays and correspondences", ("attnwarp_eval.truth.", "attnwarp_eval.world:")),
     ("timing in turn", ("attnwarp_eval.cost:in_turn",)),

@@ -18,14 +18,11 @@ above 0, times channels.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +36,7 @@ from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
 from attnwarp.warp._kernels import sampling
 from attnwarp_eval.cost import in_turn
+from benchmarks import command
 
 SPLATS = 40_000
 YAW = 20.0
@@ -230,16 +228,8 @@ def table(result: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.warp", description="Time the warp of views and features."
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="a pair at 256 and tokens (2, 1024, 320), 3 rounds"
-    )
-    parser.add_argument(
-        "--rounds", type=int, default=15, help="times each case is measured (default 15)"
-    )
-    parser.add_argument("--out", type=Path, help="also write the figures as JSON here")
+    parser = command.parser("warp", "Time the warp of views and features.")
+    command.add_turns(parser, "a pair at 256 and tokens (2, 1024, 320), 3 rounds", rounds=15)
     options = parser.parse_args(arguments)
     if options.quick:
         cases = [pair_case(256), tokens_case(32, 320, torch.float32, others=True)]
@@ -252,9 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             cases.append(tokens_case(grid, 320, torch.bfloat16, others=False))
     result = run(cases, 3 if options.quick else options.rounds)
     print(table(result))
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(result, indent=1) + "\n")
+    command.write_figures(options.out, result)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,7 @@ from attnwarp.camera import Camera
 from attnwarp.editing.segment import load_segmenter, segments_of
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.errors import InputError, suggest
-from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, random_points
-from attnwarp.fit.progress import progress_display as fit_progress
+from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, progress, random_points
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
@@ -158,7 +157,7 @@ def _fitted(
         points, colors = random_points(views.cameras, FIRST_POINTS, seed=seed)
     start = from_points(points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
     folder.mkdir(parents=True, exist_ok=True)
-    with fit_progress(title="fit") as watch:
+    with progress.progress_display(title="fit") as watch:
         return fit(start, views, settings, folder=folder, watch=watch).gaussians
 
 

@@ -11,8 +11,7 @@ from typing import Any, Literal, get_args
 from attnwarp import check
 from attnwarp.editing.attention import Block, Kind
 from attnwarp.editing.schedule import PUBLISHED_STEPS
-from attnwarp.warp import PRESETS as WARP_PRESETS
-from attnwarp.warp import WarpSettings
+from attnwarp.warp import WarpSettings, settings
 
 Method = Literal["warp", "each view alone"]
 Noise = Literal["shared", "fresh", "surface"]
@@ -133,7 +132,7 @@ class PropagateSettings:
     guidance_drop: float = 0.0
     source_text_guidance: float | None = None
     batch: int = 4
-    warp: WarpSettings = WARP_PRESETS["corrected"]
+    warp: WarpSettings = settings.PRESETS["corrected"]
     mask: bool = True
     sources: int = 1
     chain_coverage: float = 0.5
@@ -263,7 +262,7 @@ _RELEASED = PropagateSettings(
     start=(700, 980),
     text_guidance=12.5,
     guidance_drop=1.5,
-    warp=WARP_PRESETS["released"],
+    warp=settings.PRESETS["released"],
     depth_from="current",
     composite_blur=1.5,
     training="modulo",
@@ -275,7 +274,7 @@ _RELEASED = PropagateSettings(
 PRESETS: dict[str, PropagateSettings] = {
     "paper": PropagateSettings(
         views_per_stage=MOST_VIEWS,
-        warp=WARP_PRESETS["paper"],
+        warp=settings.PRESETS["paper"],
         depth_from="current",
         composite="black",
         training="stage",

@@ -38,7 +38,7 @@ from attnwarp.render.binned import (
     as_array,
     join,
 )
-from attnwarp.render.interface import Inputs, Outputs
+from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
 GRADIENT_ROWS = 1 << 16
@@ -308,14 +308,4 @@ def render(inputs: Inputs) -> Outputs:
         inputs.pose,
         inputs.background,
     )
-    names = (
-        "color",
-        "alpha",
-        "depth",
-        "median_depth",
-        "normal",
-        "distortion_l1",
-        "distortion_l2_ndc",
-        "weight",
-    )
-    return Outputs(**dict(zip(names, tensors, strict=True)), counters=counters)
+    return Outputs(**dict(zip(OUTPUTS, tensors, strict=True)), counters=counters)

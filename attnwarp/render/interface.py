@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from torch import Tensor
 
@@ -53,3 +53,7 @@ class Outputs:
     distortion_l2_ndc: Tensor
     weight: Tensor
     counters: dict[str, int]
+
+
+OUTPUTS = tuple(field.name for field in fields(Outputs) if field.name != "counters")
+"""Names of the differentiable outputs, in the order of their fields."""

@@ -157,9 +157,13 @@ def _write_disc_row(work, row, rows, dx, dy, line):
     b = u64(WORK.sums)
     for k in range(3):
         # Terms U, V and W one after another, in their columns as in their sums.
-        at, to = b + u64(DISC_SUM.d_u + 3 * k), DISC.u_x + 3 * k
-        d, d_x, d_y = f64(work[at]), f64(work[at + u64(1)]), f64(work[at + u64(2)])
-        rows[line, to], rows[line, to + 1], rows[line, to + 2] = d_x + dx * d, d_y + dy * d, d
+        term, column = b + u64(DISC_SUM.d_u + 3 * k), DISC.u_x + 3 * k
+        d, d_x, d_y = f64(work[term]), f64(work[term + u64(1)]), f64(work[term + u64(2)])
+        rows[line, column], rows[line, column + 1], rows[line, column + 2] = (
+            d_x + dx * d,
+            d_y + dy * d,
+            d,
+        )
     du, dv = f64(work[b + u64(DISC_SUM.d_u)]), f64(work[b + u64(DISC_SUM.d_v)])
     dw = f64(work[b + u64(DISC_SUM.d_w)])
     rows[line, SPLAT.center_x] = (
@@ -205,22 +209,22 @@ def _select_drawn(buffer, p, background, scale):
     d_alpha = load(buffer, SLOT.behind_loss * PIXELS + p)
     d_alpha = d_alpha + d_l2 * load(buffer, SLOT.variance * PIXELS + p)
     for c in range(3):
-        at = (SLOT.d_color + c) * PIXELS + p
-        d_alpha = d_alpha - load(buffer, at) * background[c]
-        store(buffer, at, select(drawn, load(buffer, at), zero))
-        at = (SLOT.d_normal + c) * PIXELS + p
-        store(buffer, at, select(drawn, load(buffer, at), zero))
+        slot = (SLOT.d_color + c) * PIXELS + p
+        d_alpha = d_alpha - load(buffer, slot) * background[c]
+        store(buffer, slot, select(drawn, load(buffer, slot), zero))
+        slot = (SLOT.d_normal + c) * PIXELS + p
+        store(buffer, slot, select(drawn, load(buffer, slot), zero))
     d_alpha = d_alpha * load(buffer, SLOT.transmittance * PIXELS + p)
     store(buffer, SLOT.behind_loss * PIXELS + p, select(drawn, zero - d_alpha, zero))
-    at = SLOT.d_depth * PIXELS + p
-    store(buffer, at, select(drawn, load(buffer, at) / A, zero))
+    slot = SLOT.d_depth * PIXELS + p
+    store(buffer, slot, select(drawn, load(buffer, slot) / A, zero))
     store(buffer, SLOT.d_l2 * PIXELS + p, select(drawn, d_l2 * A, zero))
-    at = SLOT.d_l1 * PIXELS + p
-    store(buffer, at, select(drawn, load(buffer, at) * f32(2.0), zero))
-    at = SLOT.d_median * PIXELS + p
-    store(buffer, at, select(drawn, load(buffer, at), zero))
-    at = SLOT.depth * PIXELS + p
-    store(buffer, at, select(drawn, load(buffer, at), zero))
+    slot = SLOT.d_l1 * PIXELS + p
+    store(buffer, slot, select(drawn, load(buffer, slot) * f32(2.0), zero))
+    slot = SLOT.d_median * PIXELS + p
+    store(buffer, slot, select(drawn, load(buffer, slot), zero))
+    slot = SLOT.depth * PIXELS + p
+    store(buffer, slot, select(drawn, load(buffer, slot), zero))
     store(buffer, SLOT.alpha * PIXELS + p, select(drawn, A, zero))
 
 
@@ -232,21 +236,21 @@ def _load_whole_tile(buffer, tile, view, background, scale, pictures, upstream):
     for k in range(PIXELS // 4):
         r, q = k // SIDE, k % SIDE
         p = (r // 4 * SIDE + q) * 16 + r % 4 * 4
-        at = (tile.top + r) * width + tile.left + q * 4
-        copy4(buffer, SLOT.transmittance * PIXELS + p, state, at + STATE.transmittance * plane)
-        copy4(buffer, SLOT.last_step * PIXELS + p, state, at + STATE.last_step * plane)
-        copy4(buffer, SLOT.median_step * PIXELS + p, state, at + STATE.median_step * plane)
-        copy4(buffer, SLOT.inverse_depth * PIXELS + p, state, at + STATE.inverse_depth * plane)
-        copy4(buffer, SLOT.variance * PIXELS + p, state, at + STATE.variance * plane)
-        copy4(buffer, SLOT.depth * PIXELS + p, pictures.depth, at)
-        copy4(buffer, SLOT.alpha * PIXELS + p, pictures.alpha, at)
-        copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, at)
-        copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, at)
-        copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, at)
-        copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, at)
-        copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, at)
-        separate4(buffer, SLOT.d_normal * PIXELS + p, PIXELS, upstream.normal, 3 * at)
-        separate4(buffer, SLOT.d_color * PIXELS + p, PIXELS, upstream.color, 3 * at)
+        pixel = (tile.top + r) * width + tile.left + q * 4
+        copy4(buffer, SLOT.transmittance * PIXELS + p, state, pixel + STATE.transmittance * plane)
+        copy4(buffer, SLOT.last_step * PIXELS + p, state, pixel + STATE.last_step * plane)
+        copy4(buffer, SLOT.median_step * PIXELS + p, state, pixel + STATE.median_step * plane)
+        copy4(buffer, SLOT.inverse_depth * PIXELS + p, state, pixel + STATE.inverse_depth * plane)
+        copy4(buffer, SLOT.variance * PIXELS + p, state, pixel + STATE.variance * plane)
+        copy4(buffer, SLOT.depth * PIXELS + p, pictures.depth, pixel)
+        copy4(buffer, SLOT.alpha * PIXELS + p, pictures.alpha, pixel)
+        copy4(buffer, SLOT.behind_loss * PIXELS + p, upstream.alpha, pixel)
+        copy4(buffer, SLOT.d_depth * PIXELS + p, upstream.depth, pixel)
+        copy4(buffer, SLOT.d_l2 * PIXELS + p, upstream.l2, pixel)
+        copy4(buffer, SLOT.d_l1 * PIXELS + p, upstream.l1, pixel)
+        copy4(buffer, SLOT.d_median * PIXELS + p, upstream.median, pixel)
+        separate4(buffer, SLOT.d_normal * PIXELS + p, PIXELS, upstream.normal, 3 * pixel)
+        separate4(buffer, SLOT.d_color * PIXELS + p, PIXELS, upstream.color, 3 * pixel)
     for p in range(0, PIXELS, 16):
         _select_drawn(buffer, p, background, scale)
 

@@ -112,26 +112,26 @@ def _runs_by_intervals(k, table, view, tiles, target, used):
 
 
 @inlined
-def _piece_ends(outlines, at, steps, discs, width):
+def _piece_ends(outlines, piece, steps, discs, width):
     """Leftmost and rightmost pixel of an outline in each of 16 rows of squares.
 
     Args:
-        outlines: see :class:`Pieces`; the piece begins at ``at``.
+        outlines: see :class:`Pieces`; where this one begins, counted flat.
         steps: Lanes, where the rows begin, in pixels from the first.
         discs: join the disc of the screen filter to the ellipse.
     """
     zero, far = f32(0.0), f32(1e9)
     # From the ellipse's middle; rows that the image ends within are taken whole.
-    y1 = steps + broadcast(outlines, at + OUTLINE.row_y)
-    y2 = y1 + broadcast(outlines, at + OUTLINE.row_height)
-    top = broadcast(outlines, at + OUTLINE.top)
-    inverse_top = broadcast(outlines, at + OUTLINE.inverse_top)
-    half = broadcast(outlines, at + OUTLINE.half_chord)
-    lean = broadcast(outlines, at + OUTLINE.lean)
-    half_width = broadcast(outlines, at + OUTLINE.half_width)
-    tip = broadcast(outlines, at + OUTLINE.tip_y)
-    e1 = maximum(y1 - broadcast(outlines, at + OUTLINE.middle_y), -top)
-    e2 = minimum(y2 - broadcast(outlines, at + OUTLINE.middle_y), top)
+    y1 = steps + broadcast(outlines, piece + OUTLINE.row_y)
+    y2 = y1 + broadcast(outlines, piece + OUTLINE.row_height)
+    top = broadcast(outlines, piece + OUTLINE.top)
+    inverse_top = broadcast(outlines, piece + OUTLINE.inverse_top)
+    half = broadcast(outlines, piece + OUTLINE.half_chord)
+    lean = broadcast(outlines, piece + OUTLINE.lean)
+    half_width = broadcast(outlines, piece + OUTLINE.half_width)
+    tip = broadcast(outlines, piece + OUTLINE.tip_y)
+    e1 = maximum(y1 - broadcast(outlines, piece + OUTLINE.middle_y), -top)
+    e2 = minimum(y2 - broadcast(outlines, piece + OUTLINE.middle_y), top)
     t1, t2 = e1 * inverse_top, e2 * inverse_top
     # 5e-7: what 1 - t^2 may be rounded by; at the tips its root is much.
     chord1 = approximate_sqrt(maximum(f32(1.0) - t1 * t1, zero) + f32(5e-7)) * half
@@ -141,17 +141,17 @@ def _piece_ends(outlines, at, steps, discs, width):
     left = minimum(lean * e1 - chord1, lean * e2 - chord2)
     left = select((e1 <= -tip) & (-tip <= e2), -half_width, left)
     meets = e1 <= e2
-    middle = broadcast(outlines, at + OUTLINE.middle_x)
+    middle = broadcast(outlines, piece + OUTLINE.middle_x)
     left, right = select(meets, left + middle, far), select(meets, right + middle, -far)
     if discs:
         near = maximum(maximum(y1, -y2), zero)
-        square = broadcast(outlines, at + OUTLINE.radius_squared)
+        square = broadcast(outlines, piece + OUTLINE.radius_squared)
         chord = approximate_sqrt(maximum(square - near * near, f32(1e-12)))
-        meets = near < broadcast(outlines, at + OUTLINE.radius)
+        meets = near < broadcast(outlines, piece + OUTLINE.radius)
         left = select(meets, minimum(left, -chord), left)
         right = select(meets, maximum(right, chord), right)
-    left = ceil(maximum(left + broadcast(outlines, at + OUTLINE.left), zero))
-    right = floor(minimum(right + broadcast(outlines, at + OUTLINE.right), f32(width - 1)))
+    left = ceil(maximum(left + broadcast(outlines, piece + OUTLINE.left), zero))
+    right = floor(minimum(right + broadcast(outlines, piece + OUTLINE.right), f32(width - 1)))
     return left, right
 
 
@@ -185,9 +185,9 @@ def _flush(pieces, waiting, discs, steps, width, tiles, wanted_before, target, u
     room = runs.shape[0]
     for j in range(waiting):
         k, ty = rows[j, 0], rows[j, 1]
-        begin, at = used, j * PIECE_SPANS
+        begin, span = used, j * PIECE_SPANS
         for _ in range(rows[j, 2]):
-            left, right = int(spans[u64(at + FIRST_COLUMN)]), int(spans[u64(at + LAST_COLUMN)])
+            left, right = int(spans[u64(span + FIRST_COLUMN)]), int(spans[u64(span + LAST_COLUMN)])
             if right >= 0:
                 tx = left // SIDE
                 length = right // SIDE - tx + 1
@@ -197,12 +197,12 @@ def _flush(pieces, waiting, discs, steps, width, tiles, wanted_before, target, u
                         to = u64(used)
                         runs[to, RUN.tile], runs[to, RUN.tiles] = tile, length
                         runs[to, RUN.column] = tx * SIDE
-                        copy4_integers(runs, used * RUN_SIZE + RUN.intervals, spans, at)
+                        copy4_integers(runs, used * RUN_SIZE + RUN.intervals, spans, span)
                         changes[u64(tile)] += 1
                         changes[u64(tile + length)] -= 1
                     used += 1
             ty += 1
-            at += SIDE
+            span += SIDE
         target.counts[k] += used - begin
     return used
 
@@ -314,14 +314,14 @@ def scatter(
 ):
     """Write the entries of the splats first..last to the lists of the tiles that are live."""
     every = live_before[-1] == live.shape[0]
-    at = u64(0)
+    run = u64(0)
     for place in range(first, last):
         for _ in range(counts[place]):
-            tile, length = u64(runs[at, RUN.tile]), runs[at, RUN.tiles]
-            begin = int(runs[at, RUN.column])
-            r0, r1 = int(runs[at, RUN.intervals]), int(runs[at, RUN.intervals + 1])
-            r2, r3 = int(runs[at, RUN.intervals + 2]), int(runs[at, RUN.intervals + 3])
-            at += u64(1)
+            tile, length = u64(runs[run, RUN.tile]), runs[run, RUN.tiles]
+            begin = int(runs[run, RUN.column])
+            r0, r1 = int(runs[run, RUN.intervals]), int(runs[run, RUN.intervals + 1])
+            r2, r3 = int(runs[run, RUN.intervals + 2]), int(runs[run, RUN.intervals + 3])
+            run += u64(1)
             if every and length * SIDE <= 56:
                 b0, b1 = _row_bits(r0, begin), _row_bits(r1, begin) << SIDE
                 b2, b3 = _row_bits(r2, begin), _row_bits(r3, begin) << SIDE

@@ -538,10 +538,10 @@ def with_any_bit(typing: Any, array: Any, item: Any, wanted: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         words = builder.load(_pointer(context, builder, sig.args[0], INTS, *args[:2]), align=4)
         mask = _spread(builder, builder.trunc(args[2], ir.IntType(32)), INTS)
-        found = builder.icmp_unsigned(
+        matches = builder.icmp_unsigned(
             "!=", builder.and_(words, mask), ir.Constant(INTS, [0] * WIDTH)
         )
-        return builder.zext(_as_bits(builder, found), ir.IntType(64))
+        return builder.zext(_as_bits(builder, matches), ir.IntType(64))
 
     return types.int64(array, types.int64, types.int64), codegen
 

@@ -260,7 +260,7 @@ def _gather(batch, splats, order, begin, last, discs):
 def _cull(batch, view, candidates, begin, first, wanted, table, outlines):
     """Which of the ``candidates``, one bit each, may show in a wanted tile; the others are marked
     as not drawn."""
-    shown = candidates
+    visible = candidates
     for lane in range(8):
         if not candidates >> lane & 1:
             continue
@@ -269,11 +269,11 @@ def _cull(batch, view, candidates, begin, first, wanted, table, outlines):
         size = max(batch[s], batch[s + u64(8)], batch[s + u64(16)])
         c = column + u64(8 * BATCH.center)
         if not _reaches(view, batch[c], batch[c + u64(8)], batch[c + u64(16)], size, wanted):
-            shown &= ~(1 << lane)
+            visible &= ~(1 << lane)
             table.singles[u64(begin + lane), u64(SINGLE + SPLAT.cut)] = f32(-1.0)
             outlines[u64(begin + lane - first), u64(OUTLINE.first_row)] = f32(1.0)
             outlines[u64(begin + lane - first), u64(OUTLINE.last_row)] = f32(0.0)
-    return shown
+    return visible
 
 
 @inlined
@@ -625,15 +625,17 @@ def project(
         ic = reciprocal(c2)
         ahead = view.near < c2
         px, py = (c0 * fx + c1 * skew) * ic + cx, c1 * fy * ic + cy
-        shown = 255 >> (8 - min(8, last - begin))
+        visible = 255 >> (8 - min(8, last - begin))
         inside = 0
         if every:
             inside = to_bits(ahead & (px > 0.0) & (px < width) & (py > 0.0) & (py < height))
-        if shown & ~inside:
+        if visible & ~inside:
             _store3(batch, BATCH.center, c0, c1, c2)
-            candidates = shown & ~inside
-            shown &= inside | _cull(batch, view, candidates, begin, first, wanted, table, outlines)
-            if shown == 0:
+            candidates = visible & ~inside
+            visible &= inside | _cull(
+                batch, view, candidates, begin, first, wanted, table, outlines
+            )
+            if visible == 0:
                 continue
         c = Vector(c0, c1, c2)
         length = _project_batch(batch, singles, view, R, c, ic, px, py, ahead, step)
@@ -647,7 +649,7 @@ def project(
                 (c0 * R.m02 + c1 * R.m12 + c2 * R.m22) * over,
             )
         for lane in range(8):
-            if not shown >> lane & 1:
+            if not visible >> lane & 1:
                 continue
             to, column = u64(begin + lane), u64(lane)
             local, i = to - u64(first), u64(order[to])

@@ -372,13 +372,13 @@ def _composite_square(space, q, left, view, channels, keep):
 def _add_channels(space, q, used, entries, features, channels):
     """Sum the channels from the fourth on in square q, over the splats it took."""
     for c in range(3, channels):
-        at = (SLOT.color + c) * PIXELS + q * 16
-        sums = load(space.buffer, at)
+        slot = (SLOT.color + c) * PIXELS + q * 16
+        sums = load(space.buffer, slot)
         for k in range(used):
             splat = entries[u64(space.entries[space.picks[u64(k)]])] & PLACE
             share = load(space.block, BLOCK_WORK.shares + k * 16)
             sums = sums + share * features[u64(splat), u64(c)]
-        store(space.buffer, at, sums)
+        store(space.buffer, slot, sums)
 
 
 @inlined
@@ -422,8 +422,8 @@ def _finish(buffer, background, ndc_scale):
         store(buffer, SLOT.l1 * PIXELS + p, l1 * f32(2.0))
         through = f32(1.0) - A
         for c in range(background.shape[0]):
-            at = (SLOT.color + c) * PIXELS + p
-            store(buffer, at, load(buffer, at) + through * background[c])
+            slot = (SLOT.color + c) * PIXELS + p
+            store(buffer, slot, load(buffer, slot) + through * background[c])
 
 
 @inlined
@@ -590,17 +590,17 @@ def settle(
 
     Weights are summed as whole numbers: the same bits in whatever order tiles end.
     """
-    at = 0
+    used = 0
     keep = cached.shape[0] > 0
     entries, weights = lists.entries, progress.weights
     for t in range(ended.shape[0]):
         if ended[t]:
-            starts[t] = offset + at
+            starts[t] = offset + used
             begin = lists.starts[t]
             for e in range(begin, begin + progress.processed[t]):
                 entry, weight = entries[u64(e)], weights[u64(e)]
                 sums[entry & PLACE] += int(f64(weight) * (1 / WEIGHT_UNIT))
                 if keep:
                     # Of what is nowhere drawn, no square is of interest to the backward pass.
-                    cached[at] = entry if weight > 0 else entry & PLACE
-                    at += 1
+                    cached[used] = entry if weight > 0 else entry & PLACE
+                    used += 1

@@ -111,9 +111,9 @@ def inspect(
         if picked is not None:
             typer.echo("\n".join(picked.lines()))
         if export is not None:
-            from attnwarp_eval.inspect.export import export as write
+            from attnwarp_eval.inspect.export import write_export
 
-            write(export, chosen, state, picked)
+            write_export(export, chosen, state, picked)
             typer.echo(export)
         if screenshot is None and export is not None and not web:
             return

@@ -346,7 +346,7 @@ class _Group:
             return "can't tell"
         values = [value for value in before.values() if math.isfinite(value)]
         allowed = Margin(self.metric.atol, self.metric.rtol)
-        told = verdict(
+        outcome = verdict(
             difference,
             "higher" if self.metric.direction == "higher" else "lower",
             atol=float(np.mean([allowed.around(value) for value in values])),
@@ -354,9 +354,9 @@ class _Group:
         )
         reach = float(np.mean([margin(self.key).around(value) for value in values]))
         within = max(abs(difference.low), abs(difference.high)) < reach
-        if told == "can't tell" and within and not undefined and not difference.undefined:
+        if outcome == "can't tell" and within and not undefined and not difference.undefined:
             return "equal"
-        return told
+        return outcome
 
 
 def _values(

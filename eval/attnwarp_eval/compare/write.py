@@ -12,9 +12,9 @@ from typing import Any
 from attnwarp_eval.canonical_json import without_nan
 from attnwarp_eval.compare.judge import Comparison, Row
 from attnwarp_eval.compare.pictures import Change
+from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Slider, Table
 from attnwarp_eval.document.numbers import number
-from attnwarp_eval.document.write import page as write_page
 from attnwarp_eval.metrics.registry import METRICS
 
 ORDER = ("worse", "can't tell", "better", "equal")
@@ -96,7 +96,7 @@ def page(comparison: Comparison, changes: Sequence[Change], why_none: str = "") 
         pictures.gallery = Gallery([(_sentence(change), _sliders(change)) for change in changes])
     rows = [_cells(row) for row in comparison.rows]
     every = Table(COLUMNS, rows, f"All {len(rows)} figures", folded=True)
-    return write_page(
+    return write.page(
         Report(
             report.title,
             report.lead,

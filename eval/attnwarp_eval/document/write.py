@@ -14,9 +14,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from attnwarp.io.picture import encode_picture
 from attnwarp_eval.document.model import Gallery, Report, Slider, Table
 from attnwarp_eval.files import write_atomic
 
@@ -128,9 +130,7 @@ def reduced(data: bytes, scale: float) -> bytes:
     with Image.open(io.BytesIO(data)) as picture:
         size = (max(1, round(scale * picture.width)), max(1, round(scale * picture.height)))
         smaller = picture.convert("RGB").resize(size, Image.Resampling.BOX)
-    buffer = io.BytesIO()
-    smaller.save(buffer, "JPEG", quality=85)
-    return buffer.getvalue()
+    return encode_picture(np.asarray(smaller), ".jpg", chroma="420")
 
 
 def _drawer(root: Path) -> Callable[[str], Markup]:

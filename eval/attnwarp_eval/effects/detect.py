@@ -20,14 +20,8 @@ from attnwarp_eval.scene.materials import EFFECTS, NOT_SIMULATED, Effect
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.truth.bounces import answer
 from attnwarp_eval.truth.mitsuba import graph
-from attnwarp_eval.truth.plan import (
-    bounces_of,
-    convex,
-    everything_on,
-    plan,
-    sampler,
-    small_lights,
-)
+from attnwarp_eval.truth.passes import convex, sampler, small_lights
+from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
 
 
 @dataclass(frozen=True)

@@ -40,17 +40,8 @@ from attnwarp_eval.statistics.equivalence import (
 )
 from attnwarp_eval.truth import bounces
 from attnwarp_eval.truth.mitsuba import comparable, render_plan
-from attnwarp_eval.truth.plan import (
-    Lens,
-    Pass,
-    Plan,
-    bounces_of,
-    convex,
-    everything_on,
-    plan,
-    small_lamps,
-    small_lights,
-)
+from attnwarp_eval.truth.passes import Lens, Pass, Plan, convex, small_lamps, small_lights
+from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
 
 Array = npt.NDArray[np.float64]
 Verdict = Literal["certified", "refused", "can't tell"]

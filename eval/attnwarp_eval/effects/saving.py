@@ -16,7 +16,8 @@ from attnwarp_eval.statistics.equivalence import welch_interval
 from attnwarp_eval.statistics.intervals import time_ratio
 from attnwarp_eval.truth.llvm import LLVM, variant
 from attnwarp_eval.truth.mitsuba import render_plan
-from attnwarp_eval.truth.plan import Plan, bounces_of, everything_on, plan
+from attnwarp_eval.truth.passes import Plan
+from attnwarp_eval.truth.plan import bounces_of, everything_on, plan
 
 Array = npt.NDArray[np.float64]
 

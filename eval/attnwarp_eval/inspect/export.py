@@ -44,7 +44,7 @@ def check_ending(path: Path) -> None:
         raise InputError(f"{path}: got {path.suffix or 'no ending'}, expected .html, .glb or .vtp")
 
 
-def export(path: Path, subject: Subject, state: State, picked: Any = None) -> None:
+def write_export(path: Path, subject: Subject, state: State, picked: Any = None) -> None:
     """Write what a state shows; no OpenGL is needed but for .html.
 
     Args:

@@ -193,23 +193,22 @@ class _Page:
 
     def _build(self) -> None:
         from trame.ui.vuetify3 import VAppLayout
-        from trame.widgets import html, vtk
-        from trame.widgets import vuetify3 as vuetify
+        from trame.widgets import html, vtk, vuetify3
 
         window = self.window
         self.server.state.trame__title = "attnwarp-eval inspect"
         compact = {"density": "compact", "hide_details": True}
         with VAppLayout(self.server):
             with (
-                vuetify.VNavigationDrawer(permanent=True, width=330),
-                vuetify.VContainer(classes="pa-3"),
+                vuetify3.VNavigationDrawer(permanent=True, width=330),
+                vuetify3.VContainer(classes="pa-3"),
             ):
                 html.Div("view: {{ targets[target] }}", classes="text-caption")
-                _slider(vuetify, "target", "targets")
-                vuetify.VSelect(
+                _slider(vuetify3, "target", "targets")
+                vuetify3.VSelect(
                     label="variant", v_model=("variant",), items=("variants",), **compact
                 )
-                vuetify.VSelect(
+                vuetify3.VSelect(
                     label="colours",
                     v_model=("coloring",),
                     items=("colorings",),
@@ -217,13 +216,13 @@ class _Page:
                     **compact,
                 )
                 html.Div("grid: {{ layers[layer] }}", classes="text-caption mt-3")
-                _slider(vuetify, "layer", "layers")
+                _slider(vuetify3, "layer", "layers")
                 if len(window.steps) > 1:
                     html.Div("step: {{ steps[step] }}", classes="text-caption mt-3")
-                    _slider(vuetify, "step", "steps")
-                vuetify.VCheckbox(label="splats as discs", v_model=("splats",), **compact)
+                    _slider(vuetify3, "step", "steps")
+                vuetify3.VCheckbox(label="splats as discs", v_model=("splats",), **compact)
                 if window.pair.world is not None:
-                    vuetify.VCheckbox(
+                    vuetify3.VCheckbox(
                         label="the whole true surface", v_model=("surface",), **compact
                     )
                 looks = {
@@ -232,16 +231,16 @@ class _Page:
                     "outside": window.look_from_outside,
                 }
                 for name, look in looks.items():
-                    vuetify.VBtn(name, click=self._look(look), size="small", classes="ma-1")
-                vuetify.VBtn("fly", click=self._fly, size="small", classes="ma-1")
+                    vuetify3.VBtn(name, click=self._look(look), size="small", classes="ma-1")
+                vuetify3.VBtn("fly", click=self._fly, size="small", classes="ma-1")
                 html.Div(
                     "click on the surface: a pixel or cell, its rays and its numbers",
                     classes="text-caption mt-2",
                 )
                 html.Pre("{{ numbers }}", style="font-size: 11px; overflow-x: auto;")
             with (
-                vuetify.VMain(),
-                vuetify.VContainer(fluid=True, classes="pa-0", style="height: 100vh;"),
+                vuetify3.VMain(),
+                vuetify3.VContainer(fluid=True, classes="pa-0", style="height: 100vh;"),
             ):
                 view = vtk.VtkRemoteView(
                     window.plotter.render_window, ref="view", interactive_ratio=1
@@ -249,8 +248,8 @@ class _Page:
                 self.server.controller.view_update = view.update
 
 
-def _slider(vuetify: Any, name: str, values: str) -> None:
-    vuetify.VSlider(
+def _slider(vuetify3: Any, name: str, values: str) -> None:
+    vuetify3.VSlider(
         v_model=(name,),
         min=0,
         max=(f"{values}.length - 1",),

@@ -107,7 +107,7 @@ def _interval(table: ByView) -> Interval:
 
 
 @dataclass(frozen=True)
-class Finding:
+class JudgedClaim:
     """A claim, the measurement, and the verdict."""
 
     claim: Claim
@@ -136,7 +136,7 @@ def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def judge(results: Results, claims: list[Claim]) -> list[Finding]:
+def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
     """Every claim that the run has measurements for, with its verdict.
 
     p-values are adjusted over the claims (Benjamini-Hochberg). A claim about the editor's working
@@ -147,7 +147,7 @@ def judge(results: Results, claims: list[Claim]) -> list[Finding]:
     contrasts = [paired(m.a, m.b) for _, m in measurements]
     adjusted = benjamini_hochberg([contrast.p for contrast in contrasts])
     return [
-        Finding(
+        JudgedClaim(
             claim,
             m.metric,
             m.sides,
@@ -161,7 +161,7 @@ def judge(results: Results, claims: list[Claim]) -> list[Finding]:
     ]
 
 
-def together(findings: Sequence[Finding], editors: Sequence[str]) -> tuple[Here, Verdict]:
+def together(findings: Sequence[JudgedClaim], editors: Sequence[str]) -> tuple[Here, Verdict]:
     """One verdict of the findings of a claim about the editor's working.
 
     It has one only where all editors were measured and agree; else it depends on the editor, or

@@ -10,8 +10,7 @@ from typing import Literal
 from attnwarp_eval.document.model import Finding, Picture, Slider
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.ablations import contrasts
-from attnwarp_eval.report.claims import Finding as Judged
-from attnwarp_eval.report.claims import judge, load_claims
+from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
 from attnwarp_eval.statistics.intervals import Interval, verdict
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import PictureFile
@@ -76,13 +75,13 @@ def _calibration(results: Results, problems: list[str]) -> Finding:
     )
 
 
-def _clearest(results: Results) -> list[Judged]:
+def _clearest(results: Results) -> list[JudgedClaim]:
     """The claims with a clear outcome, those that hold in general or do not before the others."""
     clear = [j for j in judge(results, load_claims()) if len(j.sides) > 1 and j.here != "mixed"]
     return sorted(clear, key=lambda j: (j.verdict == "can't tell", j.contrast.p))[:CLAIMS]
 
 
-def _claim(results: Results, judged: Judged) -> Finding:
+def _claim(results: Results, judged: JudgedClaim) -> Finding:
     first, second = list(judged.sides)
     outcome = {"seen": "seen here", "not seen": "not seen here"}[judged.here]
     if judged.verdict != "can't tell":
@@ -115,17 +114,17 @@ def _of_table(results: Results, ablation: Ablation, claimed: list[set[str]]) -> 
         direction: Literal["higher", "lower"] = (
             "higher" if specification.direction == "higher" else "lower"
         )
-        told = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
-        if told not in ("better", "worse") or {name, ablation.baseline} in claimed:
+        outcome = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+        if outcome not in ("better", "worse") or {name, ablation.baseline} in claimed:
             continue
         if name in clearest and clearest[name][1] <= p:
             continue
         finding = Finding(
-            f"{ablation.title}: `{name}` is {told} than `{ablation.baseline}`"
+            f"{ablation.title}: `{name}` is {outcome} than `{ablation.baseline}`"
             f" ({specification.description}).",
             _value(results, ablation.probe, metric, difference),
             f"`{metric}`: {name} against {ablation.baseline}",
-            "holds" if told == "better" else "fails",
+            "holds" if outcome == "better" else "fails",
             _pair(results, ablation.probe, ablation.baseline, name, metric),
         )
         clearest[name] = (finding.picture is None, p, finding)
@@ -157,15 +156,16 @@ def _pair(results: Results, name: str, first: str, second: str, metric: str) -> 
     left, right = (results.views(name, variant, metric) for variant in (first, second))
     for content in contents:
         differences = {}
-        for scene, view, seed, shown in sorted(before.keys() & after.keys()):
+        for key in sorted(before.keys() & after.keys()):
+            scene, view, seed, pictured = key
             values = [side.get(scene, {}).get(f"{view}/{seed}", math.nan) for side in (left, right)]
-            if shown == content and math.isfinite(difference := abs(values[1] - values[0])):
-                differences[scene, view, seed, shown] = difference
+            if pictured == content and math.isfinite(difference := abs(values[1] - values[0])):
+                differences[key] = difference
         if differences:
-            key = max(differences, key=lambda k: differences[k])
-            title = f"{content.replace('-', ' ')}, {key[0]}, {key[1]}"
+            most = max(differences, key=lambda k: differences[k])
+            title = f"{content.replace('-', ' ')}, {most[0]}, {most[1]}"
             return Slider(
-                Picture(before[key].path, f"{title}: {first}"), Picture(after[key].path, second)
+                Picture(before[most].path, f"{title}: {first}"), Picture(after[most].path, second)
             )
     return None
 

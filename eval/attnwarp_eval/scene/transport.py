@@ -174,8 +174,8 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
 
 def fewest_bounces(spec: SceneSpec) -> int:
     """The least number of bounces that shows what every object of a scene is made of."""
-    shown = (item.material for item in spec.objects if not item.emission)
-    return max((_bounces_needed(material)[0] for material in shown), default=1)
+    materials = (item.material for item in spec.objects if not item.emission)
+    return max((_bounces_needed(material)[0] for material in materials), default=1)
 
 
 def _bounces_needed(material: Material) -> tuple[int, str]:

@@ -30,7 +30,8 @@ from attnwarp_eval.scene import transport
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.equivalence import paired_test
 from attnwarp_eval.truth.llvm import variant
-from attnwarp_eval.truth.plan import Bounces, convex, plan
+from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, build, comparable, render_plan
+from attnwarp_eval.truth.passes import Bounces, convex, plan_passes
 
 Array = npt.NDArray[np.float64]
 
@@ -178,8 +179,6 @@ def answer(scene: Scene) -> Answer:
     recorded = _recorded().get(key(scene))
     if recorded is not None:
         return recorded
-    from attnwarp_eval.truth.mitsuba import APPEARANCE_PROTOCOL, build
-
     place = content_key(
         key(scene), APPEARANCE_PROTOCOL, mitsuba.__version__, variant(), build.TEXELS
     )
@@ -224,8 +223,6 @@ Pictures = Callable[[Bounces, Camera, int], Array]
 def search(scene: Scene) -> Answer:
     """Measure how many bounces ``scene`` calls for; nothing is read from record or cache."""
     import mitsuba
-
-    from attnwarp_eval.truth.mitsuba import comparable
 
     small = scene.with_size(SIZE, SIZE)
     made_by = f"{mitsuba.__version__} {comparable(small)}"
@@ -292,8 +289,6 @@ def shortfall(pictures: Pictures, bounces: int, view: Camera) -> Shortfall:
 
 def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
     """Pictures of ``scene`` for :func:`shortfall`, from ``seed`` on; those made are kept."""
-    from attnwarp_eval.truth.mitsuba import build, comparable, render_plan
-
     made_by = comparable(scene)
     side = math.isqrt(PAIRS)
 
@@ -302,7 +297,7 @@ def pictures_of(scene: Scene, seed: int = 300_000) -> Pictures:
         # Both of a pair have one seed: in a variant that gives each sample random numbers of its
         # own the light of the first bounces is then the same.
         parts = max(1, spp // AT_ONCE)
-        planned, camera = plan(scene, spp // parts, bounces=bounces), scene.camera(name)
+        planned, camera = plan_passes(scene, spp // parts, bounces), scene.camera(name)
         fine = camera.resize(side * camera.width, side * camera.height)
         with build.at_most_texels(TEXELS):
             rendered = [

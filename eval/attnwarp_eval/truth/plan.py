@@ -1,41 +1,26 @@
-"""The cheapest rendering that is faithful to a scene.
+"""How a scene's pictures are made: with the bounces its file pins, or with the measured number.
 
-:func:`plan` follows from what the scene file says, without loading anything, but for the number of
-bounces where the file leaves it open (:mod:`attnwarp_eval.truth.bounces`). docs/effects.md has the
-reasons.
+:func:`plan` needs no loading, but for the number of bounces where the file leaves it open
+(:mod:`attnwarp_eval.truth.bounces`). docs/effects.md has the reasons.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import Literal
 
-import numpy as np
-import numpy.typing as npt
-
-from attnwarp_eval.scene import materials, transport
 from attnwarp_eval.scene.materials import Effect
-from attnwarp_eval.scene.scene import Scene, SceneError
-from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
+from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SkySpec
-
-if TYPE_CHECKING:
-    from attnwarp_eval.truth.bounces import Answer
-
-Array = npt.NDArray[np.float64]
-Integrator = Literal["direct", "path", "volpath", "ptracer"]
-Bounces = int | Literal["unlimited"]
-
-SMALL = 0.15
-"""A lamp counts as small when its radius is below this share of its distance from the glass. Paths
-from the camera find it by chance, about once in 4 / SMALL^2 = 180 tries, and the caustic comes out
-as single bright pixels."""
-
-ROULETTE = 5
-"""Paths without a cap are ended at random from this many edges on; Mitsuba's own default."""
-
-LIGHT_PATHS = 4
-"""Light paths for each camera sample: from the light, most paths end where no camera looks."""
+from attnwarp_eval.truth.bounces import answer
+from attnwarp_eval.truth.passes import (
+    ROULETTE,
+    Bounces,
+    Pass,
+    Plan,
+    check_plannable,
+    plan_passes,
+)
 
 DROPPABLE: tuple[Effect, ...] = (
     "interreflection",
@@ -50,110 +35,6 @@ DROPPABLE: tuple[Effect, ...] = (
 """Effects that a plan can leave out. The others come free with any picture: what shades a point has
 its texture.
 """
-
-
-@dataclass(frozen=True)
-class Pass:
-    """One rendering; the picture is the sum of the passes, since light adds up.
-
-    Attributes:
-        integrator: Mitsuba's plugin.
-        lights: indices of the scene's lights that shine in it.
-        lamps: whether the objects with an ``emission`` shine in it.
-        max_depth: longest path in edges from the camera; 2 is direct light, -1 has no end.
-        rr_depth: edges after which paths are ended at random; above ``max_depth`` never.
-        emitter_samples, bsdf_samples: rays toward lights and along the material's lobe at each hit
-            ("direct" only).
-        spp: samples a pixel; for "ptracer" light paths a pixel.
-        first: which camera rays count. "any"; "smooth", those whose first surface is smooth glass,
-            metal or a mirror, a lamp, or none at all; or "rough", the others, which are also those
-            that a ptracer pass makes.
-        beam: light only what lies in the direction of the smooth objects (a point light becomes a
-            spot upon them).
-        sign: -1 for a pass that is taken away.
-        aims_at_sky: whether points are connected to the sky as to other lights; without it only
-            rays spread by the materials find the sky.
-    """
-
-    lights: tuple[int, ...]
-    integrator: Integrator
-    max_depth: int
-    emitter_samples: int
-    bsdf_samples: int
-    spp: int
-    lamps: bool = False
-    rr_depth: int = ROULETTE
-    first: Literal["any", "smooth", "rough"] = "any"
-    beam: bool = False
-    sign: Literal[1, -1] = 1
-    aims_at_sky: bool = True
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A thin lens: radius and focus distance in scene units; ``focus`` None means what the cameras
-    look at.
-    """
-
-    aperture: float
-    focus: float | None
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How a picture is made, and why that suffices.
-
-    Attributes:
-        passes: the renderings that are added up; none where ray casting alone gives what is wanted.
-        media: whether fog and interiors are there.
-        lens: None for a pinhole.
-        reasons: for a person.
-    """
-
-    passes: tuple[Pass, ...]
-    reasons: tuple[str, ...]
-    media: bool = False
-    lens: Lens | None = None
-
-    @property
-    def integrator(self) -> str:
-        """The integrators in use, such as "direct" or "path + ptracer"; "raycast" where nothing is
-        rendered.
-        """
-        return " + ".join(dict.fromkeys(step.integrator for step in self.passes)) or "raycast"
-
-    @property
-    def sensor(self) -> str:
-        """Mitsuba's camera plugin."""
-        return "thinlens" if self.lens else "perspective"
-
-    def identity(self) -> dict[str, Any]:
-        """What decides the picture, without the reasons; goes into cache keys."""
-        return asdict(replace(self, reasons=()))
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON, for ``scenes effects --json``."""
-        return {
-            "integrator": self.integrator,
-            "sensor": {"type": self.sensor} | (asdict(self.lens) if self.lens else {}),
-            "sampler": sorted({sampler(step.spp) for step in self.passes}),
-            "filter": "box",
-            "media": self.media,
-            "passes": [asdict(step) for step in self.passes],
-            "reasons": list(self.reasons),
-        }
-
-
-def sampler(spp: int) -> str:
-    """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would
-    render more.
-    """
-    rows = int(np.sqrt(spp))
-    return "multijitter" if spp > 0 and rows * -(-spp // rows) == spp else "independent"
-
-
-# Planning
-# --------------------------------------------------------------------------------------------------
 
 
 def plan(
@@ -184,129 +65,14 @@ def plan(
                 ),
             ),
         )
-    wanted = scene.spec.appearance
-    if spp is not None and spp < 1:
-        raise ValueError(f"spp: got {spp}, expected at least 1")
-    spp = wanted.spp if spp is None else spp
-    for message, _ in transport.contradictions(scene.spec):
-        raise SceneError(message, scene.path)
-
-    reasons: list[str] = []
-    if bounces is None:
-        bounces = bounces_of(scene)
-        if wanted.bounces == "auto":
-            reasons.append(f"bounces: auto: {_measured(scene).words}")
-    needed = transport.called_for(scene.spec)
-    lights = scene.spec.lights
-    everything = tuple(range(len(lights)))
-    lamps = any(item.emission for item in scene.spec.objects)
-    media = "medium" in needed or "subsurface" in needed
-    lens = scene.spec.cameras.lens
-    optic = Lens(lens.aperture, lens.focus) if lens else None
-    if optic:
-        reasons.append("cameras.lens has an aperture: a thin lens instead of a pinhole")
-    depth = -1 if bounces == "unlimited" else bounces + 1
-    # Roulette would end paths at random: unbiased, but noise that a short path is not worth.
-    roulette = ROULETTE if depth < 0 else depth + 1
-    if depth != 2 and not media and convex(scene):
-        depth = 2
-        reasons.append("a single convex surface never lights itself: one bounce is all there is")
-
-    def finish(*passes: Pass) -> Plan:
-        return Plan(passes, tuple(reasons), media, optic)
-
-    if media:
-        reasons.append(
-            "light passes through a medium"
-            f" ({needed.get('medium') or needed['subsurface']}): volpath"
-        )
-        # Scattered light takes many short steps, of which roulette saves more than its noise costs.
-        return finish(Pass(everything, "volpath", depth, 1, 1, spp, lamps, ROULETTE))
-    if not {"specular", "glossy", "refraction"} & set(needed):
-        reasons.append(
-            "every material is diffuse and opaque: no path passes through glass or a medium, and"
-            " none is specular"
-        )
-    if depth != 2:
-        reasons.append(
-            f"{bounces} bounces: paths "
-            + ("until roulette ends them" if depth < 0 else f"of up to {depth} edges")
-        )
-        small = small_lights(scene) if "caustics" in needed and optic is None else None
-        if small is None:
-            only = Pass(everything, "path", depth, 1, 1, spp, lamps, roulette)
-            others = lamps or any(not isinstance(light, SkySpec) for light in lights)
-            sky = any(isinstance(light, SkySpec) for light in lights)
-            if sky and others and not {"specular", "refraction"} & set(needed):
-                only = replace(only, aims_at_sky=False)
-                reasons.append(
-                    "the sky is smooth: rays spread by the materials find it with less noise than"
-                    " rays toward it, which are left to the other lights"
-                )
-            return finish(only)
-        reasons.append(
-            f"light of {small} is bent by {needed['caustics'].split(',')[0]}: paths from the light"
-            " find its caustic"
-        )
-        reasons.append(
-            "camera paths still make what is seen in mirrors and through glass, lamps, and the"
-            " sky's light"
-        )
-        skies = tuple(k for k in everything if isinstance(lights[k], SkySpec))
-        points = tuple(k for k in everything if beam(scene, k) is not None)
-        rest = tuple(k for k in everything if k not in skies and k not in points)
-        passes = []
-        if rest or lamps:
-            passes += [
-                Pass(rest, "path", depth, 1, 1, spp, lamps, roulette, "smooth"),
-                Pass(rest, "ptracer", depth, 1, 1, LIGHT_PATHS * spp, lamps, roulette),
-            ]
-        for k in points:
-            # Outside the beam no light meets anything smooth first, so that camera paths find all
-            # of it; inside, paths from the light do. Light adds up: all - beam (both by camera
-            # paths) + beam (by light paths).
-            passes += [
-                Pass((k,), "path", depth, 1, 1, spp, False, roulette),
-                Pass((k,), "path", depth, 1, 1, spp, False, roulette, "rough", True, -1),
-                Pass((k,), "ptracer", depth, 1, 1, LIGHT_PATHS * spp, False, roulette, "any", True),
-            ]
-        if points:
-            reasons.append(
-                "of a point light only the beam upon the smooth objects is followed from the light"
-            )
-        if skies:
-            passes.append(Pass(skies, "path", depth, 1, 1, spp, False, roulette))
-        return finish(*passes)
-
-    reasons.append("one bounce: light sampled at each visible point is the whole sum")
-    glossy = "glossy" in needed
-    passes = []
-    # One direction or one point is one sample: its own pass has no noise but that of the pixel's
-    # area.
-    exact = [k for k in everything if not isinstance(lights[k], SkySpec)]
-    suns = [k for k in exact if lights[k].type == "sun"]
-    for group in ([tuple(suns)] if suns else []) + [(k,) for k in exact if k not in suns]:
-        passes.append(Pass(group, "direct", 2, 1, 0, spp))
-        what = (
-            "the sun comes from one direction"
-            if group == tuple(suns)
-            else f"the {lights[group[0]].type} has no size"
-        )
-        reasons.append(f"{what}, so its own pass has no noise but that of the pixel's area")
-    skies = tuple(k for k in everything if k not in exact)
-    if skies:
-        passes.append(Pass(skies, "direct", 2, int(glossy), 1, spp))
-        reasons.append(
-            "the sky is smooth, so rays spread by the material leave only the noise of what"
-            " covers it"
-        )
-    if lamps:
-        passes.append(Pass((), "direct", 2, 1, 1, spp, True))
-        reasons.append(
-            "lamps have a size: rays toward them and along the material, weighted against each"
-            " other"
-        )
-    return finish(*passes)
+    if bounces is not None:
+        return plan_passes(scene, spp, bounces)
+    pinned = scene.spec.appearance.bounces
+    if pinned != "auto":
+        return plan_passes(scene, spp, pinned)
+    check_plannable(scene, spp)
+    measured = answer(scene)
+    return plan_passes(scene, spp, measured.bounces, (f"bounces: auto: {measured.words}",))
 
 
 def bounces_of(scene: Scene) -> Bounces:
@@ -316,14 +82,7 @@ def bounces_of(scene: Scene) -> Bounces:
     wanted = scene.spec.appearance.bounces
     if wanted != "auto":
         return wanted
-    return _measured(scene).bounces
-
-
-def _measured(scene: Scene) -> Answer:
-    # Measuring renders plans of given numbers of bounces, which come from here.
-    from attnwarp_eval.truth.bounces import answer
-
-    return answer(scene)
+    return answer(scene).bounces
 
 
 def everything_on(scene: Scene, spp: int | None = None, *, capped: bool = True) -> Plan:
@@ -399,86 +158,3 @@ def without(scene: Scene, ours: Plan, effect: Effect) -> Plan:
             " of it"
         )
     return replace(ours, passes=passes)
-
-
-def convex(scene: Scene) -> bool:
-    """Whether a scene is a single convex surface, which never lights itself. Glass does: light
-    passes through it.
-    """
-    alone = len(scene.spec.objects) == 1 and not isinstance(
-        scene.spec.objects[0].material, materials.GlassMaterial
-    )
-    shapes = scene.shapes() if alone else []
-    return len(shapes) == 1 and isinstance(shapes[0], Box | Rectangle | Sphere)
-
-
-def small_lights(scene: Scene) -> str | None:
-    """Names the lights too small to be met by chance through smooth glass or a mirror; None where
-    there are none.
-    """
-    names: list[str] = [light.type for light in scene.spec.lights if light.type != "sky"]
-    names += [f"object {scene.spec.objects[k].name!r}" for k in small_lamps(scene)]
-    return ", ".join(names) or None
-
-
-def small_lamps(scene: Scene) -> list[int]:
-    """Indices of the objects that shine and are too small to be met by chance through smooth glass
-    or a mirror.
-    """
-    found_small: list[int] = []
-    lamps = [k for k, item in enumerate(scene.spec.objects) if item.emission]
-    if lamps:
-        bent = smooth_objects(scene)
-        boxes: dict[int, list[Array]] = {}
-        for shape in scene.shapes():
-            if shape.object_id in bent or shape.object_id in lamps:
-                boxes.setdefault(shape.object_id, []).append(shape.bounds())
-        middle = {k: np.mean([b.mean(0) for b in corners], axis=0) for k, corners in boxes.items()}
-        for k in lamps:
-            low, high = (
-                np.min([b[0] for b in boxes[k]], axis=0),
-                np.max([b[1] for b in boxes[k]], axis=0),
-            )
-            away = min(float(np.linalg.norm(middle[k] - middle[j])) for j in bent) if bent else 0.0
-            if float(np.linalg.norm(high - low)) / 2 < SMALL * away:
-                found_small.append(k)
-    return found_small
-
-
-BEAM_MARGIN = 1.05
-"""How much wider than the sphere about the smooth objects a beam upon them is; Mitsuba's spots fall
-off at their rim.
-"""
-
-
-def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
-    """The cone in which a point light sees all smooth objects: its axis (not unit) and half angle
-    in degrees.
-
-    None for other lights, or where the cone would be wider than 60 degrees: then it saves little.
-    """
-    spec = scene.spec.lights[light]
-    smooth = smooth_objects(scene)
-    if spec.type != "point" or not smooth:
-        return None
-    bounds = [shape.bounds() for shape in scene.shapes() if shape.object_id in smooth]
-    low, high = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
-    axis = (low + high) / 2 - np.array(spec.position)
-    reach = BEAM_MARGIN * float(np.linalg.norm(high - low)) / 2 / float(np.linalg.norm(axis))
-    if reach >= 1 or np.degrees(np.arcsin(reach)) > 60:
-        return None
-    return axis, float(np.degrees(np.arcsin(reach)))
-
-
-def smooth_objects(scene: Scene) -> list[int]:
-    """Indices of the objects that reflect or refract without scattering: mirrors, polished metal,
-    clear glass.
-    """
-    kinds = materials.MirrorMaterial | materials.MetalMaterial | materials.GlassMaterial
-    return [
-        k
-        for k, item in enumerate(scene.spec.objects)
-        if not item.emission
-        and isinstance(item.material, kinds)
-        and not getattr(item.material, "roughness", 0.0)
-    ]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from attnwarp.errors import InputError, suggest
+from attnwarp.io.picture import encode_picture
 from attnwarp_eval.report import read_results
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.store import Store
@@ -141,9 +142,7 @@ def scrambled(data: bytes, seed: int) -> bytes:
     tiles = pixels[: h * TILES, : w * TILES].reshape(TILES, h, TILES, w, 3).swapaxes(1, 2)
     order = np.random.default_rng(seed).permutation(TILES * TILES)
     moved = tiles.reshape(-1, h, w, 3)[order].reshape(TILES, TILES, h, w, 3).swapaxes(1, 2)
-    buffer = io.BytesIO()
-    Image.fromarray(moved.reshape(h * TILES, w * TILES, 3)).save(buffer, "JPEG", quality=85)
-    return buffer.getvalue()
+    return encode_picture(moved.reshape(h * TILES, w * TILES, 3), ".jpg", chroma="420")
 
 
 def of_views(item: Item, files: Mapping[str, Path]) -> list[bytes]:

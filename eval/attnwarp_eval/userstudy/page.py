@@ -71,14 +71,14 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
         files.update(zip(names, pictures, strict=True))
         return names
 
-    shown = []
+    entries = []
     for number, item in enumerate(items):
         sides = {name: of_views(item, own) for name, own in item.methods.items()}
         checks = [c for plan in plans for c in plan if c.is_check and c.item == number]
         if checks:
             first = next(iter(sides.values()))
             sides[SCRAMBLED] = [scrambled(data, design.seed) for data in first]
-        shown.append(
+        entries.append(
             {
                 **{key: getattr(item, key) for key in ("scene", "edit", "seed", "instruction")},
                 "before": named(of_views(item, item.before)),
@@ -89,7 +89,7 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
         "format": FORMAT,
         "title": title,
         "questions": {name: QUESTIONS[name] for name in design.questions},
-        "items": shown,
+        "items": entries,
         "plans": [[_row(choice) for choice in plan] for plan in plans],
     }
     study["study"] = digest(study)

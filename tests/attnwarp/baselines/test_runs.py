@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from edit_folders import Killed, events, files, without_start_protocol
 from tiny_baselines import QUICK, rows_of
 
 from attnwarp import Camera
@@ -24,15 +24,6 @@ from attnwarp.baselines import (
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate.pictures import to_bytes
-
-
-def files(folder):
-    """Everything that has to be the same after a kill: all but the seconds."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(Path(folder).rglob("*"))
-        if path.is_file() and path.name != "times.json"
-    }
 
 
 @pytest.fixture(scope="module")
@@ -82,37 +73,12 @@ def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth
 # --- killed and resumed
 
 
-class Killed(BaseException):
-    """Leaves the files as a kill would: nothing catches it but the atomic write."""
-
-
 def killed_at(run, name, folder, moment):
     """Die at a step of progress or at a write, before it or after it; whether it came so far."""
-    from attnwarp.fit import checkpoint
-    from attnwarp.io import ply
-    from attnwarp.propagate import folder as folders
-
-    count = 0
-
-    def event(*_):
-        nonlocal count
-        count += 1
-        if count == moment:
-            raise Killed
-
-    def wrapped(write):
-        def around(*args, **kwargs):
-            event()
-            write(*args, **kwargs)
-            event()
-
-        return around
-
     with pytest.MonkeyPatch.context() as patch:
-        for module in (checkpoint, ply, folders):
-            patch.setattr(module, "write_atomically", wrapped(module.write_atomically))
+        progress, _ = events(patch, moment)
         try:
-            run(name, folder=folder, progress=event, checkpoint_seconds=0)
+            run(name, folder=folder, progress=progress, checkpoint_seconds=0)
         except Killed:
             return True
     return False
@@ -271,10 +237,7 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
 def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(run, tmp_path):
     noised = IGS2GSSettings(steps=1, iterations=0)
     run("igs2gs", noised, folder=tmp_path)
-    path = tmp_path / "manifest.json"
-    manifest = json.loads(path.read_text())
-    del manifest["start_protocol"]  # as folders had it when a start was such a step
-    path.write_text(json.dumps(manifest))
+    without_start_protocol(tmp_path)
     before = files(tmp_path)
     with pytest.raises(
         InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"

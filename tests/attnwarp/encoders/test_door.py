@@ -58,11 +58,11 @@ def test_bundled_ones_are_described():
 
 
 def test_an_installation_without_bundled_weights_says_so(monkeypatch):
-    found = importlib.util.find_spec
+    result = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
-        lambda name, *a: None if name.endswith("bundled") else found(name),
+        lambda name, *a: None if name.endswith("bundled") else result(name),
     )
     with pytest.raises(
         InputError, match="carries no bundled weights; name a real one: clip:FOLDER"

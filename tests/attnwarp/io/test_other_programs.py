@@ -1,4 +1,4 @@
-"""The table of docs/files.md, row by row: what other programs do with our files, and we with theirs.
+"""The table of docs/other-programs.md, row by row: what others do with our files, and we with theirs.
 
 Each row has a check here, which runs where its program is installed; in CI, a missing one is a failure.
 scripts/venv.sh installs splat-transform into the environment; elsewhere the one on the PATH is taken
@@ -29,7 +29,7 @@ from attnwarp.io import (
     write_splat,
 )
 
-PAGE = Path(__file__).parents[3] / "docs" / "files.md"
+PAGE = Path(__file__).parents[3] / "docs" / "other-programs.md"
 
 
 def splats(kind="3d", **more):
@@ -205,8 +205,8 @@ CHECKS = {
 
 def table():
     """(program, version, file, result) of each row."""
-    section = PAGE.read_text().split("## Other programs")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| ([^|]+) \| ([\d.]+) \| ([^|]+) \| ([^|]+) \|$", section, re.MULTILINE)
+    text = PAGE.read_text()
+    rows = re.findall(r"^\| ([^|]+) \| ([\d.]+) \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
     return [tuple(cell.strip().replace("`", "") for cell in row) for row in rows]
 
 

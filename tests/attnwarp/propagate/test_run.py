@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from edit_folders import Killed, events, files, without_start_protocol
 from tiny_baselines import rows_of
 from tiny_editors import nearest_steps
 from tiny_scenes import cameras, pictures, splats
@@ -23,15 +24,6 @@ from attnwarp.warp import Surface, warp_surfaces
 from attnwarp.warp import preset as warp_preset
 
 QUICK = preset("corrected", stages=2, views_per_stage=2, steps=2, iterations=3)
-
-
-def files(folder):
-    """Everything that has to be the same after a kill: all but the seconds."""
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(Path(folder).rglob("*"))
-        if path.is_file() and path.name != "times.json"
-    }
 
 
 def run(scene, editor, folder=None, settings=QUICK, words="a bear", **more):
@@ -253,37 +245,6 @@ def test_a_recording_on_disk_gives_the_same_bytes_and_goes_away(finished, scene,
     assert not (tmp_path / ".recording").exists()
 
 
-class Killed(BaseException):
-    """Leaves the files as a kill would: nothing catches it but the atomic write."""
-
-
-def events(monkeypatch, stop):
-    """Count steps of progress and writes; die at number ``stop``, before a write or after it."""
-    from attnwarp.fit import checkpoint
-    from attnwarp.io import ply
-    from attnwarp.propagate import folder
-
-    count = 0
-
-    def event(*_):
-        nonlocal count
-        count += 1
-        if count == stop:
-            raise Killed
-
-    def wrapped(write):
-        def around(*args, **kwargs):
-            event()
-            write(*args, **kwargs)
-            event()
-
-        return around
-
-    for module in (checkpoint, ply, folder):
-        monkeypatch.setattr(module, "write_atomically", wrapped(module.write_atomically))
-    return event, lambda: count
-
-
 def killed_and_resumed(scene, editor, folder, moments):
     """Kill a run at one moment after another, each counted from where the last sitting began."""
     for moment in moments:
@@ -356,10 +317,7 @@ def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(
 ):
     settings = preset("released", stages=1, views_per_stage=1, steps=1, iterations=0)
     run(scene, editor, tmp_path, settings)
-    path = tmp_path / "manifest.json"
-    manifest = json.loads(path.read_text())
-    del manifest["start_protocol"]  # as folders had it when a start was such a step
-    path.write_text(json.dumps(manifest))
+    without_start_protocol(tmp_path)
     before = files(tmp_path)
     with pytest.raises(
         InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"

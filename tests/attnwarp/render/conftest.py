@@ -11,18 +11,6 @@ import torch
 from attnwarp import Camera, Gaussians
 from attnwarp_eval.stability.rendered import front_camera, quaternion_to, splats
 
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
-"""The differentiable fields of a Render."""
-
 
 def camera_of(seed: int, width: int, height: int) -> Camera:
     """A camera near (0, -3, 0.3) with unequal focal lengths, skew and an off-centre principal

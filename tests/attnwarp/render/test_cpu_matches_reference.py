@@ -13,7 +13,8 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, cpu, render
-from benchmarks.precision import MODES, OUTPUTS, excess, mixed_scales, prepared
+from attnwarp.render.interface import OUTPUTS
+from benchmarks.precision import MODES, excess, mixed_scales, prepared
 
 
 @pytest.mark.usefixtures("one_thread")

@@ -13,18 +13,9 @@ import torch
 
 from attnwarp import Camera, Gaussians
 from attnwarp.render import binned, constants, render
+from attnwarp.render.interface import OUTPUTS
 
 BACKENDS = ("reference", "cpu")
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

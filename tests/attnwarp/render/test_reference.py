@@ -13,18 +13,9 @@ import torch
 from attnwarp import Gaussians
 from attnwarp.render import constants, harmonics, render
 from attnwarp.render.api import normal_from_depth
+from attnwarp.render.interface import OUTPUTS
 
 BACKENDS = ("reference", "cpu")
-OUTPUTS = (
-    "color",
-    "alpha",
-    "depth",
-    "median_depth",
-    "normal",
-    "distortion_l1",
-    "distortion_l2_ndc",
-    "weight",
-)
 
 
 @pytest.mark.usefixtures("one_thread")
@@ -222,9 +213,9 @@ def test_a_plane_of_splats_gives_the_planes_depth_by_intersection(
         by_center = render(plane, camera, backend=backend, depth="center")
         assert float((by_center.depth - exact).abs()[seen].mean()) > 0.001
     # And the surface's normal from depth is the plane's.
-    found = view.normal_from_depth[seen & ~view.normal_from_depth.isnan().any(-1)].double()
-    assert len(found) > 50
-    assert float((found @ torch.tensor(normal)).min()) > (
+    result = view.normal_from_depth[seen & ~view.normal_from_depth.isnan().any(-1)].double()
+    assert len(result) > 50
+    assert float((result @ torch.tensor(normal)).min()) > (
         1 - 1e-9 if backend == "reference" else 0.99
     )
 

@@ -101,19 +101,19 @@ def test_the_whole_row_is_what_the_encoders_and_pixels_give(data, models):
     folder, arrays = data
     done = everything(folder, models)
     assert done.exit_code == 0, done.output
-    found = saved(folder)["metrics"]
+    result = saved(folder)["metrics"]
     renders, edited, originals = (
         {v: a.astype(np.float64) / 255 for v, a in arrays[g].items()}
         for g in ("renders", "edited", "originals")
     )
     errors = [((edited[v] - renders[v]) ** 2).mean() for v in VIEWS]
     expected = {v: -10 * math.log10(e) for v, e in zip(VIEWS, errors, strict=True)}
-    assert list(found["edit.psnr_mean"]["views"]) == list(VIEWS)  # view2 before view10
-    assert found["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
-    assert found["edit.psnr_mean"]["value"] == pytest.approx(
+    assert list(result["edit.psnr_mean"]["views"]) == list(VIEWS)  # view2 before view10
+    assert result["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
+    assert result["edit.psnr_mean"]["value"] == pytest.approx(
         np.mean(list(expected.values())), abs=1e-4
     )
-    assert found["edit.psnr_pooled"]["value"] == pytest.approx(
+    assert result["edit.psnr_pooled"]["value"] == pytest.approx(
         -10 * math.log10(np.mean(errors)), abs=1e-4
     )
 
@@ -132,12 +132,12 @@ def test_the_whole_row_is_what_the_encoders_and_pixels_give(data, models):
                 cosine(dino.images([renders[v]]), dino.images([arrays["source"] / 255])),
             ),
         ):
-            assert found[f"embedding.{key}"]["views"][v] == pytest.approx(value, abs=1e-4)
+            assert result[f"embedding.{key}"]["views"][v] == pytest.approx(value, abs=1e-4)
     lpips = load_encoder(models["perceptual"]).distance(
         list(edited.values()), list(renders.values())
     )
-    assert found["perceptual.distance"]["value"] == pytest.approx(lpips.mean(), rel=1e-4)
-    for key, row in found.items():
+    assert result["perceptual.distance"]["value"] == pytest.approx(lpips.mean(), rel=1e-4)
+    for key, row in result.items():
         assert (row["unit"], row["direction"]) == (metric(key).unit, metric(key).direction) and row[
             "n"
         ] == 3
@@ -254,9 +254,9 @@ def test_pictures_without_a_partner_are_named_and_left_out(data, models):
     assert done.exit_code == 0, done.output
     assert "1 of --renders without one in --edited: view2" in done.stderr
     assert "1 of --edited without one in --renders: extra" in done.stderr
-    found = saved(folder)["metrics"]
-    assert list(found["edit.psnr_mean"]["views"]) == ["view1", "view10"]
-    assert list(found["embedding.clip_similarity"]["views"]) == list(VIEWS)
+    result = saved(folder)["metrics"]
+    assert list(result["edit.psnr_mean"]["views"]) == ["view1", "view10"]
+    assert list(result["embedding.clip_similarity"]["views"]) == list(VIEWS)
 
 
 def test_names_that_never_meet_are_told_apart(data):
@@ -310,19 +310,19 @@ def test_views_beyond_one_batch_and_pairs_with_holes_keep_their_own_values(tmp_p
             write(tmp_path / group / f"{name}.png", arrays[group][name])
     write(tmp_path / "edit.png", arrays["edited"]["1"])
     assert everything(tmp_path, models).exit_code == 0
-    found = saved(tmp_path)["metrics"]
+    result = saved(tmp_path)["metrics"]
     clip = load_encoder(models["clip"])
     (source,) = clip.images([arrays["edited"]["1"] / 255])
     expected = {n: cosine(clip.images([arrays["renders"][n] / 255])[0], source) for n in names}
-    assert found["embedding.clip_image"]["views"] == pytest.approx(expected, abs=1e-5)
-    assert list(found["embedding.clip_directional"]["views"]) == here["originals"]
+    assert result["embedding.clip_image"]["views"] == pytest.approx(expected, abs=1e-5)
+    assert list(result["embedding.clip_directional"]["views"]) == here["originals"]
     errors = {
         n: (((arrays["edited"][n] / 255.0) - (arrays["renders"][n] / 255.0)) ** 2).mean()
         for n in here["edited"]
     }
     expected = {n: -10 * math.log10(e) for n, e in errors.items()}
-    assert found["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
-    assert found["edit.psnr_pooled"]["value"] == pytest.approx(
+    assert result["edit.psnr_mean"]["views"] == pytest.approx(expected, abs=1e-4)
+    assert result["edit.psnr_pooled"]["value"] == pytest.approx(
         -10 * math.log10(np.mean(list(errors.values()))), abs=1e-4
     )
 
@@ -608,11 +608,11 @@ def test_a_default_that_is_not_installed_costs_its_figures_but_one_that_was_name
 ):
     import importlib.util
 
-    found = importlib.util.find_spec
+    result = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
-        lambda name, *a: None if name.endswith("bundled") else found(name),
+        lambda name, *a: None if name.endswith("bundled") else result(name),
     )
     folder, _ = data
     pairs = (

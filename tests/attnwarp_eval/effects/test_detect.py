@@ -22,7 +22,8 @@ from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.truth import Geometry, mitsuba
 from attnwarp_eval.truth.mitsuba import build
-from attnwarp_eval.truth.plan import Pass, Plan, beam, plan
+from attnwarp_eval.truth.passes import Pass, Plan, beam
+from attnwarp_eval.truth.plan import plan
 from attnwarp_eval.truth.shading import emitted, irradiance, object_albedo
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
@@ -43,9 +44,9 @@ EXPECTED = {
 @pytest.mark.parametrize("name", list(SCENES))
 def test_each_effect_is_found_in_the_scene_that_calls_for_it_and_planned(name):
     scene = SCENES[name]()
-    found = detect.detect(scene)
+    result = detect.detect(scene)
     if name != "diffuse":
-        assert found[name].needed and found[name].simulated and found[name].source == "detected"
+        assert result[name].needed and result[name].simulated and result[name].source == "detected"
     made = plan(scene)
     assert (made.integrator, made.sensor) == EXPECTED[name]
     # Nothing is needed that the scene has no cause for.
@@ -58,14 +59,14 @@ def test_each_effect_is_found_in_the_scene_that_calls_for_it_and_planned(name):
         "motion",
         "dispersion",
     ):
-        assert found[other].needed == (other == name)
+        assert result[other].needed == (other == name)
 
 
 def test_evidence_names_the_words_of_the_file_and_what_mitsuba_made_of_them():
-    found = detect.detect(SCENES["refraction"]())
-    assert "object 'ball' is glass" in found["refraction"].evidence
-    assert any("plugin dielectric" in e for e in found["refraction"].evidence)
-    assert any("BSDF flag Delta" in e for e in found["specular"].evidence)
+    result = detect.detect(SCENES["refraction"]())
+    assert "object 'ball' is glass" in result["refraction"].evidence
+    assert any("plugin dielectric" in e for e in result["refraction"].evidence)
+    assert any("BSDF flag Delta" in e for e in result["specular"].evidence)
     assert any(
         "ThinLens" in e or "thinlens" in e
         for e in detect.detect(SCENES["depth_of_field"]())["depth_of_field"].evidence
@@ -85,22 +86,24 @@ def test_a_file_and_a_loaded_scene_that_disagree_are_refused(monkeypatch):
 
 def test_glossy_things_smooth_shading_and_textures_are_told_apart():
     gold = ball({"type": "metal", "metal": "Au", "roughness": 0.2})
-    found = detect.detect(make([FLOOR, gold], [SUN, SKY]))
-    assert found["glossy"].needed and not found["specular"].needed and not found["caustics"].needed
-    assert not found["textures"].needed
+    result = detect.detect(make([FLOOR, gold], [SUN, SKY]))
+    assert (
+        result["glossy"].needed and not result["specular"].needed and not result["caustics"].needed
+    )
+    assert not result["textures"].needed
     checked = FLOOR | {
         "texture": {"type": "checker", "colors": ["#ffffff", "#404040"], "size": 0.5}
     }
-    found = detect.detect(make([checked, ball()], [SUN, SKY]))
-    assert found["textures"].needed and any("Bitmap" in e for e in found["textures"].evidence)
+    result = detect.detect(make([checked, ball()], [SUN, SKY]))
+    assert result["textures"].needed and any("Bitmap" in e for e in result["textures"].evidence)
 
 
 def test_what_is_not_simulated_is_named():
     moving = ball() | {"velocity": [1, 0, 0]}
     prism = ball(GLASS | {"abbe": 30}, (1, 1, 0.4), 0.3, "prism")
-    found = detect.detect(make([FLOOR, moving, prism], [SKY], 8))
+    result = detect.detect(make([FLOOR, moving, prism], [SKY], 8))
     for name in ("motion", "dispersion", "polarisation"):
-        assert found[name].needed and not found[name].simulated
+        assert result[name].needed and not result[name].simulated
     text = "\n".join(
         detect.describe(make([FLOOR, moving], [SKY]), detect.report(make([FLOOR, moving], [SKY])))
     )
@@ -109,8 +112,8 @@ def test_what_is_not_simulated_is_named():
 
 def test_a_caustic_behind_a_lens_is_named_as_not_simulated():
     scene = make([FLOOR, ball(GLASS)], [POINT], 8, cameras={"lens": {"aperture": 0.1}})
-    found = detect.detect(scene)
-    assert found["caustics"].needed and not found["caustics"].simulated
+    result = detect.detect(scene)
+    assert result["caustics"].needed and not result["caustics"].simulated
     structure = proof.prove(scene, seconds=0.1).rungs[0]
     assert "caustics" in structure.words and "not proved" in structure.words
 
@@ -127,12 +130,12 @@ def test_a_scene_that_calls_for_what_is_not_simulated_is_never_certified():
         (SCENES["refraction"](), "polarisation"),
         (mirrors, "caustics seen in mirrors and through glass"),
     ):
-        found = proof.prove(scene, against=plan(scene), size=8)
-        assert found.of_simulated in ("certified", "can't tell"), list(found.lines())
-        assert found.verdict == "can't tell" and missing in found.not_simulated
+        result = proof.prove(scene, against=plan(scene), size=8)
+        assert result.of_simulated in ("certified", "can't tell"), list(result.lines())
+        assert result.verdict == "can't tell" and missing in result.not_simulated
     still = make([FLOOR, ball()], [SKY])
-    found = proof.prove(still, against=plan(still), size=8)
-    assert (found.verdict, found.of_simulated, found.not_simulated) == (
+    result = proof.prove(still, against=plan(still), size=8)
+    assert (result.verdict, result.of_simulated, result.not_simulated) == (
         "certified",
         "certified",
         (),

@@ -14,7 +14,8 @@ from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.transport import called_for
 from attnwarp_eval.statistics.equivalence import equivalence
 from attnwarp_eval.truth.mitsuba import render_plan
-from attnwarp_eval.truth.plan import DROPPABLE, Lens, everything_on, plan, without
+from attnwarp_eval.truth.passes import Lens
+from attnwarp_eval.truth.plan import DROPPABLE, everything_on, plan, without
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 
@@ -91,13 +92,13 @@ def test_a_difference_of_two_percent_is_found_every_time_and_never_certified():
 
 def test_a_difference_in_one_block_only_is_found_where_the_whole_picture_hides_it():
     rng = np.random.default_rng(5)
-    found = 0
+    result = 0
     for _ in range(20):
         a, b = noise(rng), noise(rng)
         b[:, :8, :8] += 0.03
         levels = {level.name: level.differs for level in proof.levels(a, b)}
-        found += levels["block"]
-    assert found == 20
+        result += levels["block"]
+    assert result == 20
 
 
 def test_equivalence_certifies_the_equal_and_hardly_ever_what_lies_on_its_margin():
@@ -122,9 +123,9 @@ def test_noise_too_great_for_the_margin_is_not_certified_though_nothing_differs(
 def test_the_stated_smallest_difference_is_found_four_times_in_five():
     rng = np.random.default_rng(8)
     stated = np.mean([proof.levels(noise(rng), noise(rng))[-1].detectable for _ in range(50)])
-    found = [proof.levels(noise(rng), noise(rng) + stated)[-1].differs for _ in range(200)]
+    result = [proof.levels(noise(rng), noise(rng) + stated)[-1].differs for _ in range(200)]
     # 80 % of 200; 99.9 % of binomial counts lie within 140 and 178.
-    assert 140 <= sum(found) <= 178
+    assert 140 <= sum(result) <= 178
 
 
 def synthetic(trial, kind="normal", brighter=1.0):
@@ -154,19 +155,19 @@ def synthetic(trial, kind="normal", brighter=1.0):
     ],
 )
 def test_over_200_true_nulls_the_whole_ladder_refuses_at_its_stated_rate(kind, alpha, range_):
-    found = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
+    result = [proof.climb(synthetic(trial, kind), alpha=alpha).verdict for trial in range(200)]
     # 99.9 % of binomial counts of 200 trials lie below the upper ends. Levels made of the same
     # pixels refuse together, so that the whole keeps a little below its rate. At 20 %, two rungs at
     # the full rate each would refuse about 70.
-    assert range_[0] <= found.count("refused") <= range_[1]
-    assert found.count("certified") == 200 - found.count("refused")
+    assert range_[0] <= result.count("refused") <= range_[1]
+    assert result.count("certified") == 200 - result.count("refused")
 
 
 @pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
 def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
-    found = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
-    assert {one.verdict for one in found} == {"refused"}
-    assert all(any(rung.passed is False for rung in one.rungs) for one in found)
+    result = [proof.climb(synthetic(1000 + trial, kind, 1.02)) for trial in range(100)]
+    assert {one.verdict for one in result} == {"refused"}
+    assert all(any(rung.passed is False for rung in one.rungs) for one in result)
 
 
 # On real pictures
@@ -176,18 +177,18 @@ def test_the_whole_ladder_refuses_two_percent_more_light_every_time(kind):
 @pytest.mark.parametrize("name", ["diffuse", "refraction", "medium", "depth_of_field"])
 def test_the_plan_of_a_scene_is_certified(name):
     # A budget for a busy machine; a quiet one needs a few seconds of it.
-    found = proof.prove(SCENES[name](), seconds=180)
-    assert found.of_simulated == "certified", list(found.lines())
+    result = proof.prove(SCENES[name](), seconds=180)
+    assert result.of_simulated == "certified", list(result.lines())
     # Glass polarises light, which no picture here shows.
-    assert found.verdict == ("can't tell" if name == "refraction" else "certified")
-    assert found.rungs[0].name == "structure" and found.detectable
+    assert result.verdict == ("can't tell" if name == "refraction" else "certified")
+    assert result.rungs[0].name == "structure" and result.detectable
 
 
 @pytest.mark.parametrize("effect", DROPPABLE)
 def test_dropping_an_effect_from_a_scene_that_needs_it_is_refused_by_the_statistics_alone(effect):
     scene = SCENES[effect]()
-    found = proof.prove(scene, without(scene, plan(scene), effect), seconds=8, structure=False)
-    assert found.verdict == "refused", list(found.lines())
+    result = proof.prove(scene, without(scene, plan(scene), effect), seconds=8, structure=False)
+    assert result.verdict == "refused", list(result.lines())
 
 
 REASONS = {
@@ -205,9 +206,9 @@ REASONS = {
 @pytest.mark.parametrize("effect", DROPPABLE)
 def test_dropping_what_the_graphs_show_is_refused_before_anything_is_rendered(effect):
     scene = SCENES[effect]()
-    found = proof.prove(scene, without(scene, plan(scene), effect))
-    assert found.verdict == "refused" and [rung.name for rung in found.rungs] == ["structure"]
-    assert re.search(REASONS[effect], found.rungs[0].words), found.rungs[0].words
+    result = proof.prove(scene, without(scene, plan(scene), effect))
+    assert result.verdict == "refused" and [rung.name for rung in result.rungs] == ["structure"]
+    assert re.search(REASONS[effect], result.rungs[0].words), result.rungs[0].words
 
 
 GLOBE = {
@@ -271,8 +272,8 @@ def test_a_plan_with_something_missing_is_refused_by_its_structure_with_the_reas
     good = plan(made)
     assert not list(proof._lacks(made, good, caustic="caustics" in called_for(made.spec)))
     bad = replace(good, passes=tuple(change(list(good.passes))))
-    found = list(proof._lacks(made, bad, caustic="caustics" in called_for(made.spec)))
-    assert re.search(words, "; ".join(found)), found
+    result = list(proof._lacks(made, bad, caustic="caustics" in called_for(made.spec)))
+    assert re.search(words, "; ".join(result)), result
 
 
 @pytest.mark.parametrize("name", list(SCENES))
@@ -310,11 +311,11 @@ def test_a_light_two_percent_too_bright_is_refused():
 
 def test_too_little_time_ends_in_cannot_tell_and_says_what_could_have_been_seen():
     scene = SCENES["caustics"]()
-    found = proof.prove(scene, seconds=0.1)
-    assert found.verdict == "can't tell", list(found.lines())
-    assert found.rungs[-1].name == "equivalence" and found.rungs[-1].passed is None
-    assert found.detectable["picture"] > 0.01
-    assert any("smallest difference" in line for line in found.lines())
+    result = proof.prove(scene, seconds=0.1)
+    assert result.verdict == "can't tell", list(result.lines())
+    assert result.rungs[-1].name == "equivalence" and result.rungs[-1].passed is None
+    assert result.detectable["picture"] > 0.01
+    assert any("smallest difference" in line for line in result.lines())
 
 
 @pytest.mark.slow
@@ -338,8 +339,10 @@ def test_over_200_true_nulls_of_real_pictures_it_refuses_at_its_stated_rate(name
 
 @pytest.mark.slow
 def test_the_caustic_of_a_point_light_is_certified_but_for_what_is_not_simulated_when_there_is_time():
-    found = proof.prove(SCENES["caustics"](), seconds=240)
-    assert (found.verdict, found.of_simulated) == ("can't tell", "certified"), list(found.lines())
+    result = proof.prove(SCENES["caustics"](), seconds=240)
+    assert (result.verdict, result.of_simulated) == ("can't tell", "certified"), list(
+        result.lines()
+    )
 
 
 def test_everything_on_is_never_volpathmis():

@@ -14,7 +14,7 @@ from attnwarp import Gaussians
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.inspect import scene
 from attnwarp_eval.inspect.cell import cell_report
-from attnwarp_eval.inspect.export import export
+from attnwarp_eval.inspect.export import write_export
 from attnwarp_eval.inspect.pixel import report
 from attnwarp_eval.inspect.scene import State
 from attnwarp_eval.study.schema import Splats
@@ -98,7 +98,7 @@ def test_a_flight_goes_evenly_from_one_camera_to_the_other(pair, chosen):
 
 def test_a_vtp_file_holds_every_number_of_its_pixels(few, tmp_path):
     pair = few.pair("corrected", "yaw060")
-    export(tmp_path / "a.vtp", few, STATE)
+    write_export(tmp_path / "a.vtp", few, STATE)
     mesh = pyvista.read(tmp_path / "a.vtp")
     assert mesh.n_points == int(pair.truth.hits.valid.sum())
     pixel = int(mesh.point_data["pixel"][1000])
@@ -116,7 +116,7 @@ def test_a_vtp_file_holds_every_number_of_its_pixels(few, tmp_path):
 def test_a_glb_file_is_read_by_trimesh_with_colours_in_place_and_upright(few, tmp_path):
     pair = few.pair("corrected", "yaw060")
     picked = report(pair, 30, 40)
-    export(tmp_path / "a.glb", few, replace(STATE, splats=True, surface=True), picked)
+    write_export(tmp_path / "a.glb", few, replace(STATE, splats=True, surface=True), picked)
     loaded = trimesh.load(tmp_path / "a.glb")
     names = {"seen", "discs", "whole surface", "source frustum", "target picture", "target ray"}
     nodes = {str(node).split("_")[0] for node in loaded.graph.nodes_geometry}

@@ -47,13 +47,13 @@ def test_a_painted_scene_disagrees_by_no_more_than_bilinear_sampling_errs(sphere
     for size in (64, 128):
         pair = pair_of(spheres, yaw, size)
         source, target = (painted(spheres, camera) for camera in (pair.source, pair.target))
-        found = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
-        assert found.counted.sum() > 400 * (size / 64) ** 2
-        errors[size] = np.abs(found.linear[found.counted])
+        result = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
+        assert result.counted.sum() > 400 * (size / 64) ** 2
+        errors[size] = np.abs(result.linear[result.counted])
         # The error of linear interpolation is at most (|f_xx| + |f_yy|) / 8, in units of the
         # largest second difference near the taps; half as much again for what differences over a
         # pixel miss of a derivative.
-        row, column = np.floor(pair.xy[found.counted][:, ::-1]).astype(int).T
+        row, column = np.floor(pair.xy[result.counted][:, ::-1]).astype(int).T
         bound = sum(
             np.max([np.abs(np.roll(second, shift, (0, 1))) for shift in np.ndindex(3, 3)], axis=0)
             for second in (
@@ -103,11 +103,11 @@ def test_a_planted_shift_of_colour_comes_back_exactly(spheres, yaw):
     xy = torch.from_numpy(pair.xy)
     sampled = sample_at(torch.from_numpy(source.transpose(2, 0, 1)), xy).numpy().transpose(1, 2, 0)
     target = np.clip(sampled + shift, 0, 1)
-    found = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
+    result = metrics.cross_view(to_srgb(source), to_srgb(target), pair)
     np.testing.assert_allclose(
-        found.linear[found.counted], np.broadcast_to(shift, (found.counted.sum(), 3)), atol=1e-6
+        result.linear[result.counted], np.broadcast_to(shift, (result.counted.sum(), 3)), atol=1e-6
     )
-    figures = found.figures()
+    figures = result.figures()
     assert figures["consistency.mae_linear"] == pytest.approx(np.abs(shift).mean(), abs=1e-6)
     assert figures["consistency.rmse_linear"] == pytest.approx(np.sqrt((shift**2).mean()), abs=1e-6)
 
@@ -117,8 +117,8 @@ def test_a_slip_of_a_ramp_is_its_slope_times_the_slip(spheres):
     camera = pair_of(spheres, 10, 64).source
     pair = two_view(spheres, camera, camera)
     ramp = 0.1 + 0.01 * np.broadcast_to(np.arange(64.0)[None, :, None], (64, 64, 3))
-    found = metrics.cross_view(to_srgb(ramp), to_srgb(ramp + 0.03), pair)
-    np.testing.assert_allclose(found.linear[found.counted], 0.03, atol=1e-12)
+    result = metrics.cross_view(to_srgb(ramp), to_srgb(ramp + 0.03), pair)
+    np.testing.assert_allclose(result.linear[result.counted], 0.03, atol=1e-12)
 
 
 def test_delta_e_of_greys_has_its_closed_form(spheres):
@@ -145,18 +145,18 @@ def test_delta_e_of_greys_has_its_closed_form(spheres):
 def test_what_is_counted_is_what_is_said(spheres):
     pair = pair_of(spheres, 30, 64)
     flat = np.full((64, 64, 3), 0.5)
-    found = metrics.cross_view(flat, flat, pair)
-    assert not found.counted[~pair.visible].any() and not found.counted[pair.edge].any()
+    result = metrics.cross_view(flat, flat, pair)
+    assert not result.counted[~pair.visible].any() and not result.counted[pair.edge].any()
     x, y = np.moveaxis(pair.xy, -1, 0)
     taps = (x >= 0.5) & (x <= 63.5) & (y >= 0.5) & (y <= 63.5)
-    assert np.array_equal(found.counted, pair.visible & ~pair.edge & taps)
-    for values in (found.linear[..., 0], found.srgb[..., 0], found.delta_e):
-        assert np.array_equal(np.isfinite(values), found.counted)
+    assert np.array_equal(result.counted, pair.visible & ~pair.edge & taps)
+    for values in (result.linear[..., 0], result.srgb[..., 0], result.delta_e):
+        assert np.array_equal(np.isfinite(values), result.counted)
     half = np.zeros((64, 64), bool)
     half[:, 32:] = True
     left_out = metrics.cross_view(flat, flat, pair, exclude=half)
     asked = metrics.cross_view(flat, flat, pair, mask=~half)
-    assert np.array_equal(left_out.counted, found.counted & ~half) and np.array_equal(
+    assert np.array_equal(left_out.counted, result.counted & ~half) and np.array_equal(
         asked.counted, left_out.counted
     )
     # Pixels excluded are candidates that were not counted; pixels not asked about are no
@@ -177,11 +177,11 @@ def test_nothing_co_visible_is_undefined_and_counted():
     views = [Camera.look_at((0, 0, 0), (x, 0, 0), width=16, height=16, fov_y=40) for x in (1, -1)]
     pair = two_view(Geometry([wall, other]), *views)
     flat = np.full((16, 16, 3), 0.5)
-    found = metrics.cross_view(flat, flat, pair)
-    figures = found.figures()
-    assert figures.pop("consistency.pixels") == 0 and found.candidates == 0
+    result = metrics.cross_view(flat, flat, pair)
+    figures = result.figures()
+    assert figures.pop("consistency.pixels") == 0 and result.candidates == 0
     assert all(math.isnan(value) for value in figures.values())
-    gaps = metrics.approximation_error(found, found)
+    gaps = metrics.approximation_error(result, result)
     assert all(math.isnan(value) for value in gaps.values())
     assert not metrics.view_dependent(flat, flat, pair).any()
 
@@ -199,14 +199,14 @@ def test_a_highlight_of_the_truth_is_found_and_texture_is_not(spheres):
         metrics.view_dependent(to_srgb(source), to_srgb(target), pair).sum()
         <= 0.001 * candidates.sum()
     )
-    found = metrics.view_dependent(to_srgb(source), to_srgb(shiny), pair)
+    result = metrics.view_dependent(to_srgb(source), to_srgb(shiny), pair)
     # Above the tolerance by more than the texture's own range is found; below the tolerance nothing
     # is.
-    assert found[candidates & (shine[..., 0] > 0.25)].all()
-    assert found[candidates & (shine[..., 0] < 0.03)].mean() < 0.001
+    assert result[candidates & (shine[..., 0] > 0.25)].all()
+    assert result[candidates & (shine[..., 0] < 0.03)].mean() < 0.001
     # An edit that is consistent on the matt surface is judged so in spite of the highlight.
     with_it = metrics.cross_view(to_srgb(source), to_srgb(shiny), pair).figures()
-    without = metrics.cross_view(to_srgb(source), to_srgb(shiny), pair, exclude=found).figures()
+    without = metrics.cross_view(to_srgb(source), to_srgb(shiny), pair, exclude=result).figures()
     assert without["consistency.delta_e_p95"] < 0.5 * with_it["consistency.delta_e_p95"]
 
 

@@ -91,10 +91,10 @@ def test_lengths_do_not_matter_since_they_are_taken_out_first():
 @pytest.mark.parametrize("tiny", [0.0, 0.1 * TINY_NORM, -0.9 * TINY_NORM, 1e-320])
 def test_an_embedding_without_length_is_undefined_and_counted(tiny):
     images = np.array([E[0], tiny * E[0], E[0] + E[1]])
-    for found in (clip_similarity(images, E[0]), image_similarity(E[0], images)):
-        assert np.isnan(found.values).tolist() == [False, True, False]
-        assert (found.undefined, found.defined) == (1, 2)
-        assert found.mean == pytest.approx((1 + math.sqrt(0.5)) / 2)  # not of three
+    for result in (clip_similarity(images, E[0]), image_similarity(E[0], images)):
+        assert np.isnan(result.values).tolist() == [False, True, False]
+        assert (result.undefined, result.defined) == (1, 2)
+        assert result.mean == pytest.approx((1 + math.sqrt(0.5)) / 2)  # not of three
     assert clip_similarity(images, tiny * E[0]).undefined == 3
 
 
@@ -107,11 +107,11 @@ def test_a_view_that_did_not_change_is_undefined_and_counted():
         np.array([E[0], E[0], E[0]]),
         np.array([E[1], 2 * E[0], E[0] + 0.1 * TINY_DISPLACEMENT * E[1]]),
     )
-    found = directional_similarity(before, after, E[0], E[1])
+    result = directional_similarity(before, after, E[0], E[1])
     assert (
-        found.values[0] == pytest.approx(1)
-        and np.isnan(found.values[1:]).all()
-        and found.undefined == 2
+        result.values[0] == pytest.approx(1)
+        and np.isnan(result.values[1:]).all()
+        and result.undefined == 2
     )
     just = directional_similarity(E[:1], E[:1] + 2 * TINY_DISPLACEMENT * E[1:2], E[0], E[1])
     assert just.mean == pytest.approx(
@@ -120,8 +120,8 @@ def test_a_view_that_did_not_change_is_undefined_and_counted():
 
 
 def test_prompts_that_say_the_same_leave_every_view_undefined():
-    found = directional_similarity(E[:2], E[2:4], E[0], 3 * E[0])
-    assert found.undefined == 2 and found.defined == 0 and math.isnan(found.mean)
+    result = directional_similarity(E[:2], E[2:4], E[0], 3 * E[0])
+    assert result.undefined == 2 and result.defined == 0 and math.isnan(result.mean)
 
 
 def test_float16_embeddings_do_not_overflow():
@@ -130,8 +130,8 @@ def test_float16_embeddings_do_not_overflow():
         assert np.isinf(
             (images[0] ** 2).sum()
         )  # as the length would, computed in their own precision
-    found = clip_similarity(images, images[0])
-    assert found.values[0] == pytest.approx(1, abs=1e-15) and abs(found.values[1]) < 1e-15
+    result = clip_similarity(images, images[0])
+    assert result.values[0] == pytest.approx(1, abs=1e-15) and abs(result.values[1]) < 1e-15
 
 
 def test_the_ends_of_float64_do_no_harm():
@@ -186,8 +186,10 @@ def test_shapes_that_do_not_fit_are_named(call, complaint):
 
 
 def test_no_views_give_no_value():
-    found = clip_similarity(np.zeros((0, 4)), E[0])
-    assert isinstance(found, Similarity) and found.values.shape == (0,) and math.isnan(found.mean)
+    result = clip_similarity(np.zeros((0, 4)), E[0])
+    assert (
+        isinstance(result, Similarity) and result.values.shape == (0,) and math.isnan(result.mean)
+    )
 
 
 def test_the_figures_are_specified():

@@ -28,14 +28,14 @@ def by_hand(inside, outside):
 
 def test_inside_and_outside_are_told_apart():
     image, truth, mask = by_hand(0.1, 0.01)
-    found = metrics.fidelity(image, truth, mask)
-    assert found["fidelity.psnr.inside"] == pytest.approx(20, abs=1e-9)
-    assert found["fidelity.psnr.outside"] == pytest.approx(40, abs=1e-9)
-    assert found["fidelity.mse"] == pytest.approx(
+    result = metrics.fidelity(image, truth, mask)
+    assert result["fidelity.psnr.inside"] == pytest.approx(20, abs=1e-9)
+    assert result["fidelity.psnr.outside"] == pytest.approx(40, abs=1e-9)
+    assert result["fidelity.mse"] == pytest.approx(
         (mask.mean() * 1e-2 + (~mask).mean() * 1e-4), rel=1e-9
     )
-    assert found["fidelity.ssim.outside"] > found["fidelity.ssim.inside"]
-    assert "fidelity.preserved_psnr" not in found and "fidelity.distance" not in found
+    assert result["fidelity.ssim.outside"] > result["fidelity.ssim.inside"]
+    assert "fidelity.preserved_psnr" not in result and "fidelity.distance" not in result
 
 
 def test_the_pixels_on_the_outline_count_in_neither():
@@ -45,16 +45,18 @@ def test_the_pixels_on_the_outline_count_in_neither():
         for dx in (-1, 0, 1):
             rim[1:-1, 1:-1] |= mask[1:-1, 1:-1] != np.roll(mask, (dy, dx), (0, 1))[1:-1, 1:-1]
     spoiled = np.where(rim[..., None], 1.0, image)
-    expected, found = metrics.fidelity(image, truth, mask), metrics.fidelity(spoiled, truth, mask)
+    expected, result = metrics.fidelity(image, truth, mask), metrics.fidelity(spoiled, truth, mask)
     for name in (
         "fidelity.psnr.inside",
         "fidelity.psnr.outside",
         "fidelity.ssim.inside",
         "fidelity.ssim.outside",
     ):
-        assert found[name] == expected[name]
-    assert found["fidelity.pixels.inside"] + found["fidelity.pixels.outside"] + rim.sum() == SIZE**2
-    assert found["fidelity.psnr"] < expected["fidelity.psnr"]
+        assert result[name] == expected[name]
+    assert (
+        result["fidelity.pixels.inside"] + result["fidelity.pixels.outside"] + rim.sum() == SIZE**2
+    )
+    assert result["fidelity.psnr"] < expected["fidelity.psnr"]
 
 
 def test_preservation_is_against_the_original_and_outside():
@@ -64,9 +66,9 @@ def test_preservation_is_against_the_original_and_outside():
     spilled = np.where(
         mask[..., None], truth, original + 0.1
     )  # the right object in a picture that was painted over
-    found = metrics.fidelity(spilled, truth, mask, original_srgb=original)
-    assert found["fidelity.psnr.inside"] == math.inf
-    assert found["fidelity.preserved_psnr"] == pytest.approx(20, abs=1e-9)
+    result = metrics.fidelity(spilled, truth, mask, original_srgb=original)
+    assert result["fidelity.psnr.inside"] == math.inf
+    assert result["fidelity.preserved_psnr"] == pytest.approx(20, abs=1e-9)
     untouched = metrics.fidelity(original, truth, mask, original_srgb=original)
     assert (
         untouched["fidelity.preserved_psnr"] == math.inf
@@ -82,11 +84,11 @@ def mean_difference(image, truth):
 
 def test_a_distance_that_is_a_mean_over_places_becomes_that_of_the_region():
     image, truth, mask = by_hand(0.1, 0.03)
-    found = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
-    assert found["fidelity.distance.inside"] == pytest.approx(0.1, abs=1e-12)
-    assert found["fidelity.distance.outside"] == pytest.approx(0.03, abs=1e-12)
-    assert found["fidelity.preserved_distance"] == pytest.approx(0.03, abs=1e-12)
-    assert found["fidelity.distance"] == mean_difference(image, truth)
+    result = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
+    assert result["fidelity.distance.inside"] == pytest.approx(0.1, abs=1e-12)
+    assert result["fidelity.distance.outside"] == pytest.approx(0.03, abs=1e-12)
+    assert result["fidelity.preserved_distance"] == pytest.approx(0.03, abs=1e-12)
+    assert result["fidelity.distance"] == mean_difference(image, truth)
 
 
 @pytest.mark.parametrize(("fill", "empty"), [(True, "outside"), (False, "inside")])
@@ -94,21 +96,21 @@ def test_an_empty_region_is_undefined_and_counted(fill, empty):
     # Hard case 35; True is what an edit of the light has.
     image, truth, _ = by_hand(0.1, 0.01)
     mask = np.full((SIZE, SIZE), fill)
-    found = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
+    result = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
     full = "inside" if fill else "outside"
-    assert found[f"fidelity.pixels.{empty}"] == 0 and found[f"fidelity.pixels.{full}"] == SIZE**2
+    assert result[f"fidelity.pixels.{empty}"] == 0 and result[f"fidelity.pixels.{full}"] == SIZE**2
     for name in ("mse", "psnr", "ssim", "distance"):
-        assert math.isnan(found[f"fidelity.{name}.{empty}"])
-        assert found[f"fidelity.{name}.{full}"] == found[f"fidelity.{name}"]
-    assert math.isnan(found["fidelity.preserved_psnr"]) is fill
-    assert math.isnan(found["fidelity.ms_ssim"])  # 48 px
+        assert math.isnan(result[f"fidelity.{name}.{empty}"])
+        assert result[f"fidelity.{name}.{full}"] == result[f"fidelity.{name}"]
+    assert math.isnan(result["fidelity.preserved_psnr"]) is fill
+    assert math.isnan(result["fidelity.ms_ssim"])  # 48 px
 
 
 def test_one_pixel():
     # Hard case 14.
-    found = metrics.fidelity(np.zeros((1, 1, 3)), np.ones((1, 1, 3)), np.ones((1, 1), bool))
-    assert found["fidelity.psnr"] == found["fidelity.psnr.inside"] == 0
-    assert math.isnan(found["fidelity.ssim"]) and math.isnan(found["fidelity.psnr.outside"])
+    result = metrics.fidelity(np.zeros((1, 1, 3)), np.ones((1, 1, 3)), np.ones((1, 1), bool))
+    assert result["fidelity.psnr"] == result["fidelity.psnr.inside"] == 0
+    assert math.isnan(result["fidelity.ssim"]) and math.isnan(result["fidelity.psnr.outside"])
 
 
 def test_the_nearest_answer_is_one_for_all_views():
@@ -118,8 +120,8 @@ def test_the_nearest_answer_is_one_for_all_views():
     answers = {"dark": {"a": flat(0.2), "b": flat(0.2)}, "light": {"a": flat(0.8), "b": flat(0.8)}}
     assert metrics.nearest_answer({"a": flat(0.3), "b": flat(0.25)}, answers)[0] == "dark"
     # One view each way: neither is met, and the nearer of the two overall is said.
-    name, found = metrics.nearest_answer({"a": flat(0.3), "b": flat(0.75)}, answers)
-    assert name == "light" and found["light"] == pytest.approx(
+    name, result = metrics.nearest_answer({"a": flat(0.3), "b": flat(0.75)}, answers)
+    assert name == "light" and result["light"] == pytest.approx(
         -10 * math.log10((0.25 + 0.0025) / 2)
     )
     assert metrics.nearest_answer({"a": flat(0.8), "b": flat(0.8)}, answers) == (
@@ -148,8 +150,8 @@ def test_wrong_input_is_refused_by_name():
 
 def test_every_figure_is_registered():
     image, truth, mask = by_hand(0.1, 0.01)
-    found = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
-    assert all(metric(name).name == ".".join(name.split(".")[:2]) for name in found)
+    result = metrics.fidelity(image, truth, mask, original_srgb=truth, distance=mean_difference)
+    assert all(metric(name).name == ".".join(name.split(".")[:2]) for name in result)
 
 
 @pytest.mark.usefixtures("coarse_textures")

@@ -124,23 +124,23 @@ def test_ms_ssim_of_negatives_is_zero_and_not_a_complex_number():
 def test_identical_pictures(size):
     # Hard case 34: +inf, kept apart; and SSIM 1, where there is one (hard case 14).
     image, _ = pictures(*size)
-    found = metrics.image_error(image, image.copy())
-    assert found["image.mse"] == found["image.mse_linear"] == 0
-    assert found["image.psnr"] == found["image.psnr_linear"] == math.inf
+    result = metrics.image_error(image, image.copy())
+    assert result["image.mse"] == result["image.mse_linear"] == 0
+    assert result["image.psnr"] == result["image.psnr_linear"] == math.inf
     for name, least in (("image.ssim", 11), ("image.ms_ssim", 176)):
         if min(size) < least:
-            assert math.isnan(found[name])
+            assert math.isnan(result[name])
         else:
-            assert found[name] == pytest.approx(1, abs=1e-12)
+            assert result[name] == pytest.approx(1, abs=1e-12)
 
 
 def test_pictures_of_one_pixel_have_an_error_and_no_structure():
     # Hard case 14.
     image, target = np.full((1, 1, 3), 0.25), np.full((1, 1, 3), 0.75)
-    found = metrics.image_error(image, target)
-    assert found["image.mse"] == 0.25
-    assert found["image.psnr"] == pytest.approx(20 * math.log10(2), abs=1e-12)
-    assert math.isnan(found["image.ssim"]) and math.isnan(found["image.ms_ssim"])
+    result = metrics.image_error(image, target)
+    assert result["image.mse"] == 0.25
+    assert result["image.psnr"] == pytest.approx(20 * math.log10(2), abs=1e-12)
+    assert math.isnan(result["image.ssim"]) and math.isnan(result["image.ms_ssim"])
     assert metrics.ssim_map(image, target).size == 0
 
 
@@ -148,9 +148,9 @@ def test_pictures_of_one_pixel_have_an_error_and_no_structure():
 def test_an_empty_mask_leaves_everything_undefined(size):
     # Hard case 35.
     image, target = pictures(*size)
-    found = metrics.image_error(image, target, np.zeros(size, bool))
-    assert found.pop("image.pixels") == 0
-    assert all(math.isnan(value) for value in found.values())
+    result = metrics.image_error(image, target, np.zeros(size, bool))
+    assert result.pop("image.pixels") == 0
+    assert all(math.isnan(value) for value in result.values())
 
 
 def test_a_constant_offset_has_its_closed_form_whatever_the_mask():
@@ -177,9 +177,9 @@ def brute_ssim(image, target, mask):
     """Windows one by one, textbook formula, two passes for the variances."""
     taps = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
     weights = np.outer(taps, taps) / taps.sum() ** 2
-    found = np.full((image.shape[0] - 10, image.shape[1] - 10), np.nan)
-    for i in range(found.shape[0]):
-        for j in range(found.shape[1]):
+    result = np.full((image.shape[0] - 10, image.shape[1] - 10), np.nan)
+    for i in range(result.shape[0]):
+        for j in range(result.shape[1]):
             at = slice(i, i + 11), slice(j, j + 11)
             if not mask[at].all():
                 continue
@@ -194,8 +194,8 @@ def brute_ssim(image, target, mask):
                     * (2 * cov + 9e-4)
                     / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
                 )
-            found[i, j] = np.mean(channels)
-    return found
+            result[i, j] = np.mean(channels)
+    return result
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -273,10 +273,10 @@ def test_values_that_are_no_picture_are_refused_with_their_place():
 
 def test_linear_figures_are_those_of_the_linear_pictures():
     image, target = pictures()
-    found = metrics.image_error(image, target)
-    assert found["image.mse_linear"] == metrics.mse(to_linear(image), to_linear(target))
-    assert found["image.psnr_linear"] == metrics.psnr(to_linear(image), to_linear(target))
-    assert found["image.mse_linear"] != found["image.mse"]
+    result = metrics.image_error(image, target)
+    assert result["image.mse_linear"] == metrics.mse(to_linear(image), to_linear(target))
+    assert result["image.psnr_linear"] == metrics.psnr(to_linear(image), to_linear(target))
+    assert result["image.mse_linear"] != result["image.mse"]
 
 
 def test_single_precision_is_measured_in_double():
@@ -321,14 +321,14 @@ def test_more_noise_is_never_better():
     image, _ = pictures(192, 192)
     grain = random.standard_normal(image.shape)
     image = 0.3 + 0.4 * image
-    found = [
+    result = [
         metrics.image_error(image, np.clip(image + s * grain, 0, 1))
         for s in (0.003, 0.01, 0.03, 0.1)
     ]
     for name in ("image.psnr", "image.psnr_linear", "image.ssim", "image.ms_ssim"):
-        values = [each[name] for each in found]
+        values = [each[name] for each in result]
         assert values == sorted(values, reverse=True) and values[0] > values[-1]
-    assert 0 <= found[-1]["image.ms_ssim"] <= 1
+    assert 0 <= result[-1]["image.ms_ssim"] <= 1
 
 
 def test_edit_psnr_averages_the_error_and_not_the_decibels():
@@ -457,8 +457,8 @@ def test_a_masked_distance_is_the_mean_over_the_mask_apart_from_the_border():
     assert metrics.perceptual(image, target, local, mask) == pytest.approx(expected, rel=1e-12)
     # All of a mask in one colour: what spills over is what the border misses, to the last digit.
     shifted = np.clip(target, 0.1, 0.8)
-    found = metrics.perceptual(shifted + 0.1, shifted, blurring, mask)
-    assert found == pytest.approx(0.1, rel=1e-9)
+    result = metrics.perceptual(shifted + 0.1, shifted, blurring, mask)
+    assert result == pytest.approx(0.1, rel=1e-9)
 
 
 def test_an_empty_mask_has_no_distance_and_asks_for_none():

@@ -9,7 +9,7 @@ from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
-from attnwarp_eval.report.claims import Claim, Finding, judge, load_claims, together
+from attnwarp_eval.report.claims import Claim, JudgedClaim, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.probes import probe
@@ -177,7 +177,7 @@ def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
     assert sides == [(name, {"editor": {"name": name}}) for name in ("small", "small-plain")]
 
     def finding(here, verdict):
-        return Finding(claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict)
+        return JudgedClaim(claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict)
 
     holds, fails = finding("seen", "holds"), finding("not seen", "does not hold")
     assert together([holds, holds], claim.editors) == ("seen", "holds")

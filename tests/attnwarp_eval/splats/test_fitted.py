@@ -114,8 +114,8 @@ def test_errors_of_a_picture_are_those_of_scikit_image():
     random = np.random.default_rng(0)
     truth = random.integers(0, 256, (20, 30, 3), dtype=np.uint8)
     image = np.clip(truth / 255 + random.normal(0, 0.1, truth.shape), 0, 1)
-    found = fitted.picture_error(image, truth)
-    assert found["fit.psnr"] == pytest.approx(
+    result = fitted.picture_error(image, truth)
+    assert result["fit.psnr"] == pytest.approx(
         peak_signal_noise_ratio(truth / 255, image, data_range=1), abs=1e-9
     )
     expected = structural_similarity(
@@ -127,7 +127,7 @@ def test_errors_of_a_picture_are_those_of_scikit_image():
         channel_axis=-1,
         data_range=1,
     )
-    assert found["fit.ssim"] == pytest.approx(expected, abs=1e-9)
+    assert result["fit.ssim"] == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.fixture(scope="module")

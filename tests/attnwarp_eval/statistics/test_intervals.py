@@ -52,11 +52,11 @@ def test_the_detectable_difference_is_found_at_its_stated_power():
     # detectable.
     factor = stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1)
     truth = factor * sigma / np.sqrt(scenes)
-    found = sum(
+    result = sum(
         interval({i: [v] for i, v in enumerate(rng.normal(truth, sigma, scenes))}).p < 0.05
         for _ in range(trials)
     )
-    assert found / trials == pytest.approx(0.8, abs=0.06)
+    assert result / trials == pytest.approx(0.8, abs=0.06)
 
 
 def test_undefined_values_are_counted_and_never_averaged_in():
@@ -146,9 +146,9 @@ def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
     drift = np.geomspace(1, 8, 60)
     a = 1.25 * drift * rng.lognormal(0, 0.03, 60)
     b = drift * rng.lognormal(0, 0.03, 60)
-    found = time_ratio([a, a], [b, b])
-    assert found.low < 1.25 < found.high
-    assert found.high / found.low < 1.05
+    result = time_ratio([a, a], [b, b])
+    assert result.low < 1.25 < result.high
+    assert result.high / result.low < 1.05
     same = time_ratio([b], [b])
     assert (same.ratio, same.low, same.high) == (1, 1, 1)
 

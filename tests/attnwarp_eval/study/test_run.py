@@ -318,12 +318,12 @@ def test_a_worker_that_is_killed_costs_its_attempt_and_nothing_else(undisturbed,
 
 def children(pid):
     """Processes below ``pid``, nearest first."""
-    found = [
+    result = [
         int(c)
         for t in pathlib.Path(f"/proc/{pid}/task").iterdir()
         for c in (t / "children").read_text().split()
     ]
-    return found + [grandchild for child in found for grandchild in children(child)]
+    return result + [grandchild for child in result for grandchild in children(child)]
 
 
 @pytest.mark.parametrize(

@@ -53,10 +53,10 @@ def test_every_shipped_study_loads_and_names_scenes_that_exist(name, monkeypatch
 
 
 def test_variants_of_the_same_content_share_a_cell_and_keep_both_names(tmp_path):
-    found = cells(load_study(write(tmp_path)))
+    result = cells(load_study(write(tmp_path)))
     # Pixel centres play no part in a depth map, so all three variants are one cell there and two in
     # the warp.
-    assert [(c.probe, c.labels) for c in found] == [
+    assert [(c.probe, c.labels) for c in result] == [
         ("calibration", ("calibration",)),
         ("depth", ("corrected", "again", "slipped")),
         ("warp", ("corrected", "again")),

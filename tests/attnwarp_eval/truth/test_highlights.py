@@ -86,10 +86,10 @@ def spot(scene, geometry, ball, camera):
 @pytest.mark.parametrize("name", PARTLY_SLOW)
 def test_the_six_call_for_gloss_and_no_edit_takes_it_away(name):
     scene, _ = world(name)
-    found = detect.detect(scene)["glossy"]
-    assert found.needed and found.simulated and found.source == "detected"
-    assert "is plastic" in found.evidence[0] and any(
-        "BSDF flag Glossy" in e for e in found.evidence
+    result = detect.detect(scene)["glossy"]
+    assert result.needed and result.simulated and result.source == "detected"
+    assert "is plastic" in result.evidence[0] and any(
+        "BSDF flag Glossy" in e for e in result.evidence
     )
     shiny = {item.name for item in scene.spec.objects if item.material.type == "plastic"}
     assert 1 <= len(shiny) <= 4
@@ -162,13 +162,13 @@ def test_the_mask_of_what_depends_on_the_viewer_finds_the_highlight_and_not_the_
         ]
         pixels = [(int(y), int(x)) for x, y in filter(None, spots)]
         pixels = [at for at in pixels if pair.visible[at] and not pair.edge[at]]
-        found = metrics.view_dependent(
+        result = metrics.view_dependent(
             *(to_srgb(p.clip(0, 1)) for p in (source, sunlit(scene, camera))), pair
         )
-        assert all(found[at] for at in pixels)
-        found = metrics.view_dependent(
+        assert all(result[at] for at in pixels)
+        result = metrics.view_dependent(
             *(to_srgb(p.clip(0, 1)) for p in (matt_source, sunlit(plain, camera))), pair
         )
-        assert not any(found[at] for at in pixels)
+        assert not any(result[at] for at in pixels)
         checked += len(pixels)
     assert checked

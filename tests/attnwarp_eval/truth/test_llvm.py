@@ -1,6 +1,5 @@
 """Which of Mitsuba's variants is chosen, and whether the pictures of the two are the same."""
 
-import importlib
 import subprocess
 
 import numpy as np
@@ -13,11 +12,9 @@ from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.shapes import Mesh
-from attnwarp_eval.truth import Geometry, appearance, llvm, mitsuba
+from attnwarp_eval.truth import Geometry, appearance, llvm, mitsuba, pictures
 from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.plan import plan
-
-MODULE = importlib.import_module("attnwarp_eval.truth.mitsuba.appearance")
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
 
@@ -193,12 +190,12 @@ def test_pictures_of_the_two_variants_are_kept_apart(monkeypatch, tmp_path):
     made = []
 
     def render(scene, camera, plan, seed):
-        made.append(MODULE.variant())
+        made.append(pictures.variant())
         return np.full((8, 8, 3), len(made), np.float32)
 
-    monkeypatch.setattr(MODULE, "render_plan", render)
+    monkeypatch.setattr(pictures, "render_plan", render)
     for variant in ("scalar_rgb", "llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
-        monkeypatch.setattr(MODULE, "variant", lambda variant=variant: variant)
+        monkeypatch.setattr(pictures, "variant", lambda variant=variant: variant)
         value = appearance(scene, scene.source)[0, 0, 0]
         assert value == 1 + (variant == "llvm_ad_rgb")
     assert made == ["scalar_rgb", "llvm_ad_rgb"]
@@ -212,7 +209,7 @@ def test_a_pixel_that_comes_out_undefined_is_rendered_again(monkeypatch):
     scene = make([FLOOR], [SUN, SKY]).with_size(8, 8)
     made = plan(scene, 4)
     whole = mitsuba.render_plan(scene, scene.source, made, 0)
-    real, seeds = MODULE._render_passes, []
+    real, seeds = mitsuba.render._render_passes, []
 
     def broken(scene, camera, made, seed):
         seeds.append(seed)
@@ -221,7 +218,7 @@ def test_a_pixel_that_comes_out_undefined_is_rendered_again(monkeypatch):
             picture[2, 3] = np.nan, 1.0, np.inf
         return picture
 
-    monkeypatch.setattr(MODULE, "_render_passes", broken)
+    monkeypatch.setattr(mitsuba.render, "_render_passes", broken)
     mended = mitsuba.render_plan(scene, scene.source, made, 0)
     assert np.isfinite(mended).all() and len(seeds) == 2 and seeds[0] != seeds[1]
     changed = (mended != whole).any(-1)

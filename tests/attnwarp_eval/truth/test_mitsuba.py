@@ -1,7 +1,5 @@
 """Mitsuba's pictures and geometry against Open3D, closed forms and the ray-cast shading."""
 
-import importlib
-
 import numpy as np
 import pytest
 from direct_light import direct
@@ -11,9 +9,10 @@ from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
-from attnwarp_eval.truth import Geometry, appearance, mitsuba
+from attnwarp_eval.truth import Geometry, appearance, mitsuba, pictures
 from attnwarp_eval.truth.mitsuba import build
-from attnwarp_eval.truth.plan import Pass, Plan, plan
+from attnwarp_eval.truth.passes import Pass, Plan
+from attnwarp_eval.truth.plan import plan
 from attnwarp_eval.truth.shading import irradiance, object_albedo, sky_radiance
 
 pytestmark = pytest.mark.usefixtures("coarse_textures")
@@ -23,8 +22,6 @@ FLOOR = {
     "shape": {"type": "rectangle", "center": [0, 0, 0], "size": [40, 40]},
     "texture": {"type": "plain", "color": "#b08040"},
 }
-
-MODULE = importlib.import_module("attnwarp_eval.truth.mitsuba.appearance")
 
 
 def world(lights, objects=None, **appearance_):
@@ -172,7 +169,7 @@ def test_a_picture_is_rendered_once_and_kept_for_what_it_depends_on(monkeypatch,
     scene = world([SUN, SKY], spp=1).with_size(16, 16)
     calls = []
     real = mitsuba.render_plan
-    monkeypatch.setattr(MODULE, "render_plan", lambda *a: calls.append(a) or real(*a))
+    monkeypatch.setattr(pictures, "render_plan", lambda *a: calls.append(a) or real(*a))
     first = appearance(scene, scene.source)
     assert np.array_equal(first, appearance(scene, scene.source, spp=1)) and len(calls) == 1
     appearance(scene, scene.source, seed=1)

@@ -192,12 +192,12 @@ def _apart(yaw: float, way: Way) -> float:
     v = y * np.cos(np.arctan2(x, 1)) / np.cos(azimuth)
     px, py = u * K[0, 0] + K[0, 2], v * K[1, 1] + K[1, 2]
     ahead = np.abs(azimuth) < math.pi / 2
-    shown = ahead & (px >= 0) & (px <= SIZE) & (py >= 0) & (py <= SIZE)
+    visible = ahead & (px >= 0) & (px <= SIZE) & (py >= 0) & (py <= SIZE)
     layer = view.at((SIZE, SIZE))
     source_tokens, new = _tokens(way)
     blended = layer.blend_tokens(source_tokens + 2, new, 1.0)
-    untouched = torch.from_numpy(~shown).reshape(-1)
-    wrong = int((layer.mask.numpy() != shown).sum())
+    untouched = torch.from_numpy(~visible).reshape(-1)
+    wrong = int((layer.mask.numpy() != visible).sum())
     return float(wrong + (blended[:, untouched] != new[:, untouched]).sum())
 
 

@@ -287,8 +287,8 @@ class EditingProbe(Probe[EditResult]):
                         "edit": edit,
                         "encoders": encoders,
                     }
-                    shown = label in study.pictures.variants
-                    views = study.pictures_of(spec["views"]) if shown else ()
+                    pictured = label in study.pictures.variants
+                    views = study.pictures_of(spec["views"]) if pictured else ()
                     yield Cell(
                         spec, name, label, self.name, seed, (label,),
                         tuple(f"{edit['name']}/{view}" for view in views),
@@ -514,8 +514,8 @@ class _Measure:
         edited = {names[k]: _full(truth.originals[names[k]], v) for k, v in result.edited.items()}
         self.pictures = {"edit": edited, "render": self._renders(result.gaussians)}
         # A method that was cut short may not have edited the source: it shows no edit then.
-        shown = edited.get(self.source, truth.originals[self.source])
-        self.judged = truth.judge({self.source: shown})
+        image = edited.get(self.source, truth.originals[self.source])
+        self.judged = truth.judge({self.source: image})
         self.nearest = {k: self._nearest(pictures) for k, pictures in self.pictures.items()}
         self.neighbours = neighbours(work.world, work.spec["views"])
 
@@ -676,7 +676,7 @@ class _Measure:
         """JPEG files of a view: before, the source's edit, the edited view, its render, and the
         truth of the source's answer."""
         answer = self.judged.answer
-        shown = {
+        images = {
             "before": self.truth.originals[name],
             "by hand": source_by_hand(self.work, self.truth, self.source),
             "source edit": self.pictures["edit"].get(self.source),
@@ -686,7 +686,7 @@ class _Measure:
         }
         return {
             content.replace(" ", "-"): pictures.jpeg(pictures.enlarged(image))
-            for content, image in shown.items()
+            for content, image in images.items()
             if image is not None
         }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -86,7 +86,7 @@ class Point:
 
     @classmethod
     def from_json(cls, data: Json) -> Point:
-        """From :meth:`to_json`."""
+        """From :meth:`to_json`, or from an evaluation's attributes, None where undefined."""
         numbers = with_nan({name: data[name] for name in ("loss", "psnr", "psnr_pooled")})
         return cls(**{**data, **numbers, "measures": with_nan(data["measures"])})
 
@@ -203,18 +203,10 @@ class Fit(Probe[Curve]):
                     edge=edge,
                 )
             work.add(name, measured, partial(pictures.of_fit, surface, hits, image))
+        own = fields(Point)
         return Curve(
             tuple(
-                Point(
-                    evaluation.iteration,
-                    evaluation.seconds,
-                    evaluation.cpu_seconds,
-                    evaluation.splats,
-                    _or_nan(evaluation.loss),
-                    _or_nan(evaluation.psnr),
-                    _or_nan(evaluation.psnr_pooled),
-                    evaluation.measures,
-                )
+                Point.from_json({field.name: getattr(evaluation, field.name) for field in own})
                 for evaluation in result.history
             )
         )
@@ -358,10 +350,6 @@ def folder_of(root: Path, spec: Mapping[str, Any]) -> Path:
 
 def _measure(point: Point, name: str) -> float:
     return point.measures.get(name, math.nan)
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def _mean(values: list[float]) -> float | None:

@@ -112,8 +112,8 @@ class VariabilityProbe(Probe[Varied]):
                     "seeds": list(study.seeds),
                     "edit": edit,
                 }
-                shown = label in study.pictures.variants
-                views = study.pictures_of(spec["views"]) if shown else ()
+                pictured = label in study.pictures.variants
+                views = study.pictures_of(spec["views"]) if pictured else ()
                 yield Cell(
                     spec, name, label, self.name, first, (label,),
                     tuple(f"{edit['name']}/{view}" for view in views),
@@ -255,8 +255,8 @@ class VariabilityProbe(Probe[Varied]):
             for picture in record.pictures:
                 caption = picture.content.replace("-", " ")
                 by_view.setdefault(picture.view, []).append(Picture(picture.path, caption))
-            for view, shown in by_view.items():
-                rows.append((f"**{cell.scene}, {view}** {cell.variants[0]}", shown))
+            for view, row in by_view.items():
+                rows.append((f"**{cell.scene}, {view}** {cell.variants[0]}", row))
         if not rows:
             return None
         text = ["A view before the edit, and after it with each seed."]

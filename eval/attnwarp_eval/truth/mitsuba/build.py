@@ -31,7 +31,7 @@ from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Sphere
 from attnwarp_eval.scene.spec import ObjectSpec, SkySpec, SunSpec
 from attnwarp_eval.scene.textures import Plain, albedo
 from attnwarp_eval.truth.llvm import SCALAR, variant
-from attnwarp_eval.truth.plan import Plan, beam
+from attnwarp_eval.truth.passes import Plan, beam
 from attnwarp_eval.truth.shading import sky_radiance, sun_direction
 
 Array = npt.NDArray[np.float64]
@@ -119,7 +119,7 @@ def load_world(
 
     Args:
         texel: size of a baked texel in scene units; :func:`texel_size` if left out.
-        aims_at_sky: see :class:`~attnwarp_eval.truth.plan.Pass`.
+        aims_at_sky: see :class:`~attnwarp_eval.truth.passes.Pass`.
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel

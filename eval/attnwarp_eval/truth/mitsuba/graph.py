@@ -19,7 +19,7 @@ from attnwarp_eval.truth.mitsuba.build import (
     plugin_names,
     texel_size,
 )
-from attnwarp_eval.truth.plan import plan
+from attnwarp_eval.truth.passes import plan_passes
 
 
 def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
@@ -47,7 +47,9 @@ def graph(scene: Scene) -> tuple[list[tuple[str, str]], list[tuple[str, Any]]]:
     if scene.spec.medium is not None:
         parsed += plugin_names("medium.interior", medium_form(scene.spec.medium))
     middles = {"type": "stratified", "sample_count": 1, "jitter": False}
-    sensor = load_sensor(scene, scene.source, center, middles, world, plan(scene, 1), fog)
+    # A sensor is the same for any number of bounces.
+    planned = plan_passes(scene, 1, 1)
+    sensor = load_sensor(scene, scene.source, center, middles, world, planned, fog)
     parsed.append(
         ("cameras", {"ThinLensCamera": "thinlens"}.get(sensor.class_name(), "perspective"))
     )

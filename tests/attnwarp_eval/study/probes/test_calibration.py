@@ -33,10 +33,10 @@ def pairs():
     geometry = Geometry(scene)
     seen = geometry.trace(scene.source)
     targets = {camera.name: camera for camera in scene.targets}
-    found = {
+    result = {
         yaw: two_view(geometry, scene.source, targets[f"yaw{yaw:03d}"]) for yaw in (10, 45, 90, 150)
     }
-    return scene, geometry, Surface(seen.depth, seen.normal), found
+    return scene, geometry, Surface(seen.depth, seen.normal), result
 
 
 def warped(pair, source_surface, settings):
@@ -50,8 +50,8 @@ def warped(pair, source_surface, settings):
 
 
 def test_the_truths_own_depth_has_no_endpoint_error(pairs):
-    _, _, seen, found = pairs
-    for pair in found.values():
+    _, _, seen, result = pairs
+    for pair in result.values():
         got = metrics.endpoint_error(
             warped(pair, seen, EXACT).correspondence.xy, pair.xy, pair.visible
         )
@@ -68,10 +68,10 @@ def test_the_exact_mask_against_itself_is_perfect(pairs):
 def test_with_exact_depth_the_corrected_rules_accept_nothing_wrong(pairs):
     # Judged by ray casting, which shares no step with depth agreement. Ground whose depth changes
     # by more than 2 % a pixel at this size is rejected, 4 % of what is visible.
-    _, _, seen, found = pairs
+    _, _, seen, result = pairs
     total = dict.fromkeys(metrics.COUNTS, 0)
     inner = dict(total)
-    for pair in found.values():
+    for pair in result.values():
         mask = warped(pair, seen, EXACT).mask
         for sums, among in ((total, None), (inner, ~pair.edge)):
             for name, count in metrics.confusion(
@@ -85,10 +85,10 @@ def test_with_exact_depth_the_corrected_rules_accept_nothing_wrong(pairs):
 
 
 def test_bounds_alone_accept_hidden_surface_and_points_behind_the_camera(pairs):
-    _, _, seen, found = pairs
+    _, _, seen, result = pairs
     bare = preset("paper", gaussian_filter="none")
     rows = []
-    for yaw, pair in found.items():
+    for yaw, pair in result.items():
         mask = warped(pair, seen, bare).mask
         rows.append((yaw, metrics.confusion(mask, pair.label, pair.hits.valid, pair.behind)))
     bins = metrics.by_yaw(rows, edges=(0, 30, 120, 180))
@@ -100,9 +100,9 @@ def test_bounds_alone_accept_hidden_surface_and_points_behind_the_camera(pairs):
 
 @pytest.mark.parametrize("size", [128, 32])
 def test_features_of_the_solid_field_warp_to_their_own_points(pairs, size):
-    scene, geometry, seen, found = pairs
+    scene, geometry, seen, result = pairs
     field = SolidField(scene.center, 4.0, channels=4)
-    pair = found[45]
+    pair = result[45]
     layer = warped(pair, seen, EXACT).at((size, size))
     small = two_view(geometry, pair.source.resize(size, size), pair.target.resize(size, size))
     features = torch.from_numpy(field.on_grid(geometry.trace(small.source).point))
@@ -138,8 +138,8 @@ def test_with_exact_depth_paper_and_released_accept_what_projects_into_the_image
     pairs, name, slip, yaw
 ):
     """Pictures without contrast pass the released preset's photometric test everywhere."""
-    _, _, seen, found = pairs
-    pair = found[yaw]
+    _, _, seen, result = pairs
+    pair = result[yaw]
     image = np.full((SIZE, SIZE, 3), 0.5)
     view = warp_surfaces(
         pair.source,

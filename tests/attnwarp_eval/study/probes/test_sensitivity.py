@@ -175,9 +175,9 @@ def test_strength_blends_in_linear_light_and_ends_at_the_two_pictures():
 
 
 def test_a_wrong_colour_keeps_the_value_inside_the_mask_and_everything_outside():
-    found = picture("wrong_colour", shot())
-    np.testing.assert_allclose(found[0, 0], to_srgb([0.2, 0.8, 0.8]))  # 0.8 (1 - 0.75), 0.8, 0.8
-    np.testing.assert_array_equal(found[:, 6:], picture(RIGHT, shot())[:, 6:])
+    result = picture("wrong_colour", shot())
+    np.testing.assert_allclose(result[0, 0], to_srgb([0.2, 0.8, 0.8]))  # 0.8 (1 - 0.75), 0.8, 0.8
+    np.testing.assert_array_equal(result[:, 6:], picture(RIGHT, shot())[:, 6:])
 
 
 @pytest.mark.parametrize("color", [(0.8, 0.6, 0.2), (0.1, 0.2, 0.9), (0.5, 0.1, 0.4)])
@@ -246,18 +246,18 @@ def test_noise_has_its_standard_deviation_is_another_in_each_view_and_the_same_a
 
 
 def test_every_edit_is_asked_and_ambiguous_ones_two_answers_at_most(scene):
-    found = {task.name: task for task in tasks(load_scene(str(scene)))}
-    assert list(found) == ["green", "orange_box", "any-red", "any-yellow", "dusk"]
-    assert [name for name, _ in found["any-red"].others] == ["yellow", "white"]
-    assert found["any-red"].target == "a red ball"
+    result = {task.name: task for task in tasks(load_scene(str(scene)))}
+    assert list(result) == ["green", "orange_box", "any-red", "any-yellow", "dusk"]
+    assert [name for name, _ in result["any-red"].others] == ["yellow", "white"]
+    assert result["any-red"].target == "a red ball"
     # The ball's edits are wrong in place of the box's and the other way round; light is nobody's
     # object.
-    elsewhere = {name: task.elsewhere[0] for name, task in found.items()}
+    elsewhere = {name: task.elsewhere[0] for name, task in result.items()}
     assert elsewhere["green"] == elsewhere["any-red"] == "orange_box"
     assert elsewhere["orange_box"] == "any"
     assert elsewhere["dusk"] == "green"
-    assert found["green"].content == load_scene(str(scene)).edited("green").content_hash
-    for task in found.values():
+    assert result["green"].content == load_scene(str(scene)).edited("green").content_hash
+    for task in result.values():
         assert Task.from_dict(task.to_dict()) == task
 
 
@@ -399,7 +399,7 @@ def test_without_encoders_their_metrics_are_left_out_and_a_missing_flaw_is_undef
     path.write_text(yaml.safe_dump({**SCENE, "edits": SCENE["edits"][:1]}))
     cell = cell_of(path, tmp_path, encoders={}, edits=[])
     record = compute(probe("sensitivity"), cell, tmp_path, threads=1).to_json()
-    found = record["views"][0]["metrics"]
-    assert not any(key.startswith(("embedding", "fidelity.distance")) for key in found)
-    assert found["fidelity.mse.wrong_object"] is None
-    assert found["fidelity.mse.wrong_colour"] > 0
+    result = record["views"][0]["metrics"]
+    assert not any(key.startswith(("embedding", "fidelity.distance")) for key in result)
+    assert result["fidelity.mse.wrong_object"] is None
+    assert result["fidelity.mse.wrong_colour"] > 0

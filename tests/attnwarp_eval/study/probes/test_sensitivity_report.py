@@ -70,8 +70,8 @@ def read(data):
     ],
 )
 def test_the_right_result_wins_loses_or_cannot_be_told(key, right, flawed, expected):
-    found = beats(key, right, flawed)
-    assert math.isnan(found) if expected is None else found == expected
+    result = beats(key, right, flawed)
+    assert math.isnan(result) if expected is None else result == expected
 
 
 def test_a_share_is_the_mean_over_scenes_of_the_mean_over_views_with_ties_as_half_and_undefined_counted():
@@ -79,10 +79,10 @@ def test_a_share_is_the_mean_over_scenes_of_the_mean_over_views_with_ties_as_hal
         [{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.2, "blurred": 0.1}, {RIGHT: 0.1, "blurred": None}]
     )
     two = record([{RIGHT: 0.0, "blurred": 0.1}, {RIGHT: 0.1, "blurred": 0.1}])
-    found = share([("one", read(one)), ("two", read(two))], MSE, "blurred")
-    assert found == interval({"one": [1.0, 0.0, float("nan")], "two": [1.0, 0.5]})
-    assert found.mean == pytest.approx((0.5 + 0.75) / 2)
-    assert found.undefined == 1
+    result = share([("one", read(one)), ("two", read(two))], MSE, "blurred")
+    assert result == interval({"one": [1.0, 0.0, float("nan")], "two": [1.0, 0.5]})
+    assert result.mean == pytest.approx((0.5 + 0.75) / 2)
+    assert result.undefined == 1
 
 
 def steps(*values, key=MSE):
@@ -107,11 +107,11 @@ def steps(*values, key=MSE):
     ],
 )
 def test_a_curve_is_ranked_with_the_strength_and_its_steps_are_counted(values, key, rank, monotone):
-    found = curve(steps(*values, key=key), key)
+    result = curve(steps(*values, key=key), key)
     if rank is None:
-        assert all(map(math.isnan, found))
+        assert all(map(math.isnan, result))
     else:
-        assert found == (pytest.approx(rank), monotone)
+        assert result == (pytest.approx(rank), monotone)
 
 
 def test_power_is_the_mean_over_the_flaws_a_metric_is_meant_for():

@@ -1,4 +1,4 @@
-"""Appearance: pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.plan` plans them.
+"""Pictures of a scene by Mitsuba 3, made as :mod:`attnwarp_eval.truth.passes` plans them.
 
 Variant ``llvm_ad_rgb`` where a child process shows that it works on this machine, else
 ``scalar_rgb``, which works
@@ -18,18 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth.llvm import SCALAR, variant
-from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.truth.mitsuba.build import (
     library,
     load_sensor,
     load_world,
     owner_of_number,
-    texel_size,
 )
-from attnwarp_eval.truth.plan import Pass, Plan, plan, sampler, smooth_objects
+from attnwarp_eval.truth.passes import Pass, Plan, sampler, smooth_objects
 from attnwarp_eval.truth.raycast import Geometry
 
 Array = npt.NDArray[np.float64]
@@ -38,58 +35,6 @@ Image = npt.NDArray[np.float32]
 
 APPEARANCE_PROTOCOL = 2
 """Raised whenever the same scene, camera, plan and seed would give another picture."""
-
-
-def appearance(scene: Scene, camera: Camera, spp: int | None = None, seed: int = 0) -> Image:
-    """What ``camera`` sees, in linear RGB.
-
-    Args:
-        camera: square pixels and no skew; any principal point.
-        spp: samples a pixel; the scene's own number if left out.
-        seed: the same seed gives the same bits.
-
-    Returns:
-        (H, W, 3) float32, not clipped; the sky where nothing is hit. Box-filtered over each pixel.
-        Kept on disk, see :mod:`attnwarp_eval.cache`.
-
-    Raises:
-        ValueError: a camera that Mitsuba cannot express.
-
-    Example:
-        >>> from attnwarp_eval.scene.file import load_scene
-        >>> from attnwarp_eval.truth import appearance
-        >>> scene = load_scene("spheres").with_size(8, 8)
-        >>> image = appearance(scene, scene.source, spp=1)
-        >>> image.shape, image.dtype, bool((image >= 0).all())
-        ((8, 8, 3), dtype('float32'), True)
-    """
-    import mitsuba
-
-    planned = plan(scene, spp)
-    pose = {name: value for name, value in camera.to_dict().items() if name != "name"}
-    key = content_key(
-        "appearance",
-        APPEARANCE_PROTOCOL,
-        mitsuba.__version__,
-        variant(),
-        scene.world_hash,
-        texel_size(scene),
-        build.TEXELS,
-        # Where the lens is sharp, and what the fog's own box holds, depend on the cameras.
-        (
-            scene.spec.cameras.model_dump(mode="json", exclude={"size"})
-            if planned.lens or planned.media
-            else None
-        ),
-        pose,
-        planned.identity(),
-        int(seed),
-    )
-    stored = read_arrays("appearance", key)
-    if stored is None:
-        stored = {"image": render_plan(scene, camera, planned, seed)}
-        write_arrays("appearance", key, stored)
-    return stored["image"]
 
 
 def render_plan(

@@ -1,0 +1,56 @@
+"""Folders of edits: their files, deaths in the middle of writing them, and what older ones held."""
+
+import json
+from pathlib import Path
+
+from attnwarp.fit import checkpoint
+from attnwarp.io import ply
+from attnwarp.propagate import folder
+
+
+def files(folder):
+    """Everything that has to be the same after a kill: all but the seconds."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(Path(folder).rglob("*"))
+        if path.is_file() and path.name != "times.json"
+    }
+
+
+def without_start_protocol(folder):
+    """Make a folder's manifest what it was when a start was a step of the editor's schedule."""
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    del manifest["start_protocol"]
+    path.write_text(json.dumps(manifest))
+
+
+class Killed(BaseException):
+    """Leaves the files as a kill would: nothing catches it but the atomic write."""
+
+
+def events(monkeypatch, stop):
+    """Count steps of progress and writes; die at number ``stop``, before a write or after it.
+
+    Returns:
+        What to call at a step of progress, and what returns the count.
+    """
+    count = 0
+
+    def event(*_):
+        nonlocal count
+        count += 1
+        if count == stop:
+            raise Killed
+
+    def wrapped(write):
+        def around(*args, **kwargs):
+            event()
+            write(*args, **kwargs)
+            event()
+
+        return around
+
+    for module in (checkpoint, ply, folder):
+        monkeypatch.setattr(module, "write_atomically", wrapped(module.write_atomically))
+    return event, lambda: count
