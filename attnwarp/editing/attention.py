@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.warp import resize_mask
+from attnwarp.warp import FeatureWarp, resize_mask
 
 Kind = Literal["self", "cross"]
 Block = Literal["down", "mid", "up"]
@@ -476,35 +476,40 @@ def inject(
                 row = list(branches).index(branch) * views + view
                 own = source[view if plan.views > 1 else 0]
                 new = features[row]
-                blended = _blended(warp, own, new, alpha, source_size, size)
+                _blend_into(result[row], new, warp, own, alpha, source_size, size)
                 if mask is not None:
                     inside = resize_mask(mask.cpu(), size).reshape(-1, 1).to(features.device)
-                    blended = torch.where(inside, blended, new)
-                result[row] = blended
+                    result[row] = torch.where(inside, result[row], new)
         return result
 
     with hooked(unet, chosen, blend):
         yield
 
 
-def _blended(
+def _blend_into(
+    result: Tensor,  # (H W, C), a copy of new
+    new: Tensor,  # (H W, C)
     warp: LayerWarp | None,
     source: Tensor,  # (h w, C)
-    new: Tensor,  # (H W, C)
     alpha: float,
     source_size: Size,
     size: Size,
-) -> Tensor:
-    """(H W, C) source tokens, warped and blended into the target's own; None is the identity."""
+) -> None:
+    """Source tokens, warped and blended into the target's own; None is the identity."""
     if warp is None:
         if source_size != size:
             raise ValueError(
                 f"size: the recording has {source_size} features, the target {size}; give a warp"
                 " between views of different sizes"
             )
-        return alpha * source + (1 - alpha) * new
+        result.copy_(alpha * source + (1 - alpha) * new)
+        return
     layer = warp.at(size, source_size=source_size)
-    return layer.blend_tokens(source[None], new[None], alpha)[0]
+    if isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():
+        # A layer is small: most of a blend's time would go into results and their copies.
+        layer.blend_tokens(source[None], result[None], alpha, in_place=True)
+    else:
+        result.copy_(layer.blend_tokens(source[None], new[None], alpha)[0])
 
 
 def _check_call(plan: RecordingPlan, call: Call, rows: int) -> None:

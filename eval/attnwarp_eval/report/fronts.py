@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import Interval, Ratio, interval, time_ratio
+from attnwarp_eval.statistics.intervals import Interval, Ratio, interval
 from attnwarp_eval.study.probes import probe, probes
-from attnwarp_eval.study.probes.base import InTurn, Layout
+from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Front
 
@@ -21,17 +20,11 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         results: of the run.
         layout: of the report.
     """
-    turns = [
-        turn
-        for cell in results.cells
-        if cell.record is not None
-        and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None
-    ]
     section = Section("What accuracy costs in time")
-    section.text = _text(results, turns)
+    section.text = _text(results)
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
-        points, rows = _points(results, turns, front, metric)
+        points, rows = _points(results, front, metric)
         if not points:
             continue
         path = layout.figure(f"front-{index}.svg")
@@ -57,69 +50,58 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     return [section] if section.tables else []
 
 
-def _text(results: Results, turns: list[InTurn]) -> list[str]:
+def _text(results: Results) -> list[str]:
     contents = dict.fromkeys(probe(front.probe).cost_text for front in results.study.fronts)
-    text = (
+    text = [
         f"{' '.join(contents)} A point is on the front when nothing"
         " cheaper is as good, by the means: look at the intervals before believing a close one."
+    ]
+    for stage in dict.fromkeys(probe(front.probe).stage for front in results.study.fronts):
+        timed = timed_in_turn(results, stage)
+        text.append(_once(stage) if timed is None else _in_turn(timed))
+    return list(dict.fromkeys(text))
+
+
+def _once(stage: str) -> str:
+    able = " or ".join(f"`{p.name}`" for p in probes() if stage in p.times_in_turn)
+    advice = f": a study with a {able} probe takes them in turn" if able else ""
+    return (
+        "These seconds come from one pass over the views, each variant at another time, and"
+        f" are for orientation{advice}."
     )
-    if not turns:
-        names = " or ".join(f"`{p.name}`" for p in probes() if p.times_in_turn)
-        return [
-            text,
-            (
-                "These seconds come from one pass over the views, each variant at another time, and"
-                f" are for orientation: a study with a {names} probe takes them in turn."
-            ),
-        ]
-    first = turns[0]
-    return [
-        text,
-        (
-            f"All contestants ran in turn in one process, {first.rounds} rounds in an order drawn"
-            f" anew each round, on view {first.view} of each scene with {first.threads} renderer"
-            f" thread{'s' if first.threads != 1 else ''}; a ratio is the median over rounds of the"
-            " ratio to the first contestant within a round, with a bootstrap interval over rounds."
-            " The row `again` is the first contestant against itself: what noise alone does on this"
-            " machine. Inside that band nothing is called faster or slower."
-        ),
-    ]
 
 
-def _rounds(turns: list[InTurn], stage: str, name: str | None) -> list[list[float]]:
-    """Seconds of a contestant: a list of rounds for each cell that has it; the baseline's second
-    run for None.
-    """
-    return [
-        turn.seconds[stage][-1 if name is None else turn.names.index(name)]
-        for turn in turns
-        if name is None or name in turn.names
-    ]
+def _in_turn(timed: Timed) -> str:
+    first = timed.turns[0]
+    of = ", ".join(dict.fromkeys(turn.of for turn in timed.turns))
+    return (
+        f"All contestants ran in turn in one process, {first.rounds} rounds in an order drawn"
+        f" anew each round, on {of} with {first.threads} renderer"
+        f" thread{'s' if first.threads != 1 else ''}; a ratio is the median over rounds of the"
+        " ratio to the first contestant within a round, with a bootstrap interval over rounds."
+        " The row `again` is the first contestant against itself: what noise alone does on this"
+        " machine. Inside that band nothing is called faster or slower."
+    )
 
 
 def _points(
-    results: Results, turns: list[InTurn], front: Front, metric: str
+    results: Results, front: Front, metric: str
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
     """Seconds and quality of each variant, and the rows of the table but for their last column."""
-    stage = probe(front.probe).stage
-    baseline = turns[0].names[0] if turns else None
-    first = _rounds(turns, stage, baseline) if baseline and stage else []
-    noise = time_ratio(_rounds(turns, stage, None), first) if first else None
-    base = float(np.median(np.concatenate(first))) if first else float("nan")
+    timed = timed_in_turn(results, probe(front.probe).stage)
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
     for name in front.variants:
         quality = results.mean(front.probe, name, metric)
-        taken = _rounds(turns, stage, name) if first else []
-        if noise and not taken:
+        if timed is not None and name not in timed.names:
             # Seconds of another kind have no place on the same axis.
             rows.append([name, spread(quality), "–", "not timed", "–"])
             continue
-        if noise:
-            ratio = time_ratio(taken, first)
-            seconds = _seconds(base, ratio)
-            text = "1" if name == baseline else _ratio(ratio)
-            judged = "baseline" if name == baseline else _judge(ratio, noise)
+        if timed is not None:
+            base, ratio = name == timed.baseline, timed.ratio(name)
+            seconds = timed.seconds(name)
+            text = "1" if base else _ratio(ratio)
+            judged = "baseline" if base else timed.judge(ratio)
         else:
             once = results.seconds(front.probe, name, probe(front.probe).cost)
             if not once:
@@ -131,25 +113,12 @@ def _points(
             )
         points[name] = (seconds, quality)
         rows.append([name, spread(quality), number(1000 * seconds.mean), text, judged])
-    if noise:
-        rows.append(["again", "–", number(1000 * base * noise.ratio), _ratio(noise), "–"])
+    if timed is not None:
+        noise = timed.noise
+        again = number(1000 * timed.base * noise.ratio)
+        rows.append(["again", "–", again, _ratio(noise), "–"])
     return points, rows
-
-
-def _seconds(base: float, ratio: Ratio) -> Interval:
-    nan = float("nan")
-    return Interval(base * ratio.ratio, base * ratio.low, base * ratio.high, 1, 1, 0, nan, nan)
 
 
 def _ratio(ratio: Ratio) -> str:
     return f"{number(ratio.ratio)} [{number(ratio.low)}, {number(ratio.high)}]"
-
-
-def _judge(ratio: Ratio, noise: Ratio) -> str:
-    """Faster or slower only outside the band that the baseline against itself spans."""
-    band = max(noise.high, 1 / noise.low, 1.0)
-    if ratio.low > band:
-        return "slower"
-    if ratio.high < 1 / band:
-        return "faster"
-    return "can't tell"

@@ -258,6 +258,28 @@ def test_one_source_serves_several_views_each_with_its_own_warp():
         assert torch.allclose(together[:, rows], alone, rtol=0, atol=1e-5)
 
 
+def test_a_blend_leaves_what_the_processor_returned_and_has_one_result_with_and_without_gradient():
+    net = unet(8)
+    plan = plan_of(net, steps=1)
+    with record(net, plan) as recording:
+        run(net, timesteps=(500,))
+    first, view = plan.layers[0], between(camera(), camera(x=0.3))
+    processor = Kept()
+    net.get_submodule(first.name).set_processor(processor)
+    sample, text = torch.randn(3, 8, *SIZE), torch.randn(3, 5, 32)
+
+    def output(gradient):
+        with torch.set_grad_enabled(gradient):
+            return net(sample, torch.tensor(500), text).sample.detach()
+
+    with inject(net, recording, branches=PIX2PIX_BRANCHES, warps=(view,), layers=[first]):
+        blended = [output(gradient) for gradient in (False, True)]
+    assert torch.equal(*blended)
+    assert not torch.equal(blended[0], output(False))
+    *during, alone = processor.outputs
+    assert all(torch.equal(features, alone) for features in during)
+
+
 def test_the_weight_falls_as_the_paper_says():
     weights = [decay(0.9)(step, 20) for step in range(20)]
     assert weights == pytest.approx(np.linspace(0.9, 0, 20, endpoint=False))

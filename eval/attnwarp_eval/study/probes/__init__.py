@@ -1,8 +1,8 @@
 """The probes, one file each; other code finds them here by name.
 
 >>> [probe.name for probe in probes()]
-['calibration', 'depth', 'editing', 'fit', 'sensitivity', 'stability', 'timing', 'variability',
- 'warp']
+['calibration', 'depth', 'editing', 'editing-timing', 'fit', 'sensitivity', 'stability', 'timing',
+ 'variability', 'warp']
 >>> probe("depth").columns["AbsRel"]
 'depth.abs_rel'
 """

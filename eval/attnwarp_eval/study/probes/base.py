@@ -62,14 +62,15 @@ class InTurn:
     Attributes:
         names: of the contestants; the first is the baseline.
         seconds: stage -> contestant -> round; the baseline's second run comes last.
-        rounds, threads, view: how they were taken.
+        rounds, threads: how they were taken.
+        of: what each contestant did, in words.
     """
 
     names: tuple[str, ...]
     seconds: Mapping[str, list[list[float]]]
     rounds: int
     threads: int
-    view: str
+    of: str
 
 
 @dataclass
@@ -147,7 +148,7 @@ class Probe(ABC, Generic[E]):
         columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
             Without any, no table of variants can be made of its figures.
         contrasts: metrics in which a variant is tested against a baseline.
-        times_in_turn: whether its records have seconds of :class:`InTurn`.
+        times_in_turn: stages of the :class:`InTurn` that its records have.
         stage: of :class:`InTurn`, the one whose seconds its figures cost.
         cost, cost_of, cost_text: stage of a cell's seconds that its figures cost where nothing was
             taken in turn, what they are seconds of, and what is in them.
@@ -165,7 +166,7 @@ class Probe(ABC, Generic[E]):
     main: ClassVar[bool] = False
     columns: ClassVar[Mapping[str, str]] = {}
     contrasts: ClassVar[Sequence[str]] = ()
-    times_in_turn: ClassVar[bool] = False
+    times_in_turn: ClassVar[Sequence[str]] = ()
     stage: ClassVar[str] = ""
     cost: ClassVar[str] = "steady"
     cost_of: ClassVar[str] = "a view"

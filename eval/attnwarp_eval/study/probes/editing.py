@@ -62,7 +62,10 @@ if TYPE_CHECKING:
 
 Image = npt.NDArray[np.float32]
 
-OWN_WORK = ("source", "warp", "edit", "tune")
+EDITING_PARTS = ("source", "warp", "edit")
+"""Parts of a method's seconds that are neither tuning nor for people."""
+
+OWN_WORK = (*EDITING_PARTS, "tune")
 """Parts of a method's seconds that are its own; renders and files are for people."""
 
 FIDELITY = ("psnr", "mse", "ssim")
@@ -215,6 +218,7 @@ class EditingProbe(Probe[EditResult]):
         "embedding.clip_directional.render",
         "depth.abs_rel.after",
     )
+    stage = "whole"
     cost = "whole"
     cost_of = "an edit"
     cost_text = (

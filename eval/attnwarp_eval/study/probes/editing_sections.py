@@ -15,6 +15,7 @@ from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.turns import timed_in_turn
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
 
@@ -42,6 +43,9 @@ PARTS = ("source", "warp", "edit", "tune")
 
 FEWEST = 3
 """Scenes from which on intervals are drawn."""
+
+WHOLE = "whole"
+"""Stage of :class:`~attnwarp_eval.study.probes.base.InTurn`: all parts of an edit together."""
 
 OWN = "each view alone"
 """The method of settings that edits every view by itself: the control."""
@@ -300,11 +304,21 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     """The best variant for a given time: chosen on every other scene, checked on the rest."""
     scenes = results.study.scenes
     chosen_on, checked_on = scenes[::2], scenes[1::2]
-    seconds = {
-        name: _mean(sum(row.values()) for row in _seconds(results, probe, name).values())
-        for name in names
-        if results.records(probe, name)
-    }
+    measured = [name for name in names if results.records(probe, name)]
+    timed = timed_in_turn(results, WHOLE)
+    if timed is None:
+        seconds = {
+            name: _mean(sum(row.values()) for row in _seconds(results, probe, name).values())
+            for name in measured
+        }
+        origin = "Seconds are means over cells, each at another time: for orientation."
+    else:
+        seconds = {name: timed.seconds(name).mean for name in measured if name in timed.names}
+        origin = (
+            f"Seconds were taken in turn in one process: {', '.join(t.of for t in timed.turns)}."
+        )
+        if rest := [name for name in measured if name not in seconds]:
+            origin += f" Not timed in turn, so left out: {', '.join(rest)}."
     section = Section("Which variant for a given time")
     section.text = [
         (
@@ -312,6 +326,7 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
             f" on {', '.join(chosen_on)}; beside it the same variant on"
             f" {', '.join(checked_on) or 'no other scene'}, which had no part in the choice."
         ),
+        origin,
     ]
     columns = ["seconds at most", "variant", "where chosen", "elsewhere", "best elsewhere"]
     for metric in metrics:

@@ -39,7 +39,7 @@ class Timing(Probe[Rounds]):
     """One cell for all contestants: seconds of separate cells cannot be compared."""
 
     name = "timing"
-    times_in_turn = True
+    times_in_turn = ("render", "pair")
 
     def check(self, study: Study) -> None:
         """A variant without splats renders nothing."""
@@ -118,5 +118,5 @@ class Timing(Probe[Rounds]):
             asdict(record.extra),
             spec["rounds"],
             record.cost.threads,
-            spec["views"][0],
+            f"view {spec['views'][0]} of each scene",
         )

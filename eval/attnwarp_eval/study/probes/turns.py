@@ -1,0 +1,93 @@
+"""Seconds of contestants that ran in turn, over the cells of a run, for a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from attnwarp_eval.statistics.intervals import Interval, Ratio, time_ratio
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import InTurn
+from attnwarp_eval.study.results import Results
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Seconds of one stage of contestants that ran in turn.
+
+    Attributes:
+        turns: one for each cell that timed the stage.
+        stage: of :class:`InTurn`.
+    """
+
+    turns: Sequence[InTurn]
+    stage: str
+
+    @property
+    def baseline(self) -> str:
+        """The contestant that all ratios are to."""
+        return self.turns[0].names[0]
+
+    def rounds(self, name: str | None) -> list[list[float]]:
+        """Seconds of a contestant: a list of rounds for each cell that has it; the baseline's
+        second run for None.
+        """
+        return [
+            turn.seconds[self.stage][-1 if name is None else turn.names.index(name)]
+            for turn in self.turns
+            if name is None or name in turn.names
+        ]
+
+    def of(self, stage: str) -> Timed:
+        """The seconds of another stage."""
+        return Timed(self.turns, stage)
+
+    @property
+    def names(self) -> list[str]:
+        """Every contestant, the baseline first."""
+        return list(dict.fromkeys(name for turn in self.turns for name in turn.names))
+
+    @property
+    def base(self) -> float:
+        """Median seconds of the baseline over cells and rounds."""
+        return float(np.median(np.concatenate(self.rounds(self.baseline))))
+
+    @property
+    def noise(self) -> Ratio:
+        """The baseline against itself: what the machine's noise alone does."""
+        return time_ratio(self.rounds(None), self.rounds(self.baseline))
+
+    def ratio(self, name: str) -> Ratio:
+        """Of a contestant to the baseline within a round."""
+        both = [turn for turn in self.turns if name in turn.names]
+        return time_ratio(self.rounds(name), Timed(both, self.stage).rounds(self.baseline))
+
+    def seconds(self, name: str) -> Interval:
+        """The baseline's times the ratio, so that a slow moment of the machine falls out."""
+        ratio, base, nan = self.ratio(name), self.base, float("nan")
+        low, high = base * ratio.low, base * ratio.high
+        return Interval(base * ratio.ratio, low, high, 1, 1, 0, nan, nan)
+
+    def judge(self, ratio: Ratio) -> str:
+        """Faster or slower only outside the band that the baseline against itself spans."""
+        noise = self.noise
+        band = max(noise.high, 1 / noise.low, 1.0)
+        if ratio.low > band:
+            return "slower"
+        if ratio.high < 1 / band:
+            return "faster"
+        return "can't tell"
+
+
+def timed_in_turn(results: Results, stage: str) -> Timed | None:
+    """The seconds of a stage that cells of a run took in turn; None where none did."""
+    turns = [
+        turn
+        for cell in results.cells
+        if cell.record is not None
+        and stage in probe(cell.probe).times_in_turn
+        and (turn := probe(cell.probe).in_turn(cell, cell.record)) is not None
+    ]
+    return Timed(turns, stage) if turns else None

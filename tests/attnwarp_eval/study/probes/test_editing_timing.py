@@ -1,0 +1,217 @@
+"""Oracles: rows that the editor's network was truly given, against their closed form; planned seconds on a machine that drifts."""
+
+import math
+
+import pytest
+import written_runs
+import yaml
+from ball_scene import SCENE
+
+from attnwarp_eval.report.fronts import fronts
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study import StudyError, cells_of, load_study
+from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.probes import editing, probe
+from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.work import compute
+
+ROUNDS = 3
+STUDY = {
+    "name": "mine",
+    "size": 32,
+    "scenes": ["ball.yaml"],
+    "spp": 4,
+    "splats": {"count": 300},
+    "timing_rounds": ROUNDS,
+    "editing": {"options": {"views_per_stage": 1, "stages": 2, "steps": 1, "iterations": 1}},
+    "variants": {
+        "full": {},
+        "other": {"options": {"stages": 1, "steps": 3, "sources": 2}},
+        "oracle": {"geometry": "truth"},
+    },
+    "probes": {"editing-timing": ["full", "other"]},
+}  # fmt: skip
+BRANCHES = 2
+"""Rows through the network for a view and a step; image guidance of 1 drops a branch."""
+
+# (sources, targets, steps, stages) by the settings above.
+PLANNED = {
+    "full": (1, 2, 1, 2),
+    "other": (2, 1, 3, 1),
+}
+
+
+def load(folder, **changes):
+    (folder / "ball.yaml").write_text(yaml.safe_dump(SCENE))
+    (folder / "mine.yaml").write_text(yaml.safe_dump({**STUDY, **changes}))
+    return load_study(str(folder / "mine.yaml"))
+
+
+def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
+    tmp_path, coarse_textures
+):
+    study = load(tmp_path)
+    scenes = {name: load_scene(name) for name in study.scenes}
+    (cell,) = (c for c in cells_of(study, scenes) if c.probe == "editing-timing")
+    rows = []
+    network = editing.load(cell.sources["editor 0"], cell.spec["contestants"][0]["editor"]).unet
+    hook = network.register_forward_pre_hook(
+        lambda _, args, kwargs: rows.append(len(args[0])), with_kwargs=True
+    )
+    try:
+        record = compute(probe("editing-timing"), cell, tmp_path)
+    finally:
+        hook.remove()
+
+    expected = {
+        name: {
+            "network_rows": (sources + targets) * steps * BRANCHES,
+            "iterations": stages,
+        }
+        for name, (sources, targets, steps, stages) in PLANNED.items()
+    }
+    assert dict(zip(cell.labels, record.extra.work, strict=True)) == expected
+    # One round to compile; the first setting runs twice a round.
+    once = sum(work["network_rows"] for work in expected.values())
+    assert sum(rows) == (ROUNDS + 1) * (once + expected["full"]["network_rows"])
+
+    seconds = record.extra.seconds
+    for rounds in seconds.values():
+        assert [len(row) for row in rounds] == [ROUNDS] * (len(PLANNED) + 1)
+    for index in range(len(PLANNED) + 1):
+        for turn in range(ROUNDS):
+            parts = [seconds[part][index][turn] for part in ("source", "warp", "edit", "tune")]
+            assert seconds["whole"][index][turn] == pytest.approx(sum(parts))
+            assert seconds["editing"][index][turn] == pytest.approx(sum(parts[:3]))
+    assert probe("editing-timing").read(record.to_json()).extra == record.extra
+
+
+LIMITED = {"limited": {"method": "by_view", "budget": {"network_rows": 4}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"probes": {"editing-timing": ["full", "oracle"]}}, "'oracle' warps by the scene's truth"),
+        (
+            {"editing": {}, "variants": LIMITED, "probes": {"editing-timing": ["limited"]}},
+            "'limited' has a budget",
+        ),
+        ({"editing_timing": {"scenes": 0}}, "editing_timing.scenes"),
+    ],
+)
+def test_what_has_no_seconds_of_its_own_is_refused(tmp_path, changes, says):
+    with pytest.raises(StudyError, match=says):
+        load(tmp_path, **changes)
+
+
+ERROR = "multiview.delta_e_above.edit_inside"
+VARIANTS = ["full", "alone", "fast", "slow"]
+RATIOS = {"full": 1.0, "alone": 0.8, "fast": 0.25, "slow": 4.0}
+DRIFT = [1.0, 2.0, 16.0]
+"""How slow the machine was in each round."""
+
+ERRORS = {"full": 1.0, "alone": 9.0, "fast": 3.0, "slow": 0.5}
+BY_CELLS = {"full": 1.0, "alone": 1.0, "fast": 40.0, "slow": 0.1}
+"""Seconds of separate cells, which the machine's drift has turned upside down."""
+
+
+def edited(scene, name):
+    done = Judgement("edited", True, 30.0, 10.0, 10.0)
+    extra = EditResult("red", "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
+    data = written_runs.record(
+        [("red/v0", 15.0, {ERROR: ERRORS[name], "fidelity.mse.edit_inside": ERRORS[name]})],
+        spec={"settings": {}, "editor": {"sha256": "a"}},
+        cost={"seconds": {"whole": BY_CELLS[name], "method: edit": BY_CELLS[name]}},
+        **extra.to_json(),
+    )
+    return written_runs.outcome("editing", scene, [name], data, f"{scene}-{name}")
+
+
+def in_turn(scene, names):
+    def rounds(share):
+        rows = [[share * 2.0 * RATIOS[name] * drift for drift in DRIFT] for name in names]
+        return [*rows, rows[0]]
+
+    shares = {"whole": 1.0, "editing": 0.5, "source": 0.1, "warp": 0.1, "edit": 0.3, "tune": 0.5}
+    alone = {"alone": {"method": "each view alone"}}
+    data = written_runs.record(
+        [],
+        spec={
+            "rounds": len(DRIFT),
+            "edit": {"name": "red"},
+            "contestants": [{"settings": alone.get(name, {})} for name in names],
+        },
+        cost={
+            "rounds": {stage: rounds(share) for stage, share in shares.items()},
+            "work": [{"network_rows": 8, "iterations": 2}] * len(names),
+        },
+    )
+    return written_runs.outcome("editing-timing", scene, names, data)
+
+
+def results(timed=()):
+    scenes = ["bear", "face"]
+    study = {
+        "name": "mine",
+        "size": 64,
+        "scenes": scenes,
+        "variants": {name: {} for name in VARIANTS},
+        "probes": {"editing": VARIANTS},
+        "editing": {"choice": VARIANTS},
+        "fronts": [{"title": "Cost", "probe": "editing", "metric": ERROR, "variants": VARIANTS}],
+    }
+    cells = [edited(scene, name) for scene in scenes for name in VARIANTS]
+    return written_runs.results(
+        study, [*cells, *(in_turn(scene, timed) for scene in scenes if timed)]
+    )
+
+
+def test_the_front_has_the_seconds_of_one_pass_in_turn_where_they_are_there(tmp_path):
+    (section,) = fronts(results(VARIANTS), Layout(tmp_path))
+    rows = {row[0]: row[2:] for row in section.tables[0].rows}
+    # Twice the ratio, times the machine's middle round; separate cells say the contrary.
+    assert rows["full"] == ["4000", "1", "baseline", "yes"]
+    assert rows["fast"] == ["1000", "0.250 [0.250, 0.250]", "faster", "yes"]
+    assert rows["slow"] == ["16000", "4.00 [4.00, 4.00]", "slower", "yes"]
+    assert rows["alone"][3] == "no"
+    assert "the edit red of bear, the edit red of face" in section.text[1]
+
+    (section,) = fronts(results(), Layout(tmp_path))
+    assert {row[0]: row[2] for row in section.tables[0].rows} == {
+        name: f"{1000 * BY_CELLS[name]:.0f}" if BY_CELLS[name] >= 1 else "100" for name in VARIANTS
+    }
+    assert "a study with a `editing-timing` probe" in section.text[1]
+
+
+def test_a_variant_is_chosen_by_seconds_taken_in_turn_and_left_out_without_any(tmp_path):
+    def chosen(run):
+        sections = {s.title: s for _, s in probe("editing").sections(run, Layout(tmp_path))}
+        section = sections["Which variant for a given time"]
+        return [row[:2] for row in section.tables[0].rows], section.text[-1]
+
+    # The best of what the time allows, by the errors above.
+    rows, text = chosen(results(VARIANTS))
+    assert rows == [["1.00", "fast"], ["4.00", "full"], ["16.0", "slow"]]
+    assert "in turn" in text
+    rows, text = chosen(results(["full", "alone"]))
+    assert rows == [["3.20", "alone"], ["4.00", "full"]]
+    assert "left out: fast, slow" in text
+    assert chosen(results())[0] == [["0.100", "slow"]]
+
+
+def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
+    ((_, section),) = probe("editing-timing").sections(results(VARIANTS), Layout(tmp_path))
+    table = section.tables[0]
+    rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
+    fast = rows["fast"]
+    assert (fast["s, median"], fast["lowest to highest"]) == ("1.00", "0.500 to 8.00")
+    assert fast["ratio to 'full'"] == "0.250 [0.250, 0.250]"
+    assert rows["full"]["editing, ratio to control"] == "1.25 [1.25, 1.25]"
+    assert rows["alone"]["editing, ratio to control"] == "–"
+    assert fast["network rows"] == "8"
+    assert math.isclose(float(rows["full"]["tune, s"]), 2.0)
+    assert not list(
+        probe("editing-timing").sections(results(VARIANTS), Layout(tmp_path, timings=False))
+    )
