@@ -300,7 +300,7 @@ class Recording:
 Hook = Callable[[Layer, Tensor, "Call"], Tensor | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Call:
     """One pass of the UNet.
 

@@ -127,6 +127,7 @@ class Run:
         recipe: the other settings of the result, see :func:`settings`; written into the checkpoint,
             which can be resumed with no other.
         every: least seconds between two checkpoints; 0 writes one after each epoch.
+        device: what it runs on, for cards.
     """
 
     path: Path
@@ -134,6 +135,7 @@ class Run:
     epochs: int
     recipe: Mapping[str, Any]
     every: float = 0.0
+    device: str = "one CPU core"
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
         """Run the epochs that are left; each draws from generators seeded by its number, so a
@@ -143,10 +145,10 @@ class Run:
             InputError: the checkpoint is of another recipe, or from before recipes were written
                 into them.
         """
-        first, seconds, saved = 0, 0.0, time.perf_counter()
+        first, seconds, unsaved = 0, 0.0, 0.0
         recipe = {"epochs": self.epochs, **self.recipe}
         if self.path.exists():
-            stored = torch.load(self.path, weights_only=True)
+            stored = torch.load(self.path, weights_only=True, map_location="cpu")
             self._same_recipe(stored.get("recipe"), recipe)
             for name, thing in self.state.items():
                 thing.load_state_dict(stored[name])
@@ -155,14 +157,19 @@ class Run:
             start = time.perf_counter()
             losses = epoch(number)
             spent = time.perf_counter() - start
-            seconds += spent
+            seconds, unsaved = seconds + spent, unsaved + spent
             words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
             print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
-            if number + 1 < self.epochs and time.perf_counter() - saved < self.every:
+            if number + 1 < self.epochs and unsaved < self.every:
                 continue
-            saved = time.perf_counter()
+            unsaved = 0.0
             states = {name: thing.state_dict() for name, thing in self.state.items()}
-            about = {"epoch": number + 1, "seconds": seconds, "recipe": json.dumps(recipe)}
+            about = {
+                "epoch": number + 1,
+                "seconds": seconds,
+                "recipe": json.dumps(recipe),
+                "device": self.device,
+            }
             write_atomically(self.path, functools.partial(torch.save, {**states, **about}))
 
     def _same_recipe(self, stored: str | None, recipe: Mapping[str, Any]) -> None:

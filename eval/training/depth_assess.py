@@ -147,7 +147,7 @@ def depth_card(name: str, results: Sequence[tuple[Figure, Figure]], facts: dict[
         f"# {name}", "",
         "A depth map and a prompt give a picture: a small depth ControlNet with its own UNet, in diffusers' format."
         f" Latents by a fixed orthogonal transform of 4 x 4 px blocks. Trained on pictures of {facts['size']} x {facts['size']} px.", "",
-        f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pictures, {facts['minutes']:.0f} minutes on one shared core,"
+        f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pictures, {facts['minutes']:.0f} minutes on {facts['device']},"
         f" from the weights of the stage {facts['start']}. {facts['state']}", "",
         "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of `training/worlds.py`."
         " **Does not know**: parts of things (a jacket, a pot), other words, photographs of the world.", "",

@@ -36,6 +36,7 @@ from training.editor import (
     scheduler,
     tokenizer_of,
     tokens_of,
+    weights_of,
 )
 from training.editor_answers import codes
 from training.editor_pictures import Pictures, Row
@@ -76,7 +77,6 @@ class DepthStage:
         start: the editor's stage whose text encoder and UNet this one starts from.
         batch: pictures a step.
         seed: of everything random.
-        parts: worlds of parts that the stage it starts from has seen; only the words are of these.
     """
 
     size: int
@@ -84,14 +84,11 @@ class DepthStage:
     peak: float
     worlds: int
     start: str
-    batch: int = 8
+    batch: int = 256
     seed: int = 0
-    parts: int = 0
 
 
-DEPTH_STAGES = {
-    "depth": DepthStage(64, 6_000, 1e-3, 1800, start="plain", batch=512, seed=5, parts=1190)
-}
+DEPTH_STAGES = {"depth": DepthStage(64, 6_000, 1e-3, 1800, start="plain", seed=5)}
 
 
 class DepthNet(torch.nn.Module):
@@ -253,12 +250,15 @@ def prompts_of(worlds: Worlds, tokenizer: Tokenizer, prompts: int = PROMPTS) -> 
 
 def recipe_of(name: str, stage: DepthStage) -> dict[str, Any]:
     """Everything that a stage's result depends on."""
-    from training import editor, steps
+    from training import editor, editor_pool, steps
 
     constants = {key: getattr(editor, key) for key in editor.CONSTANTS}
     constants |= steps.constants()
+    names = ("POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT")
+    constants |= {key: getattr(editor_pool, key) for key in names}
     constants |= {
         "CONTROL_WIDTHS": CONTROL_WIDTHS, "NO_PROMPT": NO_PROMPT, "NAMES_PLACE": NAMES_PLACE, "PROMPTS": PROMPTS,
+        "NOISY_FROM": NOISY_FROM,
     }  # fmt: skip
     return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
 
@@ -267,10 +267,7 @@ def first_net(tokenizer: Tokenizer, stage: DepthStage, out: Path) -> DepthNet:
     """The networks that a stage starts from."""
     size = tokenizer.get_vocab_size()
     first = EditorNet(size, stage.size, draws=False)
-    stored = torch.load(out / f"{stage.start}.pt", weights_only=True, map_location="cpu")["average"]
-    first.load_state_dict(
-        {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
-    )
+    first.load_state_dict(weights_of(out, stage.start))
     return DepthNet(size, stage.size, first)
 
 
@@ -293,7 +290,7 @@ def train_depth_stage(
     device = torch.device(device)
     torch.set_num_threads(threads)
     torch.manual_seed(stage.seed)
-    tokenizer = tokenizer_of(stage, out)
+    tokenizer = tokenizer_of(out)
     if pool is None:
         pool = PromptPool(load_pairs(data, "edit-train", count=stage.worlds), tokenizer, device)
     net = first_net(tokenizer, stage, out).to(device)

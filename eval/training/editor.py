@@ -11,7 +11,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from tokenizers import (
 
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
+from attnwarp.errors import InputError
 from training import editor_pool, steps
 from training.assemblies import KINDS as ASSEMBLIES
 from training.editing_pairs import (
@@ -83,13 +84,14 @@ class Stage:
 
     Attributes:
         size: of the pictures in px; latents have a quarter of it.
-        steps: of ``batch`` pairs each.
+        steps: of them.
         peak: learning rate, which falls over the last 30 %.
         worlds: how many of the training worlds of one thing each are used.
         parts: how many of those of things with parts (:mod:`training.assemblies`).
         start: the stage whose networks this one starts from.
         inject: "none", "features" (recorded features of another run are mixed in, the target composed to match) or
             "control" (the same pairs and steps without the injection).
+        batch: pictures of ``size`` in a step; an injected pair is two of them, and there are a quarter as many large ones.
         seed: of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
@@ -199,20 +201,19 @@ def scheduler(shift: float = 1.0) -> Any:
     return DDIMScheduler(**settings | {"rescale_betas_zero_snr": False, "trained_betas": betas})
 
 
-def make_tokenizer(count: int = 20_000, worlds: int = 200, *, parts: bool = False) -> Tokenizer:
+def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
     """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two.
 
     Args:
-        count: of instructions, four times as many with parts.
+        count: of instructions, about things and parts in turn.
         worlds: whose looks they name.
-        parts: whether to learn the words for parts and for things that have them too.
     """
     rng = np.random.default_rng(20)
     split = PAIR_SPLITS["edit-train"]
     corpus = []
     drawn = [edit_looks(k, split)[0] for k in range(worlds)]
-    things = len(OBJECTS) + (len(ASSEMBLIES) * len(PARTS) if parts else 0)
-    for k in range(count * (4 if parts else 1)):
+    things = len(OBJECTS) + len(ASSEMBLIES) * len(PARTS)
+    for k in range(count):
         looks, thing = drawn[k % worlds], k % things
         kind = list(KINDS)[int(rng.integers(len(KINDS)))]
         look = looks[int(rng.choice(list(GROUPS[kind])))]
@@ -246,10 +247,11 @@ def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
 
 def draw_steps(count: int, generator: torch.Generator, noisy_from: int) -> Tensor:
     """(count,) steps, more of them noisy, on the generator's device."""
-    place = {"generator": generator, "device": generator.device}
-    noisy = torch.randint(noisy_from, T_STEPS, (count,), **place)
-    rest = torch.randint(0, noisy_from, (count,), **place)
-    return torch.where(torch.rand(count, **place) < NOISY_SHARE, noisy, rest)
+    device = generator.device
+    noisy = torch.randint(noisy_from, T_STEPS, (count,), generator=generator, device=device)
+    rest = torch.randint(0, noisy_from, (count,), generator=generator, device=device)
+    share = torch.rand(count, generator=generator, device=device)
+    return torch.where(share < NOISY_SHARE, noisy, rest)
 
 
 def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -288,28 +290,21 @@ def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     if stage.inject != "none":
         from training import editor_injection
 
-        names = (
+        of_injection = (
             "FIRST_WEIGHT", "WEIGHT_SPREAD", "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "MOST_OWN", "NO_TEXT", "WAYS",
             "INJECTED_KINDS",
         )  # fmt: skip
-        constants |= {key: getattr(editor_injection, key) for key in names}
+        constants |= {key: getattr(editor_injection, key) for key in of_injection}
         constants["INJECTED_SHARE"] = INJECTED_SHARE
     return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
 
 
-class HasParts(Protocol):
-    """What :func:`tokenizer_of` reads of a stage."""
-
-    @property
-    def parts(self) -> int: ...
-
-
-def tokenizer_of(stage: HasParts, out: Path) -> Tokenizer:
-    """The tokenizer of the worlds that a stage sees, made where it is missing."""
-    path = out / ("tokenizer-parts.json" if stage.parts else "tokenizer.json")
+def tokenizer_of(out: Path) -> Tokenizer:
+    """The tokenizer of a folder of checkpoints, made where it is missing."""
+    path = out / "tokenizer.json"
     if not path.exists():
         out.mkdir(parents=True, exist_ok=True)
-        make_tokenizer(parts=bool(stage.parts)).save(str(path))
+        make_tokenizer().save(str(path))
     return Tokenizer.from_file(str(path))
 
 
@@ -340,14 +335,11 @@ def train_stage(
     device = torch.device(device)
     torch.set_num_threads(threads)
     torch.manual_seed(stage.seed)
-    tokenizer = tokenizer_of(stage, out)
+    tokenizer = tokenizer_of(out)
     pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
     net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
     if stage.start is not None:
-        stored = torch.load(out / f"{stage.start}.pt", weights_only=True, map_location="cpu")
-        weights = {
-            k.removeprefix("module."): v for k, v in stored["average"].items() if k != "n_averaged"
-        }
+        weights = weights_of(out, stage.start)
         begins = stage.draws and not any(k.startswith("unet.draw.") for k in weights)
         if begins:
             weights |= {k: v for k, v in net.state_dict().items() if k.startswith("unet.draw.")}
@@ -364,6 +356,19 @@ def train_stage(
         net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device
     )  # fmt: skip
     return checkpoint
+
+
+def weights_of(out: Path, stage: str) -> dict[str, Tensor]:
+    """The averaged weights that a stage ended with.
+
+    Raises:
+        InputError: it was not trained.
+    """
+    path = out / f"{stage}.pt"
+    if not path.exists():
+        raise InputError(f"{path}: no such file; train the stage {stage} first")
+    stored = torch.load(path, weights_only=True, map_location="cpu")["average"]
+    return {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
 
 
 def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Tensor) -> list[Task]:

@@ -27,6 +27,10 @@ from training.worlds import COLORS
 
 SEED = 77
 
+ASSESSED = ("color", "material", "ground", "time")
+LARGE_WORLDS = 20
+"""Worlds that pictures of twice the size are judged on: they take four times as long."""
+
 Lab = npt.NDArray[np.float64]
 
 
@@ -67,7 +71,9 @@ def unedited(image: Image, text: str, seed: int) -> Image:
     return image
 
 
-def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> list[Figure]:
+def assess(
+    answer: Answer, worlds: Worlds, *, size: int, noises: int = 12, kinds: Sequence[str] = ASSESSED
+) -> list[Figure]:
     """Held-out figures of an editor.
 
     For each world and kind of edit one pair of looks: of the world's true pictures of that kind, the one
@@ -77,12 +83,13 @@ def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> li
         answer: the editor.
         worlds: of the test split.
         size: of the pictures in px.
-        noises: of an open instruction, for each of a quarter of the worlds.
+        noises: of an open instruction, for each of a quarter of the worlds; 0 leaves that figure out.
+        kinds: of edits.
     """
     pairs = Pictures(worlds, size)
     results = []
     outside: list[float] = []
-    for kind in ("color", "material", "ground", "time"):
+    for kind in kinds:
         right, groups = [], []
         for world in range(len(worlds)):
             rng = np.random.default_rng([SEED, world, list(GROUPS).index(kind)])
@@ -117,7 +124,8 @@ def assess(answer: Answer, worlds: Worlds, *, size: int, noises: int = 12) -> li
             np.arange(len(outside)), asked=1.0,
         )
     )  # fmt: skip
-    results.append(_open(answer, pairs, noises))
+    if noises:
+        results.append(_open(answer, pairs, noises))
     return results
 
 
@@ -187,12 +195,15 @@ def editor_card(
             ", and on the parts of those of `training/assemblies.py` (a jacket, a pot)",
             "",
         )
+    earlier = f" after {facts['before']:,} of the stages before" if facts["before"] else ""
+    larger = f" and of {facts['large']} x {facts['large']} px" if facts["large"] else ""
     lines = [
         f"# {name}", "",
         f"A picture and an instruction give the edited picture: a small InstructPix2Pix in diffusers' format. UNet of {facts['unet']:.1f} million"
         f" parameters, text encoder of {facts['text']:.2f} million, latents by a fixed orthogonal transform of 4 x 4 px"
-        f" blocks. Trained on pictures of {facts['size']} x {facts['size']} px.", "",
-        f"**State**: {facts['steps']} of {facts['planned']} planned steps of {facts['batch']} pairs, {facts['minutes']:.0f} minutes on one shared core. {facts['state']}",
+        f" blocks. Trained on pictures of {facts['size']} x {facts['size']} px{larger}.", "",
+        f"**State**: {facts['steps']:,} of {facts['planned']:,} planned steps of {facts['batch']} pictures{earlier}, {facts['minutes']:.0f} minutes in all on"
+        f" {facts['device']}. {facts['state']}",
         "", "**Knows**: 11 colours, 6 materials, stripes and checks, 7 grounds, 4 times of day, on the things of"
         f" `training/worlds.py`{learned}. **Does not know**: {missing}other words, photographs of the world.", "",
         f"**Injection**: {facts['injection']}", "",
@@ -272,6 +283,11 @@ def assess_editor(
         for results, answer in ((own, answers_of(editor)), (control, unedited)):
             figures = assess(answer, tests, size=size)
             results += [replace(f, what=label + f.what) for f in figures]
+    if facts["large"]:
+        tests = load_pairs(data, "edit-test", count=LARGE_WORLDS)
+        for results, answer in ((own, answers_of(editor)), (control, unedited)):
+            figures = assess(answer, tests, size=facts["large"], kinds=("color",), noises=0)
+            results += [replace(f, what=f"at {facts['large']} px: {f.what}") for f in figures]
     carried = []
     if rounds:
         tests = load_pairs(data, "edit-test", count=worlds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +12,54 @@ from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
+from training import steps
 from training.depth_editor import DEPTH_STAGES, DepthNet
 from training.editor import STAGES, TOKENS, EditorNet, scheduler, tokenizer_of
-from training.steps import STEPS_AN_EPOCH
 
 
-def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, int, float]:
-    """The averaged networks of a checkpoint, the tokenizer, the steps so far and their seconds."""
-    tokenizer = tokenizer_of(STAGES[stage], out)
+@dataclass(frozen=True)
+class Spent:
+    """What a stage took so far.
+
+    Attributes:
+        steps: taken.
+        seconds: of them.
+        device: on which.
+    """
+
+    steps: int
+    seconds: float
+    device: str
+
+
+def averaged(stage: str, out: Path) -> tuple[EditorNet, Tokenizer, Spent]:
+    """The averaged networks of a checkpoint, the tokenizer, and what it took so far."""
+    tokenizer = tokenizer_of(out)
     net = EditorNet(tokenizer.get_vocab_size(), STAGES[stage].size, draws=STAGES[stage].draws)
-    return net, tokenizer, *_load(net, out / f"{stage}.pt")
+    return net, tokenizer, _load(net, out / f"{stage}.pt")
 
 
-def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, int, float]:
+def depth_averaged(stage: str, out: Path) -> tuple[DepthNet, Tokenizer, Spent]:
     """As :func:`averaged`, of a stage of :mod:`training.depth_editor`."""
-    tokenizer = tokenizer_of(DEPTH_STAGES[stage], out)
+    tokenizer = tokenizer_of(out)
     net = DepthNet(tokenizer.get_vocab_size(), DEPTH_STAGES[stage].size)
-    return net, tokenizer, *_load(net, out / f"{stage}.pt")
+    return net, tokenizer, _load(net, out / f"{stage}.pt")
 
 
-def _load(net: torch.nn.Module, checkpoint: Path) -> tuple[int, float]:
-    """Load a checkpoint's averaged weights; its steps so far and their seconds."""
+def _load(net: torch.nn.Module, checkpoint: Path) -> Spent:
+    """Load a checkpoint's averaged weights."""
     stored = torch.load(checkpoint, weights_only=True, map_location="cpu")
     average = {k.removeprefix("module."): v for k, v in stored["average"].items()}
     del average["n_averaged"]
     net.load_state_dict(average)
     net.eval()
-    return STEPS_AN_EPOCH * int(stored["epoch"]), float(stored["seconds"])
+    taken = steps.STEPS_AN_EPOCH * int(stored["epoch"])
+    return Spent(taken, float(stored["seconds"]), stored.get("device", "one CPU core"))
 
 
 def export_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage's editor to ``folder`` in half precision, as diffusers and transformers load it."""
-    net, tokenizer, _, _ = averaged(stage, out)
+    net, tokenizer, _ = averaged(stage, out)
     parts = {"unet": ["attnwarp.editing.small_unet", "EditUNet"]}
     pipeline = "StableDiffusionInstructPix2PixPipeline"
     return _write(folder, net, tokenizer, pipeline, parts, STAGES[stage].shift)
@@ -50,7 +67,7 @@ def export_editor(stage: str, out: Path, folder: Path) -> Path:
 
 def export_depth_editor(stage: str, out: Path, folder: Path) -> Path:
     """Write a stage of :mod:`training.depth_editor` to ``folder``, as :func:`export_editor` does."""
-    net, tokenizer, _, _ = depth_averaged(stage, out)
+    net, tokenizer, _ = depth_averaged(stage, out)
     net.half()
     net.controlnet.save_pretrained(folder / "controlnet")
     parts = {
@@ -91,15 +108,19 @@ def _write(
 
 def facts_of(stage: str, out: Path) -> dict[str, object]:
     """What an editor's card says about its training."""
-    _, _, steps, seconds = averaged(stage, out)
-    plan = STAGES[stage]
-    start = plan.start
+    spent, plan = averaged(stage, out)[2], STAGES[stage]
+    before, seconds, start = 0, spent.seconds, plan.start
     while start is not None:
-        seconds += averaged(start, out)[3]
-        start = STAGES[start].start
-    done = steps >= plan.steps
+        earlier = averaged(start, out)[2]
+        before, seconds, start = (
+            before + earlier.steps,
+            seconds + earlier.seconds,
+            STAGES[start].start,
+        )
+    done = spent.steps >= plan.steps
     return {
-        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds, "parts": plan.parts,
+        "steps": spent.steps, "planned": plan.steps, "before": before, "batch": plan.batch, "minutes": seconds / 60,
+        "device": spent.device, "worlds": plan.worlds, "parts": plan.parts, "large": plan.size * 2 if plan.large else 0,
         "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
         "injection": {
             "none": "none; what its attention features carry, it learned from editing alone.",
@@ -112,11 +133,11 @@ def facts_of(stage: str, out: Path) -> dict[str, object]:
 
 def depth_facts_of(stage: str, out: Path) -> dict[str, object]:
     """What the card of an editor of depth maps says about its training."""
-    _, _, steps, seconds = depth_averaged(stage, out)
-    plan = DEPTH_STAGES[stage]
-    done = steps >= plan.steps
+    spent, plan = depth_averaged(stage, out)[2], DEPTH_STAGES[stage]
+    done = spent.steps >= plan.steps
     return {
-        "steps": steps, "planned": plan.steps, "batch": plan.batch, "minutes": seconds / 60, "worlds": plan.worlds,
+        "steps": spent.steps, "planned": plan.steps, "batch": plan.batch, "minutes": spent.seconds / 60,
+        "device": spent.device, "worlds": plan.worlds,
         "start": plan.start,
         "state": "The stage is complete." if done else "Unfinished: a milestone, to be replaced.",
     }  # fmt: skip

@@ -184,7 +184,7 @@ def draw_moves(
     inside = torch.where(other, warp_mask[rows.world, rows.view].view(-1, cells, cells), inside)
 
     strange = pool.rows(count, generator, size=size, kinds=INJECTED_KINDS, unclear=1.0)
-    strange = replace(strange, view=rows.view, kind=rows.kind, source=rows.source, flip=rows.flip)
+    strange = replace(strange, kind=rows.kind, source=rows.source, flip=rows.flip)
     source = strange.where(of("unrelated"), source)
     mask = inside & regions(cells, count, pool, generator)
     return rows, source, way, index.flatten(1), mask.flatten(1)

@@ -1,7 +1,7 @@
 """The steps of a training: minibatches drawn many at a time, weights averaged, and on a GPU each step as one graph.
 
-A network of three million weights keeps a GPU busy for a few milliseconds a step; starting its thousand kernels one by one
-takes ten times as long. A recorded graph starts them all at once.
+A small network's step is a thousand short kernels. Starting them one by one takes longer than they do; a recorded graph
+starts them all at once.
 """
 
 from __future__ import annotations
@@ -89,6 +89,7 @@ def train_steps(
         recipe: what the result depends on, see :class:`training.common.Run`.
         device: of torch.
     """
+    recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states
     stepper = Stepper(net, plan.peak, tasks, device)
     shares = np.array([task.share for task in tasks])
 
@@ -109,7 +110,17 @@ def train_steps(
         return {key: float(value) / counts[key] for key, value in sums.items()}
 
     state = {"net": net, "average": stepper.average, "optimizer": stepper.optimizer}
-    Run(checkpoint, state, plan.steps // STEPS_AN_EPOCH, recipe, every=SAVE_SECONDS).train(epoch)
+    epochs = plan.steps // STEPS_AN_EPOCH
+    Run(checkpoint, state, epochs, recipe, every=SAVE_SECONDS, device=name_of(device)).train(epoch)
+
+
+def name_of(device: torch.device) -> str:
+    """A device in words."""
+    if device.type == "cuda":
+        return f"one {torch.cuda.get_device_name(device)}"
+    return (
+        "one CPU core" if torch.get_num_threads() == 1 else f"{torch.get_num_threads()} CPU cores"
+    )
 
 
 def minibatches(
@@ -139,10 +150,10 @@ class Stepper:
     def __init__(
         self, net: torch.nn.Module, peak: float, tasks: Sequence[Task], device: torch.device
     ) -> None:
-        from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+        from torch.optim.swa_utils import AveragedModel
 
         self.net, self.tasks, self.device = net, tasks, device
-        self.average = AveragedModel(net, multi_avg_fn=get_ema_multi_avg_fn(EMA))
+        self.average = AveragedModel(net)
         self.graphs: dict[int, tuple[torch.cuda.CUDAGraph, Inputs, dict[str, Tensor]]] = {}
         on_gpu = device.type == "cuda"
         # A graph holds numbers as they were when it was recorded, so the rate has to be a tensor there.
@@ -155,7 +166,7 @@ class Stepper:
         """One step of a task; what its loss says of it."""
         for group in self.optimizer.param_groups:
             if isinstance(group["lr"], Tensor):
-                group["lr"].fill_(rate)
+                group["lr"] = group["lr"].to(self.device).fill_(rate)
             else:
                 group["lr"] = rate
         if self.device.type != "cuda":
@@ -178,8 +189,10 @@ class Stepper:
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         self.optimizer.step()
         with torch.no_grad():
-            own = list(self.average.module.parameters())
-            torch._foreach_lerp_(own, list(self.net.parameters()), 1 - EMA)
+            for own, new in zip(
+                self.average.module.parameters(), self.net.parameters(), strict=True
+            ):
+                own.lerp_(new, 1 - EMA)
         return parts
 
     def recorded(

@@ -11,10 +11,11 @@ from diffusers import StableDiffusionControlNetPipeline
 from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit
 from attnwarp.editing.small import DEPTH_GUIDANCE, load_editor
-from training import depth_editor
+from training import depth_editor, steps
 from training.depth_assess import assess_depth, depth_card, separation
 from training.depth_editor import (
     DepthStage,
+    PromptPool,
     Prompts,
     attributes_of,
     draw_prompt,
@@ -24,6 +25,7 @@ from training.depth_editor import (
 from training.editing_pairs import LOOKS, PAIR_SPLITS, SIZE, THING, Worlds, edit_looks
 from training.editor import EditorNet, make_tokenizer
 from training.editor_export import export_depth_editor
+from training.editor_pictures import Row
 from training.worlds import COLORS, HUES
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
@@ -67,9 +69,10 @@ def trained(tmp_path_factory, worlds, tokenizer):
     folder = tmp_path_factory.mktemp("depth")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(depth_editor, "load_pairs", lambda *args, **more: worlds)
-        patch.setattr(depth_editor, "STEPS_AN_EPOCH", 1)
+        patch.setattr(steps, "STEPS_AN_EPOCH", 1)
+        patch.setattr(steps, "SAVE_SECONDS", 0.0)
         prepare(folder, tokenizer)
-        train_depth_stage("depth-64", folder, folder, stage=TINY)
+        train_depth_stage("depth", folder, folder, stage=TINY)
         yield folder
 
 
@@ -84,28 +87,31 @@ def prepare(folder, tokenizer):
 def test_a_stopped_training_goes_on_to_the_same_weights(trained, tokenizer, tmp_path):
     prepare(tmp_path, tokenizer)
     half = dataclasses.replace(TINY, steps=1)
-    train_depth_stage("depth-64", tmp_path, tmp_path, stage=half)
-    stored = torch.load(tmp_path / "depth-64.pt", weights_only=True)
-    whole = torch.load(trained / "depth-64.pt", weights_only=True)
+    train_depth_stage("depth", tmp_path, tmp_path, stage=half)
+    stored = torch.load(tmp_path / "depth.pt", weights_only=True)
+    whole = torch.load(trained / "depth.pt", weights_only=True)
     assert (stored["epoch"], whole["epoch"]) == (1, 2)
     # The first step's rate depends on the plan's length no more than the warming up does.
     stored["recipe"] = whole["recipe"]
-    torch.save(stored, tmp_path / "depth-64.pt")
-    train_depth_stage("depth-64", tmp_path, tmp_path, stage=TINY)
-    again = torch.load(tmp_path / "depth-64.pt", weights_only=True)
+    torch.save(stored, tmp_path / "depth.pt")
+    train_depth_stage("depth", tmp_path, tmp_path, stage=TINY)
+    again = torch.load(tmp_path / "depth.pt", weights_only=True)
     for part in ("net", "average"):
         for key, value in whole[part].items():
             assert torch.equal(value, again[part][key]), key
 
 
 def test_prompts_are_true_of_the_picture_and_none_of_a_scene_is_drawn(worlds, tokenizer):
-    prompts = Prompts(worlds, 64, tokenizer)
-    rng, noise = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    pool = PromptPool(worlds, tokenizer, prompts=20)
+    generator = torch.Generator().manual_seed(0)
     assert len(reserved_prompts()) >= 30
-    for _ in range(200):
-        row, text = prompts.prompted(rng, torch.randn((48, 16, 16), generator=noise))
+    noise = torch.randn((200, 48, 16, 16), generator=generator)
+    rows, tokens = pool.prompted(noise, generator, size=64)
+    for k in range(len(rows)):
+        text = tokenizer.decode(tokens[k].tolist())
         assert text.lower() not in reserved_prompts()
-        look = attributes_of(worlds, row.world)[row.target]
+        look = attributes_of(worlds, int(rows.world[k]))[int(rows.target[k])]
+        assert worlds.valid[int(rows.world[k]), int(rows.target[k])]
         named = {
             color
             for color in COLORS
@@ -126,11 +132,24 @@ def test_a_prompt_of_a_reserved_sentence_is_drawn_again(monkeypatch):
 
 
 def test_the_control_picture_is_the_inverse_depth_of_the_cut(worlds, tokenizer):
-    prompts = Prompts(worlds, 64, tokenizer)
-    row, _ = prompts.prompted(np.random.default_rng(1), torch.randn(48, 16, 16), world=0)
-    row = dataclasses.replace(row, corner=(32, 8, 1), flip=True)
-    expected = 1 / worlds.depth[0, row.view, 32:96, 8:72][:, ::-1]
-    np.testing.assert_allclose(prompts.control(row)[..., 1], expected / expected.max(), rtol=1e-5)
+    row = Row(0, 1, 0, 0, "color", False, (32, 8, 1), True)
+    expected = 1 / worlds.depth[0, 1, 32:96, 8:72][:, ::-1]
+    alone = Prompts(worlds, 64).control(row)
+    np.testing.assert_allclose(alone[..., 1], expected / expected.max(), rtol=1e-5)
+    # Many at once are the same pictures, also where nothing is near and where a pixel stands for a block.
+    pool = PromptPool(worlds, tokenizer, prompts=4)
+    generator = torch.Generator().manual_seed(1)
+    noise = torch.randn((12, 48, 16, 16), generator=generator)
+    rows, _ = pool.prompted(noise, generator, size=64)
+    assert len(set(rows.zoom.tolist())) == 2
+    for k, image in enumerate(pool.control(rows, 64)):
+        corner = (int(rows.y[k]), int(rows.x[k]), int(rows.zoom[k]))
+        one = Row(
+            int(rows.world[k]), int(rows.view[k]), 0, 0, "color", False, corner, bool(rows.flip[k])
+        )
+        np.testing.assert_allclose(
+            image.permute(1, 2, 0), Prompts(worlds, 64).control(one), rtol=1e-6
+        )
 
 
 def test_variance_explained_by_a_mask_is_the_closed_form():
@@ -147,7 +166,7 @@ def test_variance_explained_by_a_mask_is_the_closed_form():
 
 
 def test_diffusers_own_pipeline_draws_the_same_picture(trained, worlds, tmp_path):
-    folder = export_depth_editor("depth-64", trained, tmp_path / "small-depth")
+    folder = export_depth_editor("depth", trained, tmp_path / "small-depth")
     pipe = StableDiffusionControlNetPipeline.from_pretrained(folder, torch_dtype=torch.float32)
     pipe.set_progress_bar_config(disable=True)
     ours = load_editor(str(folder), guidance=2.0)
@@ -165,7 +184,7 @@ def test_diffusers_own_pipeline_draws_the_same_picture(trained, worlds, tmp_path
 
 def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
     """Also the parts of a picture that the depth map decides."""
-    prompts = Prompts(worlds, 64, None)
+    prompts = Prompts(worlds, 64)
 
     def knows(editor, prompts, row, prompt, *, seed):
         return np.clip((prompts.picture(row, row.target) + 1) / 2, 0, 1)
@@ -177,7 +196,7 @@ def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
     assert all(own.value == 1 for own, _ in results)
     assert all(control.value == 0 for _, control in results)
     facts = {
-        "size": 64, "steps": 2, "planned": 2, "batch": 2, "minutes": 0, "start": "first", "worlds": 2,
+        "size": 64, "device": "one CPU core", "steps": 2, "planned": 2, "batch": 2, "minutes": 0, "start": "first", "worlds": 2,
         "state": "The stage is complete.", "guidance": DEPTH_GUIDANCE,
     }  # fmt: skip
     card = depth_card("small-depth", results, facts)

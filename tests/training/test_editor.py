@@ -8,14 +8,16 @@ import pytest
 import torch
 import yaml
 from diffusers import StableDiffusionInstructPix2PixPipeline
+from typer.testing import CliRunner
 
 import attnwarp_eval
-from attnwarp.editing.attention import decay
 from attnwarp.editing.editor import edit
 from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import load_editor
-from training import editing_pairs, editor, editor_draws, editor_injection
+from attnwarp.errors import InputError
+from training import editing_pairs, editor, editor_draws, editor_injection, steps
 from training.data import SPLITS
+from training.edit import app as recipe
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -27,9 +29,11 @@ from training.editing_pairs import (
     load_pairs,
     reserved,
 )
-from training.editor import Pairs, Row, Stage, codes, make_tokenizer, picked, train_stage
-from training.editor_export import export_editor
-from training.editor_injection import Moves, draw_moves, injected_loss
+from training.editor import Stage, make_tokenizer, train_stage
+from training.editor_answers import codes, picked
+from training.editor_export import export_editor, facts_of
+from training.editor_pictures import Pictures, Row
+from training.editor_pool import Pool
 from training.worlds import COLORS, held_out
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
@@ -50,9 +54,9 @@ def tokenizer():
     return make_tokenizer(400, worlds=10)
 
 
-@pytest.fixture
-def pairs(data, tokenizer):
-    return Pairs(load_pairs(data, "edit-train", count=2), 64, tokenizer)
+@pytest.fixture(scope="module")
+def pool(data, tokenizer):
+    return Pool(load_pairs(data, "edit-train", count=2), tokenizer, sentences=4)
 
 
 def scene_instructions():
@@ -151,46 +155,69 @@ def test_the_noise_picks_every_answer_as_often():
 
 
 def checkpoint(folder):
-    return torch.load(folder / "drawn-64.pt", weights_only=True)
+    return torch.load(folder / "drawn.pt", weights_only=True)
 
 
 def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
     data, tmp_path, tokenizer, monkeypatch
 ):
-    monkeypatch.setattr(editor, "STEPS_AN_EPOCH", 2)
+    monkeypatch.setattr(steps, "STEPS_AN_EPOCH", 2)
+    monkeypatch.setattr(steps, "SAVE_SECONDS", 0.0)
     for name in ("whole", "halves"):
         (tmp_path / name).mkdir()
         tokenizer.save(str(tmp_path / name / "tokenizer.json"))
-    train_stage("drawn-64", data, tmp_path / "whole", stage=TINY)
-    original = editor.falling_rate
+    train_stage("drawn", data, tmp_path / "whole", stage=TINY)
+    original = steps.falling_rate
 
     def stop(step, *more):
         if step == 3:
             raise KeyboardInterrupt
         return original(step, *more)
 
-    monkeypatch.setattr(editor, "falling_rate", stop)
+    monkeypatch.setattr(steps, "falling_rate", stop)
     with pytest.raises(KeyboardInterrupt):
-        train_stage("drawn-64", data, tmp_path / "halves", stage=TINY)
+        train_stage("drawn", data, tmp_path / "halves", stage=TINY)
     assert checkpoint(tmp_path / "halves")["epoch"] == 1
-    monkeypatch.setattr(editor, "falling_rate", original)
-    train_stage("drawn-64", data, tmp_path / "halves", stage=TINY)
+    monkeypatch.setattr(steps, "falling_rate", original)
+    train_stage("drawn", data, tmp_path / "halves", stage=TINY)
     one, other = checkpoint(tmp_path / "whole"), checkpoint(tmp_path / "halves")
     for part in ("net", "average"):
         for key, value in one[part].items():
             assert torch.equal(value, other[part][key]), (part, key)
 
-    folder = export_editor("drawn-64", tmp_path / "whole", tmp_path / "exported")
+    folder = export_editor("drawn", tmp_path / "whole", tmp_path / "exported")
     check_export(folder)
 
     for inject in ("features", "control"):
-        stage = dataclasses.replace(TINY, start="drawn-64", inject=inject)
-        train_stage(f"{inject}-64", data, tmp_path / "whole", stage=stage)
-        after = torch.load(tmp_path / "whole" / f"{inject}-64.pt", weights_only=True)["net"]
+        stage = dataclasses.replace(TINY, start="drawn", inject=inject)
+        train_stage(inject, data, tmp_path / "whole", stage=stage)
+        after = torch.load(tmp_path / "whole" / f"{inject}.pt", weights_only=True)["net"]
         assert all(torch.isfinite(v).all() for v in after.values())
         assert not torch.equal(
             after["unet.conv_out.weight"], one["average"]["module.unet.conv_out.weight"]
         )
+    monkeypatch.setitem(editor.STAGES, "drawn", TINY)
+    monkeypatch.setitem(editor.STAGES, "control", stage)
+    facts = facts_of("control", tmp_path / "whole")
+    assert (facts["steps"], facts["before"], facts["large"]) == (4, 4, 0)
+    assert "CPU core" in str(facts["device"])
+    with pytest.raises(InputError, match="nothing.pt: no such file; train the stage nothing first"):
+        train_stage("features", data, tmp_path, stage=dataclasses.replace(TINY, start="nothing"))
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["train", "plain", "--device", "tpu"], "expected cpu or cuda"),
+        (["train", "drawn-64"], "expected one of plain, drawn, features, control, depth"),
+        (["export", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
+        (["assess", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
+    ],
+)
+def test_an_unknown_stage_or_device_is_refused_by_name(words, reason):
+    result = CliRunner().invoke(recipe, words)
+    assert result.exit_code == 2
+    assert reason in " ".join(result.output.replace("│", " ").split())
 
 
 def check_export(folder):
@@ -215,50 +242,54 @@ def check_export(folder):
     assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 20e6
 
 
-def test_the_blend_moves_masks_and_mixes_tokens():
-    generator = torch.Generator().manual_seed(0)
-    new, recorded = (torch.randn((2, 16, 3), generator=generator) for _ in range(2))
-    index = torch.stack([torch.arange(15, -1, -1), torch.arange(16)])
-    mask = torch.zeros((2, 16), dtype=torch.bool)
-    mask[0, :8] = mask[1, 5] = True
-    moves = Moves(4, index, mask, torch.tensor([0.25, 1.0]))
-    from attnwarp.editing.attention import Layer
-
-    out = moves.blend(Layer("layer", "self", 0, 3), recorded, new)
-    for row in range(2):
-        for cell in range(16):
-            a = (0.25, 1.0)[row]
-            expected = new[row, cell]
-            if mask[row, cell]:
-                expected = a * recorded[row, index[row, cell]] + (1 - a) * new[row, cell]
-            assert torch.allclose(out[row, cell], expected, rtol=0, atol=1e-6)
-    coarse, share = Moves(
-        4, torch.arange(16)[None], torch.ones((1, 16), dtype=torch.bool), torch.ones(1)
-    ).level(1)
-    assert coarse.tolist() == [[0, 1, 2, 3]]
-    assert share.all()
-
-
-def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pairs, tokenizer):
+def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pool, tokenizer):
     torch.manual_seed(0)
     net = editor.EditorNet(tokenizer.get_vocab_size(), 64)
     torch.nn.init.normal_(net.unet.conv_out.weight, std=0.05)
     alphas = editor.scheduler().alphas_cumprod
-    parts = [
-        injected_loss(
-            pairs,
-            net,
-            alphas,
-            editor.tokens_of(tokenizer, [""])[0],
-            3,
-            np.random.default_rng(2),
-            torch.Generator().manual_seed(2),
-            inject=inject,
-        )[1]
+    empty = editor.tokens_of(tokenizer, [""])[0]
+    inputs = [
+        editor_injection.inputs(
+            pool, alphas, empty, 64, 3, torch.Generator().manual_seed(2), inject=inject
+        )
         for inject in (True, False)
+    ]
+    # Everything of run A, and all that decides what could go over, is the same.
+    for key in ("noisy A", "before A", "target A", "weight A", "t", "tokens", "index", "mask"):
+        assert torch.equal(inputs[0][key], inputs[1][key]), key
+    parts = [
+        editor_injection.injected_loss(net, x, inject=inject)[1]
+        for x, inject in zip(inputs, (True, False), strict=True)
     ]
     assert parts[0]["recorded"] == parts[1]["recorded"]
     assert parts[0]["injected"] != parts[1]["injected"]
+
+
+@pytest.mark.parametrize("way", ["same", "mirrored", "unrelated"])
+def test_the_target_is_the_recorded_answer_where_features_went_and_ones_own_elsewhere(
+    pool, tokenizer, monkeypatch, way
+):
+    ways = dict.fromkeys(editor_injection.WAYS, 0.0) | {way: 1.0}
+    monkeypatch.setattr(editor_injection, "WAYS", ways)
+    alphas, empty = editor.scheduler().alphas_cumprod, torch.zeros(24, dtype=torch.int64)
+    x, control = (
+        editor_injection.inputs(
+            pool, alphas, empty, 64, 12, torch.Generator().manual_seed(5), inject=inject
+        )
+        for inject in (True, False)
+    )
+    own, target = control["target B"], x["target B"]
+    mask = x["mask"].view(12, 1, 16, 16).expand_as(own)
+    assert torch.equal(target[~mask], own[~mask])
+    if way == "unrelated":  # features of another picture are to change nothing
+        assert torch.equal(target, own)
+        return
+    answer = x["target A"].flip(3) if way == "mirrored" else x["target A"]
+    # A mirrored cell's details are mirrored too; its mean and its middle bands are not.
+    channels = 3 if way == "mirrored" else 48
+    inside = mask[:, :channels]
+    assert torch.allclose(target[:, :channels][inside], answer[:, :channels][inside], atol=1e-5)
+    assert (target != own).any()
 
 
 def test_layers_of_the_noise_learn_what_the_answer_it_picks_adds_to_an_open_sentence(
@@ -350,16 +381,14 @@ def test_the_schedule_ends_in_pure_noise(shift):
     assert scheduler.timesteps[0] == 999
 
 
-def test_the_rate_falls_at_the_end():
-    rates = [editor.falling_rate(step, 1000, 1.0, warm=100) for step in range(1000)]
-    assert rates[0] == 0.01 and rates[99] == 1 and rates[600] == 1
-    assert np.all(np.diff(rates[100:]) <= 0)
-    assert 0 < rates[-1] < 0.03
-    steps = editor.draw_steps(20_000, np.random.default_rng(0), 600).numpy()
-    assert (steps >= 600).mean() == pytest.approx(0.6, abs=0.02)
+def test_more_steps_are_drawn_where_the_answer_is_decided():
+    drawn = editor.draw_steps(20_000, torch.Generator().manual_seed(0), 600)
+    assert float((drawn >= 600).float().mean()) == pytest.approx(0.6, abs=0.02)
+    assert int(drawn.min()) >= 0 and int(drawn.max()) == 999
 
 
-def test_a_row_shows_the_same_pixels_of_every_picture(pairs):
+def test_a_row_shows_the_same_pixels_of_every_picture(data):
+    pairs = Pictures(load_pairs(data, "edit-train", count=2), 64)
     row = Row(1, 0, 0, 3, "color", False, (20, 30, 1), True)
     full = pairs.worlds.images[1, 0, 3].astype(np.float32)
     expected = full[20:84, 30:94][:, ::-1] / 127.5 - 1

@@ -70,17 +70,23 @@ def test_an_editor_that_knows_every_answer_gets_all_and_one_that_changes_nothing
     assert [v.value for k, v in control.items() if k.startswith("another colour")] == [0]
     facts = {
         "unet": 3.2, "text": 0.4, "size": 64, "steps": 10, "planned": 100, "batch": 8, "minutes": 5.0, "state": "Unfinished.",
-        "injection": "none", "worlds": 2, "parts": 0, "tested": 2, "text_guidance": 1.5, "image_guidance": 1.0,
+        "injection": "none", "worlds": 2, "parts": 0, "before": 0, "large": 0, "device": "one CPU core", "tested": 2, "text_guidance": 1.5, "image_guidance": 1.0,
     }  # fmt: skip
     card = editor_card("small-plain", list(control.values()), list(control.values()), facts)
     assert "10 of 100 planned steps" in card
     swapped = figure("features make it their colour", [1, 0, 0, 0], [0, 0, 1, 1], asked=0.8)
     both = editor_card(
-        "small", list(figures.values()), list(control.values()), facts | {"parts": 3}, [swapped]
+        "small",
+        list(figures.values()),
+        list(control.values()),
+        facts | {"parts": 3, "before": 1200, "large": 128},
+        [swapped],
     )
     assert "| features make it their colour | **25 %**" in both
     assert "Short of what was asked for: features make it their colour" in both.replace("\n", " ")
     assert "parts of those of" in both
+    assert "after 1,200 of the stages before" in both and "and of 128 x 128 px" in both
+    assert "of the stages before" not in card and "128" not in card
     assert "parts of those of" not in card
     assert "Short of what was asked for: nearest true color" in card
     assert set(GROUPS) >= {"color", "material", "ground", "time"}
