@@ -10,6 +10,7 @@ import torch
 
 from attnwarp.render import _pool, order
 from attnwarp.render._kernels import binning, layout, ordering, projection
+from attnwarp.render.dispatch import call
 from attnwarp.render.interface import Inputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
@@ -193,7 +194,8 @@ class BinnedSplats:
     ) -> np.ndarray:
         """Project a group of splats; returns their runs."""
         outlines = _pool.empty((last - first, layout.OUTLINE_SIZE), np.float32)
-        projection.project(
+        call(
+            projection.project,
             first,
             last,
             self.view,
@@ -217,9 +219,10 @@ class BinnedSplats:
             target = layout.Runs(
                 _pool.empty((room, layout.RUN_SIZE), np.int32), self._run_counts, changes
             )
-            used = binning.find_runs(
-                first, last, self.view, self.tiles, self.table, outlines, before, target, pieces
-            )
+            used = call(
+                binning.find_runs,
+                first, last, self.view, self.tiles, self.table, outlines, before, target, pieces,
+            )  # fmt: skip
             if used <= room:
                 return target.runs[:used]
             room = used
@@ -252,7 +255,7 @@ class BinnedSplats:
         no_changes = np.zeros((0, self.tile_count + 1), np.int32)
         changes = join(self._changes) if self._changes else no_changes
         cursors = _pool.empty(changes.shape, np.int64)
-        binning.place_cursors(changes, live, cursors, starts, counts)
+        call(binning.place_cursors, changes, live, cursors, starts, counts)
         entries = _pool.empty(int(counts.sum()), np.int64)
         before = np.concatenate([[0], np.cumsum(live)])
         run_jobs(

@@ -38,6 +38,7 @@ from attnwarp.render.binned import (
     as_array,
     join,
 )
+from attnwarp.render.dispatch import call
 from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 
@@ -131,7 +132,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
             ended = band if is_last else band & opaque
             used = _pool.empty(int(processed[ended].sum()) if with_state else 0, np.int64)
             offset = sum(map(len, cached))
-            rasterization.settle(ended, lists, progress, sums, offset, starts, used)
+            call(rasterization.settle, ended, lists, progress, sums, offset, starts, used)
             cached.append(used)
         live = live & ~opaque
         if is_last or not live.any():
@@ -139,7 +140,7 @@ def _draw(inputs: Inputs, *, with_state: bool) -> _Drawn:
         count = len(binned.order)
     binned.lists = layout.Lists(starts, processed, join(cached))
     weight = _pool.zeros(len(binned.splats.means), np.float32)
-    rasterization.splat_weights(binned.order, sums, weight)
+    call(rasterization.splat_weights, binned.order, sums, weight)
     counters = {
         "splats": len(binned.splats.means),
         "visible": len(binned.order),

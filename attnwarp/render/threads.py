@@ -14,6 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
+from attnwarp.render.dispatch import machine_code
+
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
 
@@ -48,24 +50,13 @@ def thread_count() -> int:
     return _chosen or max(1, torch.get_num_threads())
 
 
-def _compiled(work: Callable[..., None], job: tuple) -> Callable[..., None]:
-    """The machine code of a kernel for arguments of the types of ``job``; else ``work`` itself.
-
-    numba looks at every member of a structure at every call, which for structures of arrays takes
-    tens of microseconds: once for all jobs is enough.
-    """
-    if not hasattr(work, "typeof_pyval"):
-        return work
-    return work.compile(tuple(work.typeof_pyval(argument) for argument in job))  # type: ignore[attr-defined]
-
-
 def run_jobs(work: Callable[..., None], jobs: Sequence[tuple]) -> None:
     """Call work(*job) for every job, on up to :func:`thread_count` threads.
 
     Jobs must not write to the same place, and each argument has the same type in all of them.
     """
-    if len(jobs) > 1:
-        work = _compiled(work, jobs[0])
+    if jobs:
+        work = machine_code(work, jobs[0])
     threads = min(thread_count(), len(jobs))
     if threads <= 1:
         for job in jobs:

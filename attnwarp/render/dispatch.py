@@ -1,0 +1,48 @@
+"""Which machine code a call of a kernel runs.
+
+numba works out the types of all arguments at every call, which takes microseconds for each array
+of a structure. A small picture takes milliseconds and dozens of calls with dozens of arrays, so
+that this would be a fifth of its time: here the machine code for such arguments is looked up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+
+_machine_code: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+
+def _type_key(value: Any) -> Any:
+    """Equal for two values only if numba gives them the same type."""
+    kind = type(value)
+    if kind is np.ndarray:
+        flags = value.flags
+        if flags.c_contiguous and flags.aligned:
+            return value.dtype, value.ndim, flags.writeable
+    elif isinstance(value, tuple):
+        return kind, *map(_type_key, value)
+    elif kind is not int or value.bit_length() < 64:
+        return kind
+    return numba.typeof(value)
+
+
+def machine_code(kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """What ``kernel`` is compiled to for arguments of such types; it is compiled if need be.
+
+    Where numba was told to compile nothing, a kernel is a plain function: itself.
+    """
+    if not hasattr(kernel, "typeof_pyval"):
+        return kernel
+    key = (kernel, *map(_type_key, arguments))
+    if key not in _machine_code:
+        _machine_code[key] = kernel.compile(tuple(map(kernel.typeof_pyval, arguments)))  # type: ignore[attr-defined]
+    return _machine_code[key]
+
+
+def call(kernel: Callable[..., Any], *arguments: Any) -> Any:
+    """``kernel(*arguments)``."""
+    return machine_code(kernel, arguments)(*arguments)
