@@ -38,6 +38,11 @@ MITSUBA_TOLERANCE = 1e-4
 that.
 """
 
+SMALL = 256
+"""Pixels: in smaller pictures, depth changes from pixel to pixel by more than the rules for exact
+depth let its taps spread. They then reject much that is visible, and their F1 says little.
+"""
+
 LARGEST_EPE = 1e-3
 """Pixels: the largest median endpoint error of the truth's own depth through the warp."""
 
@@ -209,6 +214,13 @@ class Calibration(Probe[Extra]):
                 " lies at edges, where taps reach across."
             ),
         ]
+        if results.study.size < SMALL:
+            text.append(
+                f"The pictures are small: at {results.study.size} px, depth on a slope changes from"
+                f" pixel to pixel by more than the {100 * TAP_SPREAD:g} % that these rules let its"
+                " taps spread. So they reject much that is visible, and their F1 is low. The"
+                " study's variants use wider tolerances."
+            )
         if bad:
             text.insert(
                 0,
