@@ -28,6 +28,22 @@ def test_what_is_needed_works_here_and_each_lack_has_its_cost_and_remedy():
         assert bool(check.cost) == bool(check.remedy) == (check.state != "ok")
 
 
+@pytest.mark.slow
+def test_a_machine_without_llvm_is_told_so_unless_it_asked_for_none():
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": os.devnull}
+    states = {}
+    for chosen in ("", "scalar_rgb"):
+        done = subprocess.run(
+            [*COMMAND, "doctor", "--json"],
+            capture_output=True,
+            text=True,
+            env=environment | {"ATTNWARP_MITSUBA": chosen},
+        )
+        states[chosen] = {c["name"]: c["state"] for c in json.loads(done.stdout)}
+    assert states[""]["true pictures"] == "lack"
+    assert states["scalar_rgb"]["true pictures"] == "ok"
+
+
 def test_lines_fit_a_terminal_of_80_columns():
     words = "a rather long text of many words about a machine " * 5
     text = lines(Check("3D window", "lack", words, words, words))
