@@ -29,7 +29,7 @@ from attnwarp.editing.command import (
     edit_image,
 )
 from attnwarp.errors import InputWarning
-from attnwarp.process import skip_last_collection
+from attnwarp.process import core_count, skip_last_collection
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -228,8 +228,6 @@ def _use_threads(threads: int | None) -> None:
     """Threads for the renderer alone: the rest is too small for them, and its bits would depend on
     their number.
     """
-    import os
-
     import cv2
     import torch
 
@@ -237,7 +235,7 @@ def _use_threads(threads: int | None) -> None:
 
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    set_thread_count(threads or len(os.sched_getaffinity(0)))
+    set_thread_count(threads or core_count())
 
 
 @app.command()

@@ -29,6 +29,7 @@ import torch
 from attnwarp.editing.small import load_editor, thread_count
 from attnwarp.fit import FitSettings, fit, from_points, hold_out, load_views
 from attnwarp.io import read_dataset
+from attnwarp.process import core_count
 from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
 from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
@@ -149,7 +150,7 @@ def table(rows: Sequence[dict[str, Any]], data: Path, load: float) -> str:
         "|---|---|---|---|",
         *(f"| {n:,} | {k:,} | {cpu:.0f} | {psnr:.2f} |" for n, k, cpu, psnr in rows[0]["curve"]),
         "",
-        f"{len(os.sched_getaffinity(0))} threads; load average of the machine at the end"
+        f"{core_count()} threads; load average of the machine at the end"
         f" {load:.1f}. Above the number of threads, all seconds are too long.",
         "",
     ]
@@ -237,7 +238,7 @@ def ratio_table(figures: dict[str, list[dict[str, float]]], load: float) -> str:
     lines += [
         "",
         f"Rows through the network: {rows[0]:.0f} and {rows[1]:.0f}."
-        f" {len(figures['propagation'])} rounds; {len(os.sched_getaffinity(0))} threads; load"
+        f" {len(figures['propagation'])} rounds; {core_count()} threads; load"
         f" average of the machine at the end {load:.1f}. Above the number of threads, seconds are"
         " too long and ratios noisy.",
         "",
@@ -286,7 +287,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             app(["scenes", "export", "bear", str(data)], standalone_mode=False)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    set_thread_count(len(os.sched_getaffinity(0)))
+    set_thread_count(core_count())
     rows = []
     for plan in plans():
         if not options.plans or plan.name in options.plans:

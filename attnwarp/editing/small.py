@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.errors import InputError, suggest
+from attnwarp.process import core_count
 
 if TYPE_CHECKING:
     from attnwarp.editing.controlnet import DepthControlNet
@@ -75,7 +75,7 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
     if asked is not None:
         return asked
     small = sum(p.numel() for p in editor.unet.parameters()) < ONE_THREAD_PARAMETERS
-    return 1 if small else len(os.sched_getaffinity(0))
+    return 1 if small else core_count()
 
 
 def guide_of(name_or_folder: str) -> Guide:

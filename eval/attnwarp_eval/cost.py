@@ -4,7 +4,6 @@ on.
 
 from __future__ import annotations
 
-import os
 import platform
 import resource
 import statistics
@@ -21,6 +20,8 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+
+from attnwarp.process import core_count
 
 T = TypeVar("T")
 
@@ -181,7 +182,7 @@ def environment() -> dict[str, Any]:
         "machine": {
             "system": platform.system(),
             "arch": platform.machine(),
-            "cores": len(os.sched_getaffinity(0)),
+            "cores": core_count(),
         },
         "git": _git(Path(__file__).resolve().parent),
     }

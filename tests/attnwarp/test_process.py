@@ -1,7 +1,10 @@
 """The oracle is the interpreter's own count of what its collector leaves alone."""
 
+import os
 import subprocess
 import sys
+
+from attnwarp.process import core_count
 
 
 def test_nothing_is_left_to_search_as_the_process_ends():
@@ -13,3 +16,16 @@ def test_nothing_is_left_to_search_as_the_process_ends():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "False", "True", "True"]
+
+
+def test_cores_are_those_that_this_process_may_use(monkeypatch):
+    cores = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(cores)})
+        assert core_count() == 1
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert core_count() == len(cores)
+    # As on macOS.
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert core_count() == os.cpu_count()

@@ -18,6 +18,8 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
+from attnwarp.process import core_count
+
 State = Literal["ok", "lack", "broken"]
 
 LONGEST = 120
@@ -108,7 +110,7 @@ def extras() -> Check:
 
 def threads() -> Check:
     """Cores and memory, and the workers that fit."""
-    cores = len(os.sched_getaffinity(0))
+    cores = core_count()
     free = _free_memory_gb()
     jobs = max(1, min(cores, int(free / WORKER_GB)))
     text = f"{cores} of {os.cpu_count()} cores, {free:.1f} GB of memory free"

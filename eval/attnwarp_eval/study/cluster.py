@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import queue
 import signal
 import threading
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.errors import InputError
+from attnwarp.process import core_count
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probes import probe
@@ -143,7 +143,7 @@ def run_on_workers(
     import dask
     from distributed import Client, LocalCluster
 
-    threads = max(1, len(os.sched_getaffinity(0)) // jobs)
+    threads = max(1, core_count() // jobs)
     # dask has workers give freed memory back at once; image-sized arrays then cost more page faults
     # than arithmetic.
     memory = {

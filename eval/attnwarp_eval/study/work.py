@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import traceback
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import torch
 
 from attnwarp.errors import InputError
+from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.study.cell import Cell
@@ -34,7 +34,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     # Image-sized tensor operations gain little from threads and lose much when other processes want
     # the cores; the renderer's own threads are counted apart.
     torch.set_num_threads(1)
-    set_thread_count(threads or len(os.sched_getaffinity(0)))
+    set_thread_count(threads or core_count())
     meter = Meter()
     scene_world = None
     if probe.needs_scenes:
