@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -26,8 +27,11 @@ CONTENTS = {
     "occlusion.": ("mask",),
     "warp.feature": ("warped",),
     "warp.": ("endpoint-error", "warped"),
-    "depth.": ("depth-error", "render"),
+    "depth.": ("depth-error", "render", "edited"),
     "fit.": ("render", "depth-error"),
+    "multiview.": ("edited",),
+    "fidelity.": ("edited",),
+    "embedding.": ("edited",),
 }
 """Pictures that show a metric, by the beginning of its name."""
 
@@ -167,6 +171,20 @@ def _pair(results: Results, name: str, first: str, second: str, metric: str) -> 
             return Slider(
                 Picture(before[most].path, f"{title}: {first}"), Picture(after[most].path, second)
             )
+    if "edited" in contents:
+        return _unedited_and_edited(after, second)
+    return None
+
+
+def _unedited_and_edited(
+    pictures: Mapping[tuple[str, str, int, str], PictureFile], variant: str
+) -> Slider | None:
+    """A view before and after the edit, for a variant whose counterpart has no pictures."""
+    for (scene, view, seed, content), file in pictures.items():
+        unedited = pictures.get((scene, view, seed, "before"))
+        if content == "edited" and unedited is not None:
+            title = f"unedited, {scene}, {view}"
+            return Slider(Picture(unedited.path, title), Picture(file.path, variant))
     return None
 
 

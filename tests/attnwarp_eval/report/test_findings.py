@@ -8,10 +8,14 @@ import written_runs
 
 from attnwarp_eval.document.model import Slider
 from attnwarp_eval.report.findings import findings
+from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.record import PictureFile
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
+DONE = Judgement("red", True, 25.0, 10.0, 10.0)
+EDIT = EditResult("colour=red", "make it red", DONE, DONE, {}, {}, 25.0, 2, 1.0)
 
 
 def results(variants, values, *, pictures=True, calibration=None):
@@ -80,9 +84,45 @@ def test_the_instrument_comes_first(problems):
     assert first.outcome == ("fails" if problems else "holds")
 
 
+@pytest.mark.parametrize("pictured", [("alone", "propagated"), ("propagated",)])
+def test_an_edit_is_shown_beside_its_counterpart_or_else_beside_the_unedited_view(pictured):
+    names, metric = ("alone", "propagated"), "fidelity.psnr.edit_inside"
+    study = {
+        "name": "edits",
+        "scenes": list(SCENES),
+        "variants": {name: {} for name in names},
+        "probes": {"editing": list(names)},
+        "ablations": [
+            {"title": "Help", "probe": "editing", "baseline": names[0], "variants": [names[1]]}
+        ],
+    }
+    cells = []
+    for scene in SCENES:
+        for name, value in zip(names, (20.0, 25.0), strict=True):
+            values = {"red/near": value, "red/far": 20.0}
+            data = written_runs.record([(v, 0.0, {metric: x}) for v, x in values.items()])
+            data |= EDIT.to_json()
+            cell = written_runs.outcome("editing", scene, [name], data)
+            cell.record.__dict__["pictures"] = tuple(
+                PictureFile(view, content, f"{name}-{scene}-{view}-{content}.jpg", "")
+                for view in values
+                for content in ("before", "edited")
+                if name in pictured
+            )
+            cells.append(cell)
+    (finding,) = findings(written_runs.results(study, cells), [])
+    assert finding.picture.after.path == ("propagated-one-red/near-edited.jpg")
+    assert finding.picture.before.path == (
+        "alone-one-red/near-edited.jpg"
+        if len(pictured) == 2
+        else "propagated-one-red/near-before.jpg"
+    )
+
+
 def test_every_content_that_a_finding_looks_for_is_one_that_a_picture_has():
     from attnwarp_eval.report.findings import CONTENTS
 
-    source = pathlib.Path(findings.__code__.co_filename).parents[1] / "study" / "pictures.py"
-    drawn = set(re.findall(r'"([a-z-]+)":', source.read_text()))
+    study = pathlib.Path(findings.__code__.co_filename).parents[1] / "study"
+    sources = (study / "pictures.py", study / "probes" / "editing.py")
+    drawn = set(re.findall(r'"([a-z-]+)":', "".join(path.read_text() for path in sources)))
     assert {content for contents in CONTENTS.values() for content in contents} <= drawn
