@@ -19,12 +19,12 @@ from plyfile import PlyData
 from typer.testing import CliRunner
 
 from attnwarp import Camera, Gaussians
-from attnwarp.cli import app
+from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
 from attnwarp.render.threads import set_thread_count
 
-ATTNWARP = [sys.executable, "-m", "attnwarp.cli"]
+ATTNWARP = [sys.executable, "-m", "attnwarp.cli.main"]
 
 
 @pytest.fixture(autouse=True)
@@ -97,7 +97,7 @@ def test_help_answers_at_once():
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys, attnwarp.cli; print([m for m in ('torch', 'numba', 'numpy', 'cv2', 'scipy') if"
+        "import sys, attnwarp.cli.main; print([m for m in ('torch', 'numba', 'numpy', 'cv2', 'scipy') if"
         " m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

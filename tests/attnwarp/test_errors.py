@@ -102,7 +102,7 @@ def test_a_command_without_its_extra_ends_in_one_line_and_code_2(argv, module, e
 def test_help_of_both_commands_needs_no_extra(tmp_path):
     every = [name for names in EXTRAS.values() for name in names]
     for package, name in (
-        ("attnwarp.cli", "attnwarp"),
+        ("attnwarp.cli.main", "attnwarp"),
         ("attnwarp_eval.cli.main", "attnwarp-eval"),
     ):
         done = run_without(every, package, [name, "--help"], tmp_path)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import USAGE, clear_errors, fail
+from attnwarp.cli.shell import USAGE
+from attnwarp_eval.cli.shell import clear_errors, fail
 
 if TYPE_CHECKING:
     from attnwarp_eval.cli.machine import Check

@@ -6,6 +6,7 @@ import sys
 
 import typer
 
+from attnwarp.cli.shell import CLOSED_PIPE, USAGE, closed_pipe
 from attnwarp.process import skip_last_collection
 from attnwarp_eval.cli import (
     cache,
@@ -19,12 +20,9 @@ from attnwarp_eval.cli import (
     userstudy,
 )
 from attnwarp_eval.cli.shell import (
-    CLOSED_PIPE,
     CRASH,
     REGRESSION,
-    USAGE,
     Regression,
-    closed_pipe,
     fail,
     file_error,
 )

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
+
+from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
 
 if TYPE_CHECKING:
     import rich.progress
     from rich.console import Console
     from rich.progress import TaskID
 
-PASS, REGRESSION, USAGE, TOO_LITTLE, CRASH, INTERRUPTED, CLOSED_PIPE = 0, 1, 2, 3, 70, 130, 141
-"""Exit codes. 1 is reserved for a regression; an unusable input is 2. A run that measured too
+PASS, REGRESSION, TOO_LITTLE, CRASH = 0, 1, 3, 70
+"""Exit codes beside those of attnwarp. 1 is reserved for a regression. A run that measured too
 little, or with an instrument that is not calibrated, is 3. A fault of this program is 70, as in
-sysexits; Ctrl-C or a polite kill is 130, output that nobody reads 141, as in shells."""
+sysexits."""
 
 
 class Regression(SystemExit):
@@ -49,7 +49,7 @@ def clear_errors() -> Iterator[None]:
     except InputError as error:
         raise fail(str(error)) from None
     except KeyboardInterrupt:
-        raise fail("interrupted", INTERRUPTED) from None
+        raise fail("interrupted", STOPPED) from None
     except BrokenPipeError:
         raise closed_pipe() from None
     except OSError as error:
@@ -68,15 +68,6 @@ def file_error(error: OSError) -> str:
     )
 
 
-def closed_pipe() -> typer.Exit:
-    """Let what is still to be flushed go nowhere, as it cannot be written; raise what this
-    returns.
-    """
-    with suppress(OSError, ValueError):  # no real stream, as under a test's runner
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return typer.Exit(CLOSED_PIPE)
-
-
 @contextmanager
 def resumable(state: Callable[[], str]) -> Iterator[None]:
     """Turn Ctrl-C or a polite kill into one clear line and exit code 130.
@@ -93,7 +84,7 @@ def resumable(state: Callable[[], str]) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         message = f"interrupted; {state()}, the same command goes on from here"
-        raise fail(message, INTERRUPTED) from None
+        raise fail(message, STOPPED) from None
     finally:
         signal.signal(signal.SIGTERM, handler)
 

@@ -7,7 +7,7 @@ from tiny_scenes import cameras, pictures, splats
 from typer.testing import CliRunner
 
 from attnwarp.baselines import ByViewSettings, by_view
-from attnwarp.cli import app
+from attnwarp.cli.main import app
 from attnwarp.editing.small import load_editor
 from attnwarp.fit import load_views
 from attnwarp.io import Dataset, read_dataset, read_image, read_ply, write_ply, write_transforms

@@ -7,7 +7,7 @@ from tiny_editors import pix2pix
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
-from attnwarp.cli import app
+from attnwarp.cli.main import app
 from attnwarp.editing.editor import edit
 from attnwarp.editing.segment import GroundedSam
 from attnwarp.editing.small import load_editor
@@ -148,7 +148,7 @@ def test_help_imports_nothing_heavy():
     import sys
 
     code = (
-        "import sys; from typer.testing import CliRunner; from attnwarp.cli import app;"
+        "import sys; from typer.testing import CliRunner; from attnwarp.cli.main import app;"
         "assert CliRunner().invoke(app, ['edit-image', '--help']).exit_code == 0;"
         "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
     )

@@ -18,7 +18,7 @@ from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
-from attnwarp.cli import app
+from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
 
@@ -233,7 +233,7 @@ def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_pa
 
 def test_help_imports_nothing_heavy():
     code = (
-        "import sys; from typer.testing import CliRunner; from attnwarp.cli import app;"
+        "import sys; from typer.testing import CliRunner; from attnwarp.cli.main import app;"
         "assert CliRunner().invoke(app, ['edit', '--help']).exit_code == 0;"
         "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
     )
@@ -248,7 +248,7 @@ def test_a_process_that_is_killed_and_started_again_leaves_the_same_bytes(place,
             "edit", place / "data", "--instruction", "a bear", "--editor", place / "editor", "--out", out, "--ply",
             place / "splats.ply", *QUICK, "--iterations", 60,
         ]  # fmt: skip
-        return [sys.executable, "-m", "attnwarp.cli", *map(str, arguments)]
+        return [sys.executable, "-m", "attnwarp.cli.main", *map(str, arguments)]
 
     def files(out):
         # The page shows the seconds.

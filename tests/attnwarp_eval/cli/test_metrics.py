@@ -740,7 +740,7 @@ def test_a_picture_rewritten_during_the_run_is_stored_under_its_new_hash(tmp_pat
 
 def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
     from attnwarp.camera import Camera
-    from attnwarp.cli import app as renderer
+    from attnwarp.cli.main import app as renderer
     from attnwarp.fit import from_points
     from attnwarp.io import Dataset, write_ply, write_transforms
 

@@ -1,0 +1,93 @@
+"""attnwarp baseline."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.options import (
+    DataArgument,
+    FormatOption,
+    IgnoreOption,
+    ImagesOption,
+    MaxSizeOption,
+    MissingImages,
+    MissingOption,
+    ResizeOption,
+)
+from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
+from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
+
+
+class BaselineMethod(StrEnum):
+    """What a person may type for a method that edits are compared with."""
+
+    by_view = "by_view"
+    igs2gs = "igs2gs"
+    dge = "dge"
+    gaussctrl = "gaussctrl"
+
+
+def baseline(
+    method: Annotated[BaselineMethod, typer.Argument(help="Of docs/baselines.md.")],
+    data: DataArgument,
+    ply: Annotated[Path, typer.Option(help="Splats of the scene, such as attnwarp fit makes.")],
+    instruction: InstructionOption,
+    out: Annotated[Path, typer.Option(help="Folder for the result; a run in it is resumed.")],
+    editor: EditorOption = "small-plain",
+    preset: Annotated[
+        str, typer.Option(help="The method's choices; see docs/baselines.md.")
+    ] = "default",
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Begin no edit and no iteration after so many.")
+    ] = None,
+    network_rows: Annotated[
+        int | None, typer.Option(min=0, help="Rows through the network at most.")
+    ] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any setting of the method."),
+    ] = None,
+    max_size: MaxSizeOption = None,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Edit a scene by another method, for comparison with attnwarp edit."""
+    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+        changes = assignments(change or [], {})
+        check_out(out)
+        import attnwarp.baselines.settings
+
+        settings = attnwarp.baselines.settings.preset(method.value, preset, **changes)
+        budget = attnwarp.baselines.settings.Budget(seconds, network_rows)
+        use_threads(threads)
+        from attnwarp.baselines.command import edit_dataset
+
+        dataset = read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            points=False,
+        )
+        result = edit_dataset(
+            method.value, dataset, read_splats(ply, None, None), editor, instruction, settings,
+            out, budget=budget, max_size=max_size, device=device, threads=threads,
+        )  # fmt: skip
+        ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
+        typer.echo(
+            f"{out / 'edited.ply'}: {result.counters['edits']} edits of"
+            f" {result.counters['views']} views in {sum(result.seconds.values()):.0f} s{ended}"
+        )
+        typer.echo(out / "sheet.png")

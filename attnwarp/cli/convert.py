@@ -1,0 +1,95 @@
+"""attnwarp convert and attnwarp undistort: files for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.options import (
+    AntialiasedOption,
+    Coordinates,
+    DataArgument,
+    FormatOption,
+    IgnoreOption,
+    ImagesOption,
+    MissingImages,
+    MissingOption,
+    ResizeOption,
+    SplatKindOption,
+)
+from attnwarp.cli.shell import check_out, clear_errors
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="Splats: .ply or .splat.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="File to write: .ply or .splat.")],
+    kind: SplatKindOption = None,
+    antialiased: AntialiasedOption = None,
+    third_scale: Annotated[
+        float | None,
+        typer.Option(help="Write 2DGS as thin 3DGS with this third scale (1e-6)."),
+    ] = None,
+    sh_degree: Annotated[
+        int | None, typer.Option(min=0, max=3, help="Cut harmonics beyond this degree.")
+    ] = None,
+    coordinates: Annotated[
+        Coordinates,
+        typer.Option(
+            help="world, relative to the origin comment that attnwarp alone reads, or auto: world"
+            " unless float32 would lose too much."
+        ),
+    ] = Coordinates.auto,
+) -> None:
+    """Convert splats for other programs: 2DGS as thin 3DGS, .splat, fewer harmonics, no origin."""
+    with clear_errors():
+        suffix = out.suffix.lower()
+        if suffix not in (".ply", ".splat"):
+            raise ValueError(f"OUT: got {out}, expected a name ending in .ply or .splat")
+        from attnwarp.io import THIRD_SCALE, write_ply, write_splat
+
+        splats = read_splats(source, kind, antialiased)
+        if third_scale is not None and splats.kind == "3d":
+            raise ValueError(f"--third-scale: {source} holds 3DGS, which has three scales")
+        if sh_degree is not None:
+            splats = splats.with_sh_degree(min(sh_degree, splats.sh_degree))
+        if suffix == ".splat":
+            write_splat(
+                out,
+                splats,
+                third_scale=THIRD_SCALE if third_scale is None else third_scale,
+                coordinates="relative" if coordinates == "relative" else "world",
+            )
+        else:
+            write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
+        typer.echo(f"{out}: {len(splats)} splats")
+
+
+def undistort(
+    data: DataArgument,
+    out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Resample pictures to pinhole cameras, for lens models that OpenCV has."""
+    with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
+        check_out(out)
+        import attnwarp.io
+
+        dataset = read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            distorted="keep",
+        )
+        count = sum(lens is not None for lens in dataset.lenses)
+        result = attnwarp.io.undistort(dataset, out)
+        typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")

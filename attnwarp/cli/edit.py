@@ -1,0 +1,144 @@
+"""attnwarp edit."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.options import (
+    DataArgument,
+    FormatOption,
+    IgnoreOption,
+    ImagesOption,
+    Kind,
+    MaxSizeOption,
+    MissingImages,
+    MissingOption,
+    ResizeOption,
+    Store,
+)
+from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
+from attnwarp.editing.command import (
+    SEGMENTER,
+    DeviceOption,
+    EditorOption,
+    InstructionOption,
+    SegmenterOption,
+    ThreadsOption,
+    WhereOption,
+    check_segmenter,
+)
+
+
+class Preset(StrEnum):
+    """What a person may type for the choices of an edit."""
+
+    corrected = "corrected"
+    extended = "extended"
+    paper = "paper"
+    released = "released"
+    released_controlnet = "released-controlnet"
+
+
+def edit(
+    data: DataArgument,
+    instruction: InstructionOption,
+    out: Annotated[Path, typer.Option(help="Folder for the result; an edit in it is resumed.")],
+    ply: Annotated[
+        Path | None, typer.Option(help="Splats of the scene; fitted first if left out.")
+    ] = None,
+    editor: EditorOption = "small-plain",
+    preset: Annotated[
+        Preset, typer.Option(help="The method's choices; see docs/editing-a-scene.md.")
+    ] = Preset.corrected,
+    source: Annotated[
+        str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
+    ] = None,
+    source_picture: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The source view, edited elsewhere.")
+    ] = None,
+    masks: Annotated[
+        Path | None, typer.Option(help="Folder of PNG masks, NAME.png; white is edited.")
+    ] = None,
+    words: WhereOption = None,
+    segmenter: SegmenterOption = None,
+    stages: Annotated[int | None, typer.Option(min=1, help="Of editing and tuning (3).")] = None,
+    views_per_stage: Annotated[
+        int | None, typer.Option(min=1, help="New views a stage edits.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of denoising (20).")] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=0, help="Of tuning, in each stage (300).")
+    ] = None,
+    size: Annotated[
+        int | None,
+        typer.Option(min=16, help="Longest side in px to edit at; the editor's own if left out."),
+    ] = None,
+    alone: Annotated[
+        bool, typer.Option("--each-view-alone", help="Edit view by view, for comparison.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of everything random (0).")] = None,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting of the preset."),
+    ] = None,
+    fit_iterations: Annotated[
+        int, typer.Option(min=1, help="Of the fit, where no PLY is given.")
+    ] = 3_000,
+    kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids, for the fit.")] = Kind.two,
+    max_splats: Annotated[
+        int, typer.Option(min=1, help="Do not grow the model beyond, for the fit.")
+    ] = 30_000,
+    max_size: MaxSizeOption = None,
+    store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
+    device: DeviceOption = "cpu",
+    threads: ThreadsOption = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Edit a scene: one view by an instruction, the others along with it, the splats on all."""
+    with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
+        options: dict[str, Any] = {
+            "stages": stages, "views_per_stage": views_per_stage, "steps": steps,
+            "iterations": iterations, "size": size, "seed": seed,
+            "method": "each view alone" if alone else None,
+        }  # fmt: skip
+        changes = {name: value for name, value in options.items() if value is not None}
+        flags = {name: f"--{name.replace('_', '-')}" for name in options}
+        changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
+        check_segmenter(segmenter, words)
+        check_out(out)
+
+        import attnwarp.propagate.settings
+
+        settings = attnwarp.propagate.settings.preset(preset.value, **changes)
+        use_threads(threads)
+        dataset = read_views(
+            data,
+            format=format,
+            images=images,
+            missing_images=missing_images,
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+        )
+        splats = None if ply is None else read_splats(ply, None, None)
+        from attnwarp.propagate.command import FitPlan, edit_dataset
+
+        result, page = edit_dataset(
+            dataset, splats, editor, instruction, settings, out,
+            fit_plan=FitPlan(fit_iterations, kind.value[:2], max_splats), source=source,
+            source_picture=source_picture, masks=masks, words=words,
+            segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
+            threads=threads,
+            say=lambda text: typer.echo(text, err=True),
+        )  # fmt: skip
+        seconds = sum(result.seconds.values())
+        typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")
+        typer.echo(page)

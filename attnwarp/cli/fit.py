@@ -1,0 +1,227 @@
+"""attnwarp fit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from attnwarp.cli.files import read_views, write_image
+from attnwarp.cli.options import (
+    DataArgument,
+    FormatOption,
+    IgnoreOption,
+    ImagesOption,
+    Kind,
+    MaxSizeOption,
+    MissingImages,
+    MissingOption,
+    ResizeOption,
+)
+from attnwarp.cli.shell import (
+    STOPPED,
+    asked_to_stop,
+    assignments,
+    check_out,
+    clear_errors,
+    use_threads,
+)
+
+if TYPE_CHECKING:
+    from attnwarp.fit import Fit, FitSettings, Views
+
+
+OWN_OPTIONS = {
+    name: f"--{name.replace('_', '-')}" for name in ("kind", "seed", "iterations", "max_splats")
+}
+
+
+def fit(
+    data: DataArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
+    kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids.")] = Kind.two,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Steps, one view each (default 7000).")
+    ] = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(min=0, help="Stop after so many seconds of fitting.")
+    ] = None,
+    max_size: MaxSizeOption = None,
+    max_splats: Annotated[
+        int | None, typer.Option(min=1, help="Do not grow the model beyond.")
+    ] = None,
+    points: Annotated[
+        int, typer.Option(min=1, help="Random first points, where DATA has none.")
+    ] = 10_000,
+    hold_out: Annotated[
+        int, typer.Option(min=0, help="Hold out one view of so many; 0: none.")
+    ] = 8,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
+    change: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any other setting; see docs/fitting.md."),
+    ] = None,
+    checkpoint_seconds: Annotated[
+        float, typer.Option(min=0, help="Seconds between two checkpoints.")
+    ] = 30.0,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
+    ] = None,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Begin again without the checkpoint.")
+    ] = False,
+    third_scale: Annotated[
+        float | None,
+        typer.Option(help="2dgs: third scale in the PLY, for viewers of 3DGS (1e-6)."),
+    ] = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    missing_images: MissingOption = MissingImages.error,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
+    with clear_errors(
+        f"stopped; what {out} holds is whole, and the same command goes on from its checkpoint"
+    ):
+        # What needs nothing heavy is read first: a typing error is answered at once.
+        changes = assignments(change or [], OWN_OPTIONS)
+        check_out(out)
+        _check_third_scale(third_scale, kind)
+        use_threads(threads)
+        result = _fit(
+            data,
+            {
+                "format": format,
+                "images": images,
+                "missing_images": missing_images,
+                "resize_cameras": resize_cameras,
+                "ignore_keys": ignore_key or [],
+            },
+            out,
+            kind,
+            iterations,
+            max_seconds,
+            max_size,
+            max_splats,
+            points,
+            hold_out,
+            seed,
+            changes,
+            checkpoint_seconds,
+            restart,
+            third_scale,
+        )
+        last = result.history[-1]
+        held = f", held-out PSNR {last.psnr:.2f} dB" if last.psnr is not None else ""
+        typer.echo(
+            f"{out / 'splats.ply'}: {len(result.gaussians)} splats, {result.iteration} iterations"
+            f" in {result.seconds:.0f} s{held}"
+        )
+        if result.stopped == "asked":
+            typer.echo("stopped; the same command goes on from here", err=True)
+            raise typer.Exit(STOPPED)
+
+
+def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
+    if third_scale is None:
+        return
+    if kind is not Kind.two:
+        raise ValueError(f"--third-scale: got {third_scale} for {kind.value}, which has three")
+    if not 0 < third_scale < float("inf"):
+        raise ValueError(f"--third-scale: got {third_scale}, expected a length such as 1e-6")
+
+
+def _fit(
+    data: Path,
+    reading: dict[str, Any],
+    out: Path,
+    kind: Kind,
+    iterations: int | None,
+    max_seconds: float | None,
+    max_size: int | None,
+    max_splats: int | None,
+    points: int,
+    every: int,
+    seed: int,
+    changes: dict[str, Any],
+    checkpoint_seconds: float,
+    restart: bool,
+    third_scale: float | None,
+) -> Fit:
+    changes = {**changes, "kind": kind.value[:2], "seed": seed}
+    if iterations is not None:
+        changes["iterations"] = iterations
+    if max_splats is not None:
+        changes["max_splats"] = max_splats
+    if every == 1:
+        raise ValueError(
+            "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
+        )
+
+    import attnwarp.fit
+    from attnwarp.fit.loop import CHECKPOINT
+    from attnwarp.fit.progress import progress_display
+
+    settings = attnwarp.fit.FitSettings.from_dict(changes)
+    dataset = read_views(data, **reading)
+    train, test = attnwarp.fit.hold_out(dataset, every)
+    views = attnwarp.fit.load_views(train, max_size=max_size)
+    held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
+    if dataset.points is not None and len(dataset.points):
+        first, colors = dataset.points, dataset.colors
+    else:
+        typer.echo(f"{data} has no points: beginning with {points} random ones", err=True)
+        first, colors = attnwarp.fit.random_points(views.cameras, points, seed=seed)
+    start = attnwarp.fit.from_points(
+        first, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    if restart:
+        (out / CHECKPOINT).unlink(missing_ok=True)
+    with asked_to_stop() as stop, progress_display(title=out.name) as watch:
+        result = attnwarp.fit.fit(
+            start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
+            checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
+        )  # fmt: skip
+    _write_results(out, result, held_out)
+    return result
+
+
+def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
+    """The settings, the curve, and the held-out views beside their pictures."""
+    from dataclasses import asdict
+
+    from attnwarp.io.file import write_atomically
+    from attnwarp.io.names import file_stems
+
+    lines = "".join(json.dumps(asdict(record)) + "\n" for record in result.history)
+    settings = json.dumps(
+        {**result.settings.to_dict(), "extent": result.extent, "stopped": result.stopped}, indent=2
+    )
+    write_atomically(out / "history.jsonl", lambda stream: stream.write(lines.encode()))
+    write_atomically(out / "settings.json", lambda stream: stream.write(f"{settings}\n".encode()))
+    if held_out is None:
+        return
+
+    import torch
+
+    from attnwarp.render import render
+
+    folder = out / "held_out"
+    folder.mkdir(exist_ok=True)
+    near = _near(result.settings, result.extent)
+    white = result.settings.background == "white"
+    background = torch.full((3,), 1.0 if white else 0.0)
+    for index, (camera, name) in enumerate(
+        zip(held_out.cameras, file_stems(held_out.cameras), strict=True)
+    ):
+        color = render(result.gaussians, camera, background=background, near=near).color.clamp(0, 1)
+        both = torch.cat([held_out.target(index, background), color], dim=1)
+        write_image(folder / f"{name}.png", both.numpy())
+
+
+def _near(settings: FitSettings, extent: float) -> float:
+    return settings.near * extent

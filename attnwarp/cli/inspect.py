@@ -1,0 +1,30 @@
+"""attnwarp inspect: attnwarp-eval's command, for a person's own scene."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from attnwarp.cli.options import DataArgument
+from attnwarp.cli.shell import fail
+
+
+def inspect(
+    context: typer.Context,
+    splats: Annotated[
+        Path, typer.Argument(help="Splats (.ply, .splat), or a folder that attnwarp edit made.")
+    ],
+    data: DataArgument,
+) -> None:
+    """See a scene, its cameras and its warps in 3D; takes the options of attnwarp-eval inspect."""
+    from importlib.util import find_spec
+
+    if find_spec("attnwarp_eval") is None:
+        raise fail("inspect: needs the package attnwarp_eval: pip install 'attnwarp[inspect]'")
+    # The library does not import the instrument: this process becomes its command.
+    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "inspect", str(splats)]
+    os.execv(sys.executable, [*command, "--data", str(data), *context.args])

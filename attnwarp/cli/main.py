@@ -1,0 +1,70 @@
+"""The command attnwarp, and what it does at its end."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from attnwarp.cli.baseline import baseline
+from attnwarp.cli.convert import convert, undistort
+from attnwarp.cli.edit import edit
+from attnwarp.cli.fit import fit
+from attnwarp.cli.inspect import inspect
+from attnwarp.cli.render import render
+from attnwarp.cli.shell import CLOSED_PIPE, clear_errors, closed_pipe, fail, file_error
+from attnwarp.editing.command import edit_image
+from attnwarp.process import skip_last_collection
+
+app = typer.Typer(
+    name="attnwarp",
+    help=(
+        "Gaussian splats for consistent 3D scene editing: fit them to pictures, edit, render and"
+        " convert them."
+    ),
+    epilog=(
+        "Exit codes: 0 done, 2 wrong usage or input, 130 stopped by Ctrl-C or kill with everything"
+        " so far written, 141 output pipe closed."
+    ),
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+app.command()(fit)
+app.command()(edit)
+app.command()(render)
+app.command()(convert)
+app.command()(undistort)
+app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(inspect)
+app.command()(baseline)
+app.command("edit-image")(clear_errors()(edit_image))
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    from attnwarp.errors import missing_extra
+
+    skip_last_collection()
+    try:
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
+    except ImportError as error:
+        explained = missing_extra(error)
+        if explained is None:
+            raise
+        sys.exit(fail(str(explained)).exit_code)
+    except BrokenPipeError:
+        sys.exit(closed_pipe().exit_code)
+    except OSError as error:  # help that cannot be written
+        closed_pipe()
+        sys.exit(fail(file_error(error)).exit_code)
+    except SystemExit as done:
+        # Typer's own code for a pipe that is closed; no command of ours gives 1.
+        sys.exit(CLOSED_PIPE if done.code == 1 else done.code)
+
+
+if __name__ == "__main__":
+    main()

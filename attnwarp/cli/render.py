@@ -1,0 +1,114 @@
+"""attnwarp render."""
+
+from __future__ import annotations
+
+import functools
+import io
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import typer
+
+from attnwarp.cli.files import read_splats, read_views, write_image
+from attnwarp.cli.options import (
+    AntialiasedOption,
+    FormatOption,
+    IgnoreOption,
+    ImagesOption,
+    ResizeOption,
+    SplatKindOption,
+)
+from attnwarp.cli.shell import check_out, clear_errors, use_threads
+
+
+def render(
+    model: Annotated[Path, typer.Argument(help="Splats: a PLY file.")],
+    cameras: Annotated[
+        Path, typer.Argument(help="transforms.json, its folder, or a COLMAP folder.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    background: Annotated[
+        str, typer.Option(help="black, white, or three numbers in [0, 1]: r,g,b.")
+    ] = "black",
+    size: Annotated[
+        int | None, typer.Option(min=1, help="Longest side in px; the cameras' own if left out.")
+    ] = None,
+    near: Annotated[
+        float, typer.Option(help="Nothing nearer than this is drawn, scene units.")
+    ] = 0.01,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")
+    ] = False,
+    threads: Annotated[
+        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
+    ] = None,
+    normal: Annotated[
+        bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")
+    ] = False,
+    kind: SplatKindOption = None,
+    antialiased: AntialiasedOption = None,
+    format: FormatOption = None,
+    images: ImagesOption = None,
+    resize_cameras: ResizeOption = False,
+    ignore_key: IgnoreOption = None,
+) -> None:
+    """Render splats from every camera of a data set; the images need not be there."""
+    with clear_errors(f"stopped; the files in {out} are whole, and the same command renders all"):
+        import numpy as np
+
+        behind = _color(background)
+        check_out(out)
+
+        import attnwarp.render
+        from attnwarp.io.file import write_atomically
+        from attnwarp.io.names import file_stems
+
+        use_threads(threads)
+        splats = read_splats(model, kind, antialiased)
+        views = read_views(
+            cameras,
+            format=format,
+            images=images,
+            missing_images="none",
+            resize_cameras=resize_cameras,
+            ignore_keys=ignore_key or [],
+            points=False,
+        ).cameras
+        out.mkdir(parents=True, exist_ok=True)
+        for camera, name in zip(views, file_stems(views), strict=True):
+            if size is not None:
+                factor = size / max(camera.width, camera.height)
+                camera = camera.resize(
+                    max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+                )
+            view = attnwarp.render.render(splats, camera, background=behind, near=near)
+            write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
+            if depth:
+                buffer = io.BytesIO()
+                np.save(buffer, view.median_depth.numpy())
+                write_atomically(
+                    out / f"{name}.depth.npy", functools.partial(_put, data=buffer.getvalue())
+                )
+            if normal:
+                write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
+        typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
+
+
+def _put(stream: BinaryIO, data: bytes) -> None:
+    stream.write(data)
+
+
+def _color(text: str) -> list[float]:
+    named = {"black": [0.0, 0.0, 0.0], "white": [1.0, 1.0, 1.0]}
+    if text in named:
+        return named[text]
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(0 <= value <= 1 for value in values):
+        raise ValueError(
+            f"--background: got {text!r}, expected black, white or r,g,b in [0, 1] such as"
+            " 0.2,0.5,1"
+        )
+    return values
