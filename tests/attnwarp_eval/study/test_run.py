@@ -264,8 +264,10 @@ def test_an_adaptive_cluster_starts_a_worker_that_gives_the_same_numbers_and_pic
 
     run = folder / "elsewhere"
     none = {"n_workers": 0, "threads_per_worker": 1, "memory_limit": 0}
+    # Any free port: a run beside the tests may have dask's usual one.
+    place = {"dashboard_address": "127.0.0.1:0", "scheduler_kwargs": {"dashboard": False}}
     # Workers are threads of this process, which costs no start of another.
-    with LocalCluster(processes=False, dashboard_address=None, **none) as cluster:
+    with LocalCluster(processes=False, **none, **place) as cluster:
         cluster.adapt(minimum=0, maximum=1, interval="50ms")
         done = call("run", "study.yaml", "--out", run, "--scheduler", cluster.scheduler_address)
     assert done.exit_code == 0, done.stderr
