@@ -41,7 +41,7 @@ from training.editing_pairs import (
     instruction,
     load_mixed,
 )
-from training.editor_pool import Batch, Pool
+from training.editor_pool import Batch, PairPool
 from training.steps import Task, train_steps
 from training.worlds import OBJECTS
 
@@ -308,17 +308,17 @@ def tokenizer_of(out: Path) -> Tokenizer:
     return Tokenizer.from_file(str(path))
 
 
-def pool_of(stage: Stage, data: Path, tokenizer: Tokenizer, device: torch.device | str) -> Pool:
+def pool_of(stage: Stage, data: Path, tokenizer: Tokenizer, device: torch.device | str) -> PairPool:
     """The pictures and sentences that a stage is trained on; pictures are rendered where they are missing."""
     counts: dict[str, int | None] = {"edit-train": stage.worlds}
     if stage.parts:
         counts["parts-train"] = stage.parts
-    return Pool(load_mixed(data, counts), tokenizer, device)
+    return PairPool(load_mixed(data, counts), tokenizer, device)
 
 
 def train_stage(
     name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1, device: torch.device | str = "cpu",
-    pool: Pool | None = None,
+    pool: PairPool | None = None,
 ) -> Path:  # fmt: skip
     """Train a stage, or go on with it; the checkpoint's path.
 
@@ -371,7 +371,9 @@ def weights_of(out: Path, stage: str) -> dict[str, Tensor]:
     return {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
 
 
-def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Tensor) -> list[Task]:
+def tasks_of(
+    stage: Stage, pool: PairPool, net: EditorNet, alphas: Tensor, empty: Tensor
+) -> list[Task]:
     """What a stage's steps are of: plain pairs or injected ones, small pictures or large ones."""
     tasks = []
     for size, share in ((stage.size, 1 - stage.large), (2 * stage.size, stage.large)):
@@ -395,7 +397,7 @@ def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Te
 
 
 def plain_inputs(
-    pool: Pool, stage: Stage, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
+    pool: PairPool, stage: Stage, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
 ) -> dict[str, Tensor]:  # fmt: skip
     """Pairs as the network gets them, with their targets."""
     t = draw_steps(count, generator, stage.noisy_from)
