@@ -8,6 +8,7 @@ noisy latents. It predicts the edited picture itself, from betas whose last step
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -338,6 +339,7 @@ def train_stage(
     tokenizer = tokenizer_of(out)
     pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
     net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
+    spent = 0.0
     if stage.start is not None:
         weights = weights_of(out, stage.start)
         begins = stage.draws and not any(k.startswith("unet.draw.") for k in weights)
@@ -347,13 +349,15 @@ def train_stage(
         if begins and not (out / f"{name}.pt").exists():
             from training.editor_draws import teach_draws
 
+            start = time.perf_counter()
             teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
+            spent = time.perf_counter() - start
     net.to(device)
     alphas = scheduler(stage.shift).alphas_cumprod.to(device)
     empty = tokens_of(tokenizer, [""])[0].to(device)
     checkpoint = out / f"{name}.pt"
     train_steps(
-        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device
+        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device, spent
     )  # fmt: skip
     return checkpoint
 
