@@ -16,21 +16,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from tokenizers import (
-    Tokenizer,
-    decoders,
-    models,
-    normalizers,
-    pre_tokenizers,
-    processors,
-    trainers,
-)
+from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
 from attnwarp.errors import InputError
 from training import editor_pool, steps
 from training.assemblies import KINDS as ASSEMBLIES
+from training.byte_pairs import learn_byte_pairs
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -222,21 +215,7 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
         corpus.append(instruction(kind, thing, row, rng))
         if kind in AMBIGUOUS:
             corpus.append(ambiguous_instruction(kind, thing, rng))
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
-    tokenizer.decoder = decoders.ByteLevel()
-    trainer = trainers.BpeTrainer(
-        vocab_size=VOCABULARY, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
-        show_progress=False,
-    )  # fmt: skip
-    tokenizer.train_from_iterator(corpus, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(
-        single="$A <end>", special_tokens=[("<end>", 1)]
-    )
-    tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=TOKENS)
-    tokenizer.enable_truncation(TOKENS)
-    return tokenizer
+    return learn_byte_pairs(corpus, vocabulary=VOCABULARY, most_tokens=TOKENS, length=TOKENS)
 
 
 def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
