@@ -37,6 +37,8 @@ def reduce(path: Path, out: Path) -> None:
     import cv2
 
     picture = cv2.imread(str(path))
+    if picture is None:
+        raise SystemExit(f"{path}: is no picture, expected the one of --screenshot")
     height = round(WIDTH * picture.shape[0] / picture.shape[1])
     small = cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(out), small, [cv2.IMWRITE_JPEG_QUALITY, 88])

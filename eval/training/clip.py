@@ -12,19 +12,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
-from tokenizers import (
-    Tokenizer,
-    decoders,
-    models,
-    normalizers,
-    pre_tokenizers,
-    processors,
-    trainers,
-)
+from tokenizers import Tokenizer
 from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipSmall
 from training import naming
+from training.byte_pairs import learn_byte_pairs
 from training.common import Run, channels_last, crops, groups, rate, settings
 from training.naming import Heads, pictures_of, scrambled, warm_start
 from training.worlds import (
@@ -66,21 +59,7 @@ def make_tokenizer(sentences: int = 30_000) -> Tokenizer:
     for _ in range(sentences):
         drawn = _any_attributes(rng)
         corpus.append(sentence(captioned(drawn, rng), rng, fillers=True))
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
-    tokenizer.decoder = decoders.ByteLevel()
-    trainer = trainers.BpeTrainer(
-        vocab_size=VOCABULARY, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
-        show_progress=False,
-    )  # fmt: skip
-    tokenizer.train_from_iterator(corpus, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(
-        single="$A <end>", special_tokens=[("<end>", 1)]
-    )
-    tokenizer.enable_padding(pad_id=0, pad_token="<pad>")
-    tokenizer.enable_truncation(ClipSmall.length)
-    return tokenizer
+    return learn_byte_pairs(corpus, vocabulary=VOCABULARY, most_tokens=ClipSmall.length)
 
 
 def _any_attributes(rng: np.random.Generator) -> tuple[int, ...]:

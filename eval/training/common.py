@@ -18,6 +18,7 @@ from torch.nn import functional
 
 from attnwarp.errors import InputError
 from attnwarp.io.file import write_atomically
+from training.log import Entry, append, cut_log, log_path
 
 Tensor = torch.Tensor
 Model = TypeVar("Model", bound=torch.nn.Module)
@@ -118,7 +119,8 @@ def settings(module: Mapping[str, Any], *splits: str) -> dict[str, Any]:
 
 @dataclass
 class Run:
-    """A training run that can be killed and resumed: its state is written after epochs.
+    """A training run that can be killed and resumed: its state is written after epochs, and the
+    losses of each to a log (:mod:`training.log`).
 
     Attributes:
         path: of the checkpoint.
@@ -128,6 +130,8 @@ class Run:
             which can be resumed with no other.
         every: least seconds between two checkpoints; 0 writes one after each epoch.
         device: what it runs on, for cards.
+        steps: in an epoch, for the log; None where the recipe does not count them.
+        spent: seconds that went before the first epoch.
     """
 
     path: Path
@@ -136,6 +140,8 @@ class Run:
     recipe: Mapping[str, Any]
     every: float = 0.0
     device: str = "one CPU core"
+    steps: int | None = None
+    spent: float = 0.0
 
     def train(self, epoch: Callable[[int], dict[str, float]]) -> None:
         """Run the epochs that are left; each draws from generators seeded by its number, so a
@@ -145,7 +151,7 @@ class Run:
             InputError: the checkpoint is of another recipe, or from before recipes were written
                 into them.
         """
-        first, seconds, unsaved = 0, 0.0, 0.0
+        first, seconds, unsaved = 0, self.spent, 0.0
         recipe = {"epochs": self.epochs, **self.recipe}
         if self.path.exists():
             stored = torch.load(self.path, weights_only=True, map_location="cpu")
@@ -153,11 +159,15 @@ class Run:
             for name, thing in self.state.items():
                 thing.load_state_dict(stored[name])
             first, seconds = int(stored["epoch"]), float(stored["seconds"])
+        log = log_path(self.path)
+        cut_log(log, first)
         for number in range(first, self.epochs):
             start = time.perf_counter()
             losses = epoch(number)
             spent = time.perf_counter() - start
             seconds, unsaved = seconds + spent, unsaved + spent
+            steps = None if self.steps is None else self.steps * (number + 1)
+            append(log, Entry(self.path.stem, number + 1, steps, seconds, losses))
             words = ", ".join(f"{k} {v:.4g}" for k, v in losses.items())
             print(f"epoch {number + 1}/{self.epochs}: {words}, {spent:.0f} s", flush=True)
             if number + 1 < self.epochs and unsaved < self.every:

@@ -40,7 +40,7 @@ from training.editor import (
 )
 from training.editor_answers import codes
 from training.editor_pictures import Pictures, Row
-from training.editor_pool import Pool, Rows, points_of
+from training.editor_pool import PicturePool, Rows
 from training.steps import Task, train_steps
 from training.worlds import sentence
 
@@ -183,20 +183,21 @@ class Prompts(Pictures):
         return control_image(depth[:, ::-1] if row.flip else depth)
 
 
-class PromptPool(Pool):
+class PromptPool(PicturePool):
     """Depth maps, prompts and pictures of worlds on one device.
 
     Args:
-        worlds, tokenizer, device: see :class:`training.editor_pool.Pool`.
+        worlds, device: see :class:`training.editor_pool.PicturePool`.
+        tokenizer: of the prompts.
         prompts: made ahead for each world.
     """
 
     def __init__(
-        self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, prompts: int = PROMPTS,
-        tables: Mapping[str, Tensor] | None = None,
+        self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, prompts: int = PROMPTS
     ) -> None:  # fmt: skip
-        tables = prompts_of(worlds, tokenizer, prompts) if tables is None else tables
-        super().__init__(worlds, tokenizer, device, tables=tables)
+        super().__init__(worlds, device)
+        tokens, true = prompts_of(worlds, tokenizer, prompts)
+        self.tokens, self.true = tokens.to(self.device), true.to(self.device)
         self.depth = torch.from_numpy(worlds.depth).to(self.device).view(-1)
 
     def control(self, rows: Rows, size: int) -> Tensor:
@@ -219,7 +220,7 @@ class PromptPool(Pool):
             size: of the pictures in px.
         """
         count = len(noise)
-        tokens, true = self.tables["prompts"], self.tables["true"]
+        tokens, true = self.tokens, self.true
         world = self.integers(len(tokens), count, generator)
         view = self.integers(VIEWS, count, generator)
         prompt = self.integers(tokens.shape[1], count, generator)
@@ -232,8 +233,10 @@ class PromptPool(Pool):
         return rows, tokens[world, prompt].long()
 
 
-def prompts_of(worlds: Worlds, tokenizer: Tokenizer, prompts: int = PROMPTS) -> dict[str, Tensor]:
-    """:func:`training.editor_pool.points_of`, (N, P, 24) tokens of prompts and the (N, P, LOOKS) looks they are true of."""
+def prompts_of(
+    worlds: Worlds, tokenizer: Tokenizer, prompts: int = PROMPTS
+) -> tuple[Tensor, Tensor]:
+    """(N, P, 24) tokens of prompts and the (N, P, LOOKS) looks they are true of."""
     rng = np.random.default_rng(32)
     texts, true = [], np.zeros((len(worlds), prompts, LOOKS), dtype=bool)
     for world in range(len(worlds)):
@@ -245,7 +248,7 @@ def prompts_of(worlds: Worlds, tokenizer: Tokenizer, prompts: int = PROMPTS) -> 
     tokens = torch.tensor(
         [code.ids for code in tokenizer.encode_batch(texts)], dtype=torch.int16
     ).view(len(worlds), prompts, -1)
-    return {"points": points_of(worlds), "prompts": tokens, "true": torch.from_numpy(true)}
+    return tokens, torch.from_numpy(true)
 
 
 def recipe_of(name: str, stage: DepthStage) -> dict[str, Any]:

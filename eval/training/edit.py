@@ -48,12 +48,12 @@ def train(
     from training.depth_editor import DEPTH_STAGES, train_depth_stage
     from training.editor import train_stage
 
-    trainer = train_depth_stage if known(stage) in DEPTH_STAGES else train_stage
+    trainer = train_depth_stage if checked(stage) in DEPTH_STAGES else train_stage
     trainer(stage, data, out, threads=threads, device=device)
 
 
-def known(stage: str) -> str:
-    """The stage's name, if there is one of that name."""
+def checked(stage: str) -> str:
+    """The stage's name. BadParameter: there is none of that name."""
     from training.depth_editor import DEPTH_STAGES
     from training.editor import STAGES
 
@@ -64,6 +64,21 @@ def known(stage: str) -> str:
 
 
 @app.command()
+def stages(out: Out = CACHE) -> None:
+    """Print a table of the trained stages: steps, seconds and losses, from the logs of ``train``."""
+    from training.depth_editor import DEPTH_STAGES
+    from training.editor import STAGES
+    from training.log import log_path, table
+
+    logs = [log_path(out / f"{name}.pt") for name in (*STAGES, *DEPTH_STAGES)]
+    logs = [path for path in logs if path.exists()]
+    if not logs:
+        message = f"{out}: no log of a stage, which training writes; train one first"
+        raise typer.BadParameter(message, param_hint="--out")
+    typer.echo(table(logs))
+
+
+@app.command()
 def export(
     stage: str, name: str, out: Out = CACHE, weights: Annotated[Path, typer.Option()] = WEIGHTS
 ) -> None:
@@ -71,7 +86,7 @@ def export(
     from training.depth_editor import DEPTH_STAGES
     from training.editor_export import export_depth_editor, export_editor
 
-    write = export_depth_editor if known(stage) in DEPTH_STAGES else export_editor
+    write = export_depth_editor if checked(stage) in DEPTH_STAGES else export_editor
     typer.echo(write(stage, out, weights / name))
 
 
@@ -89,7 +104,7 @@ def assess(
     from training.editor_assess import assess_editor
     from training.editor_export import depth_facts_of, facts_of
 
-    if known(stage) in DEPTH_STAGES:
+    if checked(stage) in DEPTH_STAGES:
         card = assess_depth_editor(weights / name, data, depth_facts_of(stage, out), worlds=worlds)
     else:
         facts = facts_of(stage, out)

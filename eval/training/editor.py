@@ -8,6 +8,7 @@ noisy latents. It predicts the edited picture itself, from betas whose last step
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,21 +16,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from tokenizers import (
-    Tokenizer,
-    decoders,
-    models,
-    normalizers,
-    pre_tokenizers,
-    processors,
-    trainers,
-)
+from tokenizers import Tokenizer
 
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
 from attnwarp.errors import InputError
 from training import editor_pool, steps
 from training.assemblies import KINDS as ASSEMBLIES
+from training.byte_pairs import learn_byte_pairs
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -41,7 +35,7 @@ from training.editing_pairs import (
     instruction,
     load_mixed,
 )
-from training.editor_pool import Batch, Pool
+from training.editor_pool import Batch, PairPool
 from training.steps import Task, train_steps
 from training.worlds import OBJECTS
 
@@ -221,21 +215,7 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
         corpus.append(instruction(kind, thing, row, rng))
         if kind in AMBIGUOUS:
             corpus.append(ambiguous_instruction(kind, thing, rng))
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
-    tokenizer.decoder = decoders.ByteLevel()
-    trainer = trainers.BpeTrainer(
-        vocab_size=VOCABULARY, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
-        show_progress=False,
-    )  # fmt: skip
-    tokenizer.train_from_iterator(corpus, trainer)
-    tokenizer.post_processor = processors.TemplateProcessing(
-        single="$A <end>", special_tokens=[("<end>", 1)]
-    )
-    tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=TOKENS)
-    tokenizer.enable_truncation(TOKENS)
-    return tokenizer
+    return learn_byte_pairs(corpus, vocabulary=VOCABULARY, most_tokens=TOKENS, length=TOKENS)
 
 
 def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
@@ -308,17 +288,17 @@ def tokenizer_of(out: Path) -> Tokenizer:
     return Tokenizer.from_file(str(path))
 
 
-def pool_of(stage: Stage, data: Path, tokenizer: Tokenizer, device: torch.device | str) -> Pool:
+def pool_of(stage: Stage, data: Path, tokenizer: Tokenizer, device: torch.device | str) -> PairPool:
     """The pictures and sentences that a stage is trained on; pictures are rendered where they are missing."""
     counts: dict[str, int | None] = {"edit-train": stage.worlds}
     if stage.parts:
         counts["parts-train"] = stage.parts
-    return Pool(load_mixed(data, counts), tokenizer, device)
+    return PairPool(load_mixed(data, counts), tokenizer, device)
 
 
 def train_stage(
     name: str, data: Path, out: Path, *, stage: Stage | None = None, threads: int = 1, device: torch.device | str = "cpu",
-    pool: Pool | None = None,
+    pool: PairPool | None = None,
 ) -> Path:  # fmt: skip
     """Train a stage, or go on with it; the checkpoint's path.
 
@@ -338,6 +318,7 @@ def train_stage(
     tokenizer = tokenizer_of(out)
     pool = pool_of(stage, data, tokenizer, device) if pool is None else pool
     net = EditorNet(tokenizer.get_vocab_size(), stage.size, draws=stage.draws)
+    spent = 0.0
     if stage.start is not None:
         weights = weights_of(out, stage.start)
         begins = stage.draws and not any(k.startswith("unet.draw.") for k in weights)
@@ -347,13 +328,15 @@ def train_stage(
         if begins and not (out / f"{name}.pt").exists():
             from training.editor_draws import teach_draws
 
+            start = time.perf_counter()
             teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
+            spent = time.perf_counter() - start
     net.to(device)
     alphas = scheduler(stage.shift).alphas_cumprod.to(device)
     empty = tokens_of(tokenizer, [""])[0].to(device)
     checkpoint = out / f"{name}.pt"
     train_steps(
-        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device
+        net, stage, tasks_of(stage, pool, net, alphas, empty), checkpoint, recipe_of(name, stage), device, spent
     )  # fmt: skip
     return checkpoint
 
@@ -371,7 +354,9 @@ def weights_of(out: Path, stage: str) -> dict[str, Tensor]:
     return {k.removeprefix("module."): v for k, v in stored.items() if k != "n_averaged"}
 
 
-def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Tensor) -> list[Task]:
+def tasks_of(
+    stage: Stage, pool: PairPool, net: EditorNet, alphas: Tensor, empty: Tensor
+) -> list[Task]:
     """What a stage's steps are of: plain pairs or injected ones, small pictures or large ones."""
     tasks = []
     for size, share in ((stage.size, 1 - stage.large), (2 * stage.size, stage.large)):
@@ -395,7 +380,7 @@ def tasks_of(stage: Stage, pool: Pool, net: EditorNet, alphas: Tensor, empty: Te
 
 
 def plain_inputs(
-    pool: Pool, stage: Stage, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
+    pool: PairPool, stage: Stage, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator
 ) -> dict[str, Tensor]:  # fmt: skip
     """Pairs as the network gets them, with their targets."""
     t = draw_steps(count, generator, stage.noisy_from)

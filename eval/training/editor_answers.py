@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -29,19 +28,6 @@ def codes() -> Tensor:
     c = torch.arange(fine, dtype=torch.float64)[None]
     rows = (2 / fine) ** 0.5 * torch.cos(math.pi * (c + 0.5) * k / fine)
     return torch.cat([torch.zeros((LOOKS, COARSE)), rows.float()], dim=1)
-
-
-def picked(noise: Tensor, candidates: Sequence[int]) -> int:
-    """The answer that a noise picks: the look whose direction is nearest to the noise's mean over the picture.
-
-    Directions are orthonormal and the noise is white, so every candidate is picked as often.
-
-    Args:
-        noise: (48, h, w).
-        candidates: indices of looks.
-    """
-    scores = codes()[list(candidates)] @ noise.mean(dim=(1, 2))
-    return int(candidates[int(scores.argmax())])
 
 
 def membership() -> Tensor:

@@ -86,7 +86,7 @@ def teach_draws(
     """Fit ``net.unet.draw`` to the differences of the answers that noises pick; the last losses' mean.
 
     An open sentence gets the difference of the answer whose direction is nearest to the noise's mean
-    (:func:`training.editor_answers.picked`), a clear one and none get 0.
+    (:func:`training.editor_answers.settled`), a clear one and none get 0.
     """
     rng = np.random.default_rng([seed, 1])
     generator = torch.Generator().manual_seed(seed)

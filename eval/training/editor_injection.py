@@ -11,18 +11,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from attnwarp.camera import Camera
 from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK, CHANNELS
-from attnwarp.warp import EXACT_DEPTH_TOLERANCE, FeatureWarp, Surface, WarpSettings, warp_surfaces
-from training.editing_pairs import SIZE, VIEWS, Worlds
+from training.editing_pairs import SIZE
 from training.editor import T_STEPS, EditorNet, draw_steps, loss_of, noised
 from training.editor_answers import settled
-from training.editor_pool import Batch, Pool, Rows
+from training.editor_pool import Batch, PairPool, Rows
 
 FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05
 """Features are mixed in with the paper's falling weight at that step, give or take the spread.
@@ -48,10 +45,8 @@ WAYS = {"same": 0.35, "mirrored": 0.15, "shifted": 0.15, "other view": 0.25, "un
 
 INJECTED_KINDS = {"color": 0.6, "material": 0.25, "ground": 0.15}
 
-EXACT = WarpSettings(opaque=None, normal_test="none", depth_relative=EXACT_DEPTH_TOLERANCE)
 
-
-def regions(cells: int, count: int, pool: Pool, generator: torch.Generator) -> Tensor:
+def regions(cells: int, count: int, pool: PairPool, generator: torch.Generator) -> Tensor:
     """(B, h, w) bool, where features go over: everything (40 %), a half (30 %), or a box."""
     line = torch.arange(cells, device=pool.device)
     y, x = line[None, :, None], line[None, None, :]
@@ -100,36 +95,8 @@ class Moves:
         return torch.where(mask[:, :, None], mixed, new)
 
 
-def view_warp(worlds: Worlds, world: int, target: int, cells: int) -> FeatureWarp:
-    """The exact warp to a view of a world from its other one, on a grid of the whole picture."""
-
-    def camera(view: int) -> Camera:
-        return Camera(worlds.K[world, view], worlds.world_to_camera[world, view], SIZE, SIZE)
-
-    def surface(view: int) -> Surface:
-        return Surface(worlds.depth[world, view].astype(np.float64))
-
-    source = 1 - target
-    view = warp_surfaces(camera(source), camera(target), surface(target), surface(source), EXACT)
-    return view.at((cells, cells))
-
-
-def view_moves(worlds: Worlds, size: int) -> tuple[Tensor, Tensor]:
-    """(N, 2, cells^2) index into the other view's cells, and mask, for whole pictures of that size."""
-    cells = size // BLOCK
-    index = np.zeros((len(worlds), VIEWS, cells**2), dtype=np.int16)
-    mask = np.zeros(index.shape, dtype=bool)
-    for world in range(len(worlds)):
-        for target in range(VIEWS):
-            warp = view_warp(worlds, world, target, cells)
-            xy = np.clip(np.nan_to_num(warp.correspondence.xy.numpy()), 0, cells - 1e-6)
-            index[world, target] = (xy.astype(np.int64) @ [1, cells]).ravel()
-            mask[world, target] = warp.mask.numpy().ravel()
-    return torch.from_numpy(index), torch.from_numpy(mask)
-
-
 def draw_moves(
-    pool: Pool, rows: Rows, size: int, generator: torch.Generator
+    pool: PairPool, rows: Rows, size: int, generator: torch.Generator
 ) -> tuple[Rows, Rows, Tensor, Tensor, Tensor]:
     """For each of B's rows: the way's place in :data:`WAYS` and where features come from.
 
@@ -198,7 +165,7 @@ def falling_weight(t: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def inputs(
-    pool: Pool, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator, *,
+    pool: PairPool, alphas: Tensor, empty: Tensor, size: int, count: int, generator: torch.Generator, *,
     inject: bool = True, noisy_from: int = 850,
 ) -> dict[str, Tensor]:  # fmt: skip
     """Pairs of runs A and B as the network gets them, with their targets; the runs of a pair share their step.
@@ -274,7 +241,7 @@ def injected_loss(
     return loss_a + loss_b, {"recorded": loss_a.detach(), "injected": loss_b.detach()}
 
 
-def _rebuilt(pool: Pool, batch: Batch, rows: Rows, size: int) -> Batch:
+def _rebuilt(pool: PairPool, batch: Batch, rows: Rows, size: int) -> Batch:
     """The batch with the pictures of other rows."""
     return replace(
         batch,

@@ -30,6 +30,7 @@ from training.editing_pairs import (
     instruction,
 )
 from training.editor_answers import KIND_NAMES, membership, settled
+from training.view_warps import view_moves
 
 SENTENCES = 48
 """Instructions made ahead for each thing and result."""
@@ -104,40 +105,22 @@ class Batch:
     rows: Rows
 
 
-class Pool:
-    """Pictures, sentences and choices of worlds on one device.
+class PicturePool:
+    """Pictures of worlds on one device, cut by the hundred.
 
     Args:
         worlds: at :data:`training.editing_pairs.SIZE`.
-        tokenizer: of the instructions.
         device: where everything lies and is drawn.
-        sentences: instructions made ahead for each thing and result.
-        tables: what :func:`tables_of` gives, if it is there already.
     """
 
-    def __init__(
-        self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, sentences: int = SENTENCES,
-        tables: Mapping[str, Tensor] | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, worlds: Worlds, device: torch.device | str = "cpu") -> None:
         self.worlds = worlds
         self.device = torch.device(device)
-        tables = tables_of(worlds, tokenizer, sentences) if tables is None else tables
-        self.tables = {key: value.to(self.device) for key, value in tables.items()}
+        self.points = points_of(worlds).to(self.device)
         self.images = torch.from_numpy(worlds.images).to(self.device).view(-1, 3)
         self.things = torch.from_numpy(worlds.ids == THING).to(self.device).view(-1)
         self.member = membership().to(self.device)
-        self.open_kinds = torch.tensor([k in AMBIGUOUS for k in KIND_NAMES], device=self.device)
         self.coder = HaarLatents().to(self.device)
-        self._moves: dict[int, tuple[Tensor, Tensor]] = {}
-
-    def moves(self, size: int) -> tuple[Tensor, Tensor]:
-        """:func:`training.editor_injection.view_moves` on the device, made once for a size."""
-        if size not in self._moves:
-            from training.editor_injection import view_moves
-
-            index, mask = view_moves(self.worlds, size)
-            self._moves[size] = index.to(self.device), mask.to(self.device)
-        return self._moves[size]
 
     def pick(self, weights: Tensor, generator: torch.Generator) -> Tensor:
         """(B,) columns drawn by (B, N) weights."""
@@ -151,57 +134,10 @@ class Pool:
         """(count,) whole numbers from 0 to ``high`` - 1."""
         return torch.randint(high, (count,), generator=generator, device=self.device)
 
-    def rows(
-        self, count: int, generator: torch.Generator, *, size: int, kinds: Mapping[str, float], unclear: float
-    ) -> Rows:  # fmt: skip
-        """Draw pairs.
-
-        Args:
-            count: of them.
-            generator: on the pool's device.
-            size: of the pictures in px. At 64, half of the pictures are a quarter of the full one about the thing,
-                so that things come large and small.
-            kinds: how often each kind comes, by name.
-            unclear: share of the pairs of kinds with open instructions that get one.
-        """
-        share = torch.tensor([kinds.get(k, 0.0) for k in KIND_NAMES], device=self.device)
-        chances = self.tables["pairs"]
-        having = chances.sum(dim=(2, 3)) > 0
-        both = torch.multinomial(
-            (having * share / having.sum(dim=0).clamp(min=1)).flatten(), count, replacement=True, generator=generator
-        )  # fmt: skip
-        world, kind = both // len(KIND_NAMES), both % len(KIND_NAMES)
-        source, target = self.looks(world, kind, generator)
-        view = self.integers(VIEWS, count, generator)
-        is_open = self.open_kinds[kind] & (self.uniform(generator, count) < unclear)
-        y, x, zoom = self.corner(world, view, size, generator)
-        flip = self.uniform(generator, count) < 0.5
-        return Rows(world, view, source, target, kind, is_open, y, x, zoom, flip)
-
-    def looks(
-        self, world: Tensor, kind: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """(B,) looks before and after."""
-        both = self.pick(self.tables["pairs"][world, kind].flatten(1), generator)
-        return both // LOOKS, both % LOOKS
-
-    def answered(self, rows: Rows, generator: torch.Generator) -> Rows:
-        """The rows with answers of their own; where the world has no such look before, with another one too."""
-        chances = self.tables["pairs"][rows.world, rows.kind]
-        own = chances[torch.arange(len(rows), device=self.device), rows.source]
-        source, target = self.looks(rows.world, rows.kind, generator)
-        has = own.sum(dim=1) > 0
-        drawn = self.pick(torch.where(has[:, None], own, 1.0), generator)
-        return replace(
-            rows,
-            source=torch.where(has, rows.source, source),
-            target=torch.where(has, drawn, target),
-        )
-
     def point(self, world: Tensor, view: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:  # fmt: skip
         """(B,) y and x of a pixel of the full picture's thing."""
         number = self.integers(POINTS, len(world), generator)
-        y, x = self.tables["points"][world, view, number].long().unbind(1)
+        y, x = self.points[world, view, number].long().unbind(1)
         return y, x
 
     def corner(
@@ -256,6 +192,79 @@ class Pool:
         gain = torch.where(surface, gain, 1.0)
         return 1 + touched * (gain - 1)[:, None, None, None]
 
+
+class PairPool(PicturePool):
+    """Pictures, instructions and choices of looks before and after.
+
+    Args:
+        worlds, device: see :class:`PicturePool`.
+        tokenizer: of the instructions.
+        sentences: instructions made ahead for each thing and result.
+    """
+
+    def __init__(
+        self, worlds: Worlds, tokenizer: Tokenizer, device: torch.device | str = "cpu", *, sentences: int = SENTENCES
+    ) -> None:  # fmt: skip
+        super().__init__(worlds, device)
+        tables = tables_of(worlds, tokenizer, sentences)
+        self.tables = {key: value.to(self.device) for key, value in tables.items()}
+        self.open_kinds = torch.tensor([k in AMBIGUOUS for k in KIND_NAMES], device=self.device)
+        self._moves: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def moves(self, size: int) -> tuple[Tensor, Tensor]:
+        """:func:`training.view_warps.view_moves` on the device, made once for a size."""
+        if size not in self._moves:
+            index, mask = view_moves(self.worlds, size)
+            self._moves[size] = index.to(self.device), mask.to(self.device)
+        return self._moves[size]
+
+    def rows(
+        self, count: int, generator: torch.Generator, *, size: int, kinds: Mapping[str, float], unclear: float
+    ) -> Rows:  # fmt: skip
+        """Draw pairs.
+
+        Args:
+            count: of them.
+            generator: on the pool's device.
+            size: of the pictures in px. At 64, half of the pictures are a quarter of the full one about the thing,
+                so that things come large and small.
+            kinds: how often each kind comes, by name.
+            unclear: share of the pairs of kinds with open instructions that get one.
+        """
+        share = torch.tensor([kinds.get(k, 0.0) for k in KIND_NAMES], device=self.device)
+        chances = self.tables["pairs"]
+        having = chances.sum(dim=(2, 3)) > 0
+        both = torch.multinomial(
+            (having * share / having.sum(dim=0).clamp(min=1)).flatten(), count, replacement=True, generator=generator
+        )  # fmt: skip
+        world, kind = both // len(KIND_NAMES), both % len(KIND_NAMES)
+        source, target = self.looks(world, kind, generator)
+        view = self.integers(VIEWS, count, generator)
+        is_open = self.open_kinds[kind] & (self.uniform(generator, count) < unclear)
+        y, x, zoom = self.corner(world, view, size, generator)
+        flip = self.uniform(generator, count) < 0.5
+        return Rows(world, view, source, target, kind, is_open, y, x, zoom, flip)
+
+    def looks(
+        self, world: Tensor, kind: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """(B,) looks before and after."""
+        both = self.pick(self.tables["pairs"][world, kind].flatten(1), generator)
+        return both // LOOKS, both % LOOKS
+
+    def answered(self, rows: Rows, generator: torch.Generator) -> Rows:
+        """The rows with answers of their own; where the world has no such look before, with another one too."""
+        chances = self.tables["pairs"][rows.world, rows.kind]
+        own = chances[torch.arange(len(rows), device=self.device), rows.source]
+        source, target = self.looks(rows.world, rows.kind, generator)
+        has = own.sum(dim=1) > 0
+        drawn = self.pick(torch.where(has[:, None], own, 1.0), generator)
+        return replace(
+            rows,
+            source=torch.where(has, rows.source, source),
+            target=torch.where(has, drawn, target),
+        )
+
     def text(self, rows: Rows, generator: torch.Generator) -> Tensor:
         """(B, 24) tokens of the rows' instructions."""
         clear = self.tables["clear"][rows.world, rows.target]
@@ -298,7 +307,7 @@ class Pool:
         )  # fmt: skip
 
 
-def cut_regions(thing: Tensor, pool: Pool, generator: torch.Generator) -> Tensor:
+def cut_regions(thing: Tensor, pool: PicturePool, generator: torch.Generator) -> Tensor:
     """(B, S, S) bool: half-planes at any angle, or boxes, whose edge goes through a pixel of the thing.
 
     Args:
@@ -322,12 +331,12 @@ def cut_regions(thing: Tensor, pool: Pool, generator: torch.Generator) -> Tensor
 
 
 def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) -> dict[str, Tensor]:  # fmt: skip
-    """What batches are drawn by.
+    """What pairs are drawn by.
 
     Returns:
-        ``pairs``: (N, kinds, LOOKS, LOOKS) chance of a pair of looks, 0 where it is none of the kind; ``points``:
-        (N, 2, POINTS, 2) y and x of pixels of the thing; ``sentences``: (M, S, 24) tokens; ``clear``: (N, LOOKS)
-        the row of the sentences that ask for a look; ``opened``: (N, kinds) of those that leave it open.
+        ``pairs``: (N, kinds, LOOKS, LOOKS) chance of a pair of looks, 0 where it is none of the kind;
+        ``sentences``: (M, S, 24) tokens; ``clear``: (N, LOOKS) the row of the sentences that ask for a look;
+        ``opened``: (N, kinds) of those that leave it open.
     """
     rng = np.random.default_rng(31)
     count = len(worlds)
@@ -368,7 +377,7 @@ def tables_of(worlds: Worlds, tokenizer: Tokenizer, sentences: int = SENTENCES) 
     flat = [text for row in texts for text in row]
     tokens = torch.tensor([code.ids for code in tokenizer.encode_batch(flat)], dtype=torch.int16)
     return {
-        "pairs": pairs, "points": points_of(worlds), "clear": clear, "opened": opened,
+        "pairs": pairs, "clear": clear, "opened": opened,
         "sentences": tokens.view(len(texts), sentences, -1),
     }  # fmt: skip
 

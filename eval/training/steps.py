@@ -77,7 +77,7 @@ def falling_rate(step: int, total: int, peak: float, warm: int = WARM) -> float:
 
 def train_steps(
     net: torch.nn.Module, plan: Plan, tasks: Sequence[Task], checkpoint: Path, recipe: Mapping[str, Any],
-    device: torch.device,
+    device: torch.device, spent: float = 0.0,
 ) -> None:  # fmt: skip
     """Take a stage's steps, or those that are left, with an average of the weights beside them.
 
@@ -88,6 +88,7 @@ def train_steps(
         checkpoint: written as it goes.
         recipe: what the result depends on, see :class:`training.common.Run`.
         device: of torch.
+        spent: seconds that went before the first step.
     """
     recipe = {**recipe, "device": device.type}  # optimizers of a CPU and of a GPU hold other states
     stepper = Stepper(net, plan.peak, tasks, device)
@@ -111,7 +112,9 @@ def train_steps(
 
     state = {"net": net, "average": stepper.average, "optimizer": stepper.optimizer}
     epochs = plan.steps // STEPS_AN_EPOCH
-    Run(checkpoint, state, epochs, recipe, every=SAVE_SECONDS, device=name_of(device)).train(epoch)
+    Run(
+        checkpoint, state, epochs, recipe, every=SAVE_SECONDS, device=name_of(device), steps=STEPS_AN_EPOCH, spent=spent
+    ).train(epoch)  # fmt: skip
 
 
 def name_of(device: torch.device) -> str:

@@ -143,6 +143,20 @@ def test_the_seconds_of_both_halves_are_added(tmp_path, monkeypatch):
     assert minutes(tmp_path / "a.pt", tmp_path / "a.pt") == pytest.approx(160 / 60)
 
 
+def test_seconds_before_the_first_epoch_are_counted_once(tmp_path, monkeypatch):
+    clock = iter([10, 40, 100, 100, 150])
+    monkeypatch.setattr(common.time, "perf_counter", lambda: next(clock))
+    small = Small(tmp_path / "a.pt", stop_in=1)
+    small.run.spent = 15.0
+    with pytest.raises(KeyboardInterrupt):
+        small.train()
+    assert minutes(tmp_path / "a.pt") == 0.75
+    resumed = Small(tmp_path / "a.pt")
+    resumed.run.spent = 15.0  # the layers that learned first are in the checkpoint
+    resumed.train()
+    assert minutes(tmp_path / "a.pt") == pytest.approx(95 / 60)
+
+
 def test_what_a_recipe_says_is_its_constants_its_words_and_its_pictures():
     said = settings(vars(dino), "train")
     assert (said["EPOCHS"], said["PEAK"], said["SEED"]) == (dino.EPOCHS, dino.PEAK, dino.SEED)

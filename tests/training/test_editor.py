@@ -8,6 +8,7 @@ import pytest
 import torch
 import yaml
 from diffusers import StableDiffusionInstructPix2PixPipeline
+from picked_answers import picked
 from typer.testing import CliRunner
 
 import attnwarp_eval
@@ -30,10 +31,10 @@ from training.editing_pairs import (
     reserved,
 )
 from training.editor import Stage, make_tokenizer, train_stage
-from training.editor_answers import codes, picked
+from training.editor_answers import codes
 from training.editor_export import export_editor, facts_of
 from training.editor_pictures import Pictures, Row
-from training.editor_pool import Pool
+from training.editor_pool import PairPool
 from training.worlds import COLORS, held_out
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
@@ -56,7 +57,7 @@ def tokenizer():
 
 @pytest.fixture(scope="module")
 def pool(data, tokenizer):
-    return Pool(load_pairs(data, "edit-train", count=2), tokenizer, sentences=4)
+    return PairPool(load_pairs(data, "edit-train", count=2), tokenizer, sentences=4)
 
 
 def scene_instructions():

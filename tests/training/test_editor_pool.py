@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 import torch
+from picked_answers import picked
 
 from attnwarp.editing.attention import Layer, decay
 from training import editing_pairs
 from training.editing_pairs import AMBIGUOUS, GROUPS, load_pairs
 from training.editor import make_tokenizer
-from training.editor_answers import KIND_NAMES, codes, picked, settled
+from training.editor_answers import KIND_NAMES, codes, settled
 from training.editor_injection import WAYS, Moves, draw_moves, falling_weight
 from training.editor_pictures import Pictures, Row
-from training.editor_pool import Pool, cut_regions
+from training.editor_pool import PairPool, cut_regions
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
 
@@ -21,7 +22,7 @@ def pool(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pairs")
     for index in range(2):
         editing_pairs._make(folder, "edit-train", index)
-    return Pool(
+    return PairPool(
         load_pairs(folder, "edit-train", count=2), make_tokenizer(400, worlds=10), sentences=4
     )
 

@@ -213,14 +213,28 @@ def markdown_table(table: Table) -> str:
     return "\n".join([header, f"|{'---|' * len(table.columns)}", *rows])
 
 
-def _render(template: str, report: Report, autoescape: bool, filters: dict[str, Any]) -> str:
-    environment = Environment(
-        loader=PackageLoader("attnwarp_eval.document", "."),
+def templates(package: str, *, autoescape: bool) -> Environment:
+    """The templates that lie beside a package's modules; a name without a value is an error.
+
+    Args:
+        package: whose folder has them.
+        autoescape: whether values are text of HTML rather than of Markdown.
+
+    Example:
+        >>> templates("attnwarp_eval.userstudy", autoescape=True).list_templates("j2")
+        ['page.html.j2']
+    """
+    return Environment(
+        loader=PackageLoader(package, "."),
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
         autoescape=autoescape,
     )
+
+
+def _render(template: str, report: Report, autoescape: bool, filters: dict[str, Any]) -> str:
+    environment = templates("attnwarp_eval.document", autoescape=autoescape)
     environment.filters.update(filters)
     return environment.get_template(template).render(report=report)
 

@@ -253,7 +253,11 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
         - certified
     )
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
-    costs = [entry["cost"] for entry in entries if "cost" in entry]
+    # Entries of one table have one: it follows from the rounds and Mitsuba's variant, which all
+    # share.
+    costs = {
+        tuple(e["cost"][key] for key in ("size", "spp", "rounds")) for e in entries if "cost" in e
+    }
     lead = [
         f"{len(entries)} scenes, {certified} of their plans certified"
         + (f", {partly} more but for what is not simulated" if partly else "")
@@ -268,9 +272,10 @@ def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Re
         ),
     ]
     if costs:
+        ((size, spp, rounds),) = costs
         lead.append(
-            f"**Times**: {costs[0]['size']} x {costs[0]['size']}, {costs[0]['spp']} samples, in"
-            f" turn, {costs[0]['rounds']} rounds. Everything on follows light until roulette ends"
+            f"**Times**: {size} x {size}, {spp} samples, in turn, {rounds} rounds. Everything on"
+            " follows light until roulette ends"
             " it. **At equal noise**: the same times the ratio of variances. Where a scene caps"
             " its bounces, by its own word or as measured below, the plan leaves light out, so that"
             " the two pictures have other means and equal noise is not equal error: the **light"

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import write_json
 from attnwarp_eval.cost import environment
 from attnwarp_eval.document.write import write_files
 from attnwarp_eval.effects import table
 from attnwarp_eval.effects.table import Settings, measure_entry, report, side_by_side
+from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
 from attnwarp_eval.experiments.overwriting import check_nothing_is_lost
 from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
@@ -48,11 +48,8 @@ def collect(
         InputError: a scene that is unknown or contradicts itself, two scenes of one name, another
             run that is writing to ``out``, or rows of its ``effects.json`` that would be lost.
     """
-    from attnwarp_eval.scene.file import load_scene
-
     store = Store(out)
-    scenes = [load_scene(name) for name in names]
-    _check_names(names, scenes)
+    scenes = distinct_scenes(names)
     asked = {(scene.name,) for scene in scenes}
     stored = check_nothing_is_lost(out / "effects.json", "scenes", ("scene",), asked)
     tasks, parts = _tasks(scenes, store, settings), 1 + settings.pictures
@@ -69,22 +66,6 @@ def collect(
         write_json(out / "effects.json", data, sort_keys=False)
         write_files(report(list(entries.values()), about), out, "effects")
     return list(entries.values())
-
-
-def _check_names(names: Sequence[str], scenes: Sequence[Scene]) -> None:
-    """Check that no two scenes have one name, which names the row and the picture.
-
-    Raises:
-        InputError: two have.
-    """
-    first: dict[str, tuple[str, Scene]] = {}
-    for path, scene in zip(names, scenes, strict=True):
-        other, same = first.setdefault(scene.name, (path, scene))
-        if same.content_hash != scene.content_hash:
-            raise InputError(
-                f"{other} and {path}: two scenes have the name {scene.name!r}, expected one of"
-                " each name in a table; rename one of them"
-            )
 
 
 def _tasks(scenes: Sequence[Scene], store: Store, settings: Settings) -> Iterator[Task[Part]]:

@@ -204,19 +204,10 @@ def of_run(
         >>> of_run(store.root).scene
         'spheres'
     """
-    from pydantic import ValidationError
-
-    from attnwarp_eval.study.study import explain_errors, parse_study
+    from attnwarp_eval.study.run import stored_study
     from attnwarp_eval.world import world
 
-    stored = Store(folder).read_study()
-    try:
-        study = parse_study(stored["study"])
-    except ValidationError as error:
-        raise InputError(
-            f"{folder / 'study.json'}: {explain_errors(error)}; run the study again with --out"
-            f" {folder}, which writes it anew"
-        ) from None
+    study, listed = stored_study(Store(folder))
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     scene = scene or study.scenes[0]
@@ -233,7 +224,7 @@ def of_run(
         )
     size = size or study.size
     views = world(scene, size)
-    records = measured(folder, stored["cells"], scene, seed, views.source.name)
+    records = measured(folder, listed, scene, seed, views.source.name)
     for own in records.values():
         if own.scene != views.content_hash:
             raise InputError(

@@ -6,24 +6,22 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-from pydantic import ValidationError
-
 from attnwarp_eval.canonical_json import canonical_json
-from attnwarp_eval.study.probes import probe, probes
+from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.results import Outcome, Results
-from attnwarp_eval.study.run import check_labels
+from attnwarp_eval.study.run import stored_study
 from attnwarp_eval.study.store import Store, StoreError
-from attnwarp_eval.study.study import explain_errors, parse_study
 
 
 def read_results(store: Store) -> Results:
     """The finished cells of a run, and a failure for each damaged record.
 
     Raises:
-        StoreError: the folder is no run, or its study cannot be read.
+        StoreError: see :func:`attnwarp_eval.study.run.stored_study`.
 
     Example:
+        >>> from attnwarp_eval.study import parse_study
         >>> from attnwarp_eval.study.run import expected, plan
         >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
         >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
@@ -32,29 +30,11 @@ def read_results(store: Store) -> Results:
         >>> [(outcome.probe, outcome.record) for outcome in read_results(store).cells]
         [('calibration', None), ('depth', None)]
     """
-    stored = store.read_study()
-    try:
-        study = parse_study(stored["study"])
-    except ValidationError as error:
-        raise StoreError(
-            f"{store.root / 'study.json'}: {explain_errors(error)}; run the study again with --out"
-            f" {store.root}, which writes it anew"
-        ) from None
-    needs_scenes = {p.name: p.needs_scenes for p in probes()}
-    for cell in stored["cells"]:
-        on_scene = needs_scenes.get(cell["probe"], True)
-        if cell["probe"] not in needs_scenes or (on_scene and cell["scene"] not in study.scenes):
-            raise StoreError(
-                f"{store.root / 'study.json'}: cell {cell['title']!r} names a probe or a scene"
-                f" that the study lacks; run the study again with --out {store.root}, which"
-                " writes it anew"
-            )
-    if "sha256" not in stored:
-        check_labels(store, stored, study)
+    study, listed = stored_study(store)
     done = store.done()
     failures = [Failure.from_json(failure) for failure in store.failures()]
     cells = []
-    for cell in stored["cells"]:
+    for cell in listed:
         record: Record[Any] | None = None
         if cell["id"] in done:
             try:

@@ -167,10 +167,9 @@ def run_on_workers(
                 threads_per_worker=1,
                 memory_limit=0,
                 silence_logs=50,
-                dashboard_address=None,
-                # Even without its dashboard dask serves HTTP, and warns where its port is taken,
-                # as beside another run: any free port of this machine's own address will do.
-                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+                # Any free port: two runs on one machine would both ask for dask's usual one.
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
             )
             stack.enter_context(_closed(cluster))
             client = stack.enter_context(_closed(Client(cluster)))

@@ -11,17 +11,21 @@ from typing import Any
 from pydantic import ValidationError
 
 from attnwarp.errors import InputError
+from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
-from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
 from attnwarp_eval.study.schema import Study, StudyError
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write
+
+Label = tuple[str | None, str | None, int, list[str]]
+"""Scene, probe, seed and names of variants."""
 
 
 @dataclass
@@ -119,12 +123,54 @@ def verify(store: Store) -> Problems:
     return problems
 
 
-def check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
+def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
+    """The study of a run, and its expected cells as ``study.json`` lists them.
+
+    Raises:
+        StoreError: the folder is no run, its study cannot be read, or a cell of an unsealed run has
+            a label that is not its own.
+
+    Example:
+        >>> from attnwarp_eval.study.run import expected, plan, stored_study
+        >>> content = dict(name="my", scenes=["spheres"], variants={"a": {}})
+        >>> study = parse_study(content | {"probes": {"depth": ["a"]}})
+        >>> store = Store("run")
+        >>> store.write_study(expected(plan(study, store)))
+        >>> [cell["title"] for cell in stored_study(store)[1]]
+        ['spheres / calibration / calibration', 'spheres / a / depth']
+    """
+    stored = store.read_study()
+    path, remedy = store.root / "study.json", _remedy(store)
+    try:
+        study = parse_study(stored["study"])
+    except ValidationError as error:
+        raise StoreError(f"{path}: {explain_errors(error)}; {remedy}") from None
+    needs_scenes = {p.name: p.needs_scenes for p in probes()}
+    for cell in stored["cells"]:
+        on_scene = needs_scenes.get(cell["probe"], True)
+        if cell["probe"] not in needs_scenes or (on_scene and cell["scene"] not in study.scenes):
+            raise StoreError(
+                f"{path}: cell {cell['title']!r} names a probe or a scene that the study lacks;"
+                f" {remedy}"
+            )
+    if "sha256" not in stored:
+        _check_labels(store, stored, study)
+    return study, stored["cells"]
+
+
+def _remedy(store: Store) -> str:
+    return f"run the study again with --out {store.root}, which writes it anew"
+
+
+def _check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
     """Check under which names figures of an unsealed run would appear.
 
     A ``study.json`` without a checksum is of former code, or its checksum was removed: the file
-    does not tell which. What the study says of itself decides. Cells that it no longer names, and a
-    study whose scenes are gone, cannot be checked.
+    does not tell which. Records have checksums of their own, so each record's spec is searched
+    among today's cells of the study. A scene or a protocol that has changed gives other ids today;
+    the search leaves both out, and takes a scene's name from its hash in ``study.json``. A spec
+    that today's code writes otherwise still tells its scene, probe and seed; of its variants only
+    the names can then be checked.
 
     Args:
         store: the run's folder.
@@ -132,37 +178,66 @@ def check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
         study: the study in it.
 
     Raises:
-        StoreError: a cell has another label than the study gives it.
+        StoreError: a cell has another label than its record or the study gives it.
     """
     try:
-        scenes = _scenes(study)
-    except InputError:
-        return
-    cells = [_entry(cell) for cell in cells_of(study, scenes)]
-    wrong = _wrong_labels(store, stored["cells"], cells)
-    if wrong:
-        raise StoreError(wrong[0])
+        today = cells_of(study, _scenes(study))
+    except InputError:  # such as a scene that is gone
+        today = []
+    expected_labels = {_search_key(cell.spec, cell.scene): _label(_entry(cell)) for cell in today}
+    scenes = {entry["hash"]: name for name, entry in stored.get("scenes", {}).items()}
+    done = store.done()
+    for cell in stored["cells"]:
+        if cell["id"] not in done:
+            continue
+        try:
+            spec = store.read(cell["id"])["spec"]
+        except StoreError:
+            continue  # a failure of the report, without figures
+        scene = scenes.get(spec["scene"]) if "scene" in spec else cell["scene"]
+        label = _label(cell)
+        of_record = (scene, spec.get("probe"), spec.get("seed", cell["seed"]), label[3])
+        expected = expected_labels.get(_search_key(spec, scene), of_record)
+        if label != expected:
+            raise StoreError(_wrong_label(store, cell["id"], label, expected))
+        names = study.probes.get(cell["probe"], [])
+        for name in cell["variants"] if probe(cell["probe"]).judges_variants else []:
+            if name not in names:
+                raise StoreError(
+                    f"{store.root / 'study.json'}: cell {cell['id']} has the variant {name!r},"
+                    f" which the study does not name for {cell['probe']}; {_remedy(store)}"
+                )
+
+
+def _search_key(spec: dict[str, Any], scene: str | None) -> str:
+    """The same for cells of one study whose scene or protocol has changed between them."""
+    return digest({**spec, "protocol": None, "scene": scene if "scene" in spec else None})
 
 
 def _wrong_labels(
     store: Store, listed: list[dict[str, Any]], today: list[dict[str, Any]]
 ) -> list[str]:
     """A line for each cell that ``study.json`` lists under another name than the study gives it."""
-    names, expected_names = _labels(listed), _labels(today)
+    labels, expected_labels = ({c["id"]: _label(c) for c in cells} for cells in (listed, today))
     return [
-        f"{store.root / 'study.json'}: cell {cell_id} is called {names[cell_id]}, but the study"
-        f" calls it {expected_names[cell_id]}; run the study again with --out {store.root}, which"
-        " writes it anew"
-        for cell_id in sorted(names.keys() & expected_names.keys())
-        if names[cell_id] != expected_names[cell_id]
+        _wrong_label(store, cell_id, labels[cell_id], expected_labels[cell_id])
+        for cell_id in sorted(labels.keys() & expected_labels.keys())
+        if labels[cell_id] != expected_labels[cell_id]
     ]
 
 
-def _labels(cells: list[dict[str, Any]]) -> dict[str, Any]:
-    """By id, under which names figures appear. Their order follows that of the study's file, which
-    a run does not keep.
+def _wrong_label(store: Store, cell_id: str, label: Label, expected: Label) -> str:
+    return (
+        f"{store.root / 'study.json'}: cell {cell_id} is called {label}, but the study calls it"
+        f" {expected}; {_remedy(store)}"
+    )
+
+
+def _label(cell: dict[str, Any]) -> Label:
+    """Under which names the figures of a listed cell appear. Their order follows that of the
+    study's file, which a run does not keep.
     """
-    return {c["id"]: (c["scene"], c["probe"], c["seed"], sorted(c["variants"])) for c in cells}
+    return cell["scene"], cell["probe"], cell["seed"], sorted(cell["variants"])
 
 
 def expected(plan: Plan) -> dict[str, Any]:

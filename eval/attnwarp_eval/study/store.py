@@ -378,6 +378,10 @@ def _study_problem(study: dict[str, Any]) -> str | None:
     cells = study.get("cells")
     if not isinstance(study.get("study"), dict) or not isinstance(cells, list):
         return "damaged (no study, or no list of cells)"
+    scenes = study.get("scenes", {})
+    for scene in scenes.values() if isinstance(scenes, dict) else [scenes]:
+        if not isinstance(scene, dict) or not isinstance(scene.get("hash"), str):
+            return "damaged (scenes: expected the hash of each)"
     for index, cell in enumerate(cells):
         entry = cell if isinstance(cell, dict) else {}
         for key, kind in _LABELS.items():

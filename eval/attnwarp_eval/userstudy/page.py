@@ -8,10 +8,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from attnwarp_eval.canonical_json import digest
-from attnwarp_eval.document.write import reduced, reduction
+from attnwarp_eval.document.write import reduced, reduction, templates
 from attnwarp_eval.userstudy.draw import SCRAMBLED, Choice, draw
 from attnwarp_eval.userstudy.material import Item, of_views, scrambled
 
@@ -99,13 +97,7 @@ def build_page(items: Sequence[Item], design: Design, title: str) -> str:
         + base64.b64encode(reduced(data, scale) if scale < 1 else data).decode()
         for name, data in files.items()
     }
-    environment = Environment(
-        loader=PackageLoader("attnwarp_eval.userstudy", "."),
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=StrictUndefined,
-        autoescape=True,
-    )
+    environment = templates("attnwarp_eval.userstudy", autoescape=True)
     return environment.get_template("page.html.j2").render(study=study) + "\n"
 
 

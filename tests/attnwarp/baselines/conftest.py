@@ -4,19 +4,13 @@ from diffusers import ControlNetModel
 from tiny_baselines import QUICK
 from tiny_editors import parts, unet
 from tiny_scenes import cameras, pictures, splats
+from torch_threads import on_one_thread
 
 from attnwarp.baselines import METHODS
 from attnwarp.editing.controlnet import DepthControlNet
 from attnwarp.editing.pix2pix import InstructPix2Pix
 
-
-@pytest.fixture(autouse=True, scope="package")
-def one_thread():
-    """Pictures this small gain nothing from threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, autouse=True, scope="package")
 
 
 def loud(network):

@@ -141,16 +141,3 @@ def test_a_missing_extra_is_one_clear_line(folder, photo, tmp_path, monkeypatch)
         "editors need diffusers, which is not installed: pip install 'attnwarp[edit]'"
         in result.output
     )
-
-
-def test_help_imports_nothing_heavy():
-    import subprocess
-    import sys
-
-    code = (
-        "import sys; from typer.testing import CliRunner; from attnwarp.cli.main import app;"
-        "assert CliRunner().invoke(app, ['edit-image', '--help']).exit_code == 0;"
-        "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import tiny_editors
 import torch
+from torch_threads import on_one_thread
 
 from attnwarp.editing.folder import load_controlnet, load_parts
 from attnwarp.errors import InputError
@@ -26,12 +27,7 @@ FILES = (
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
 
 @pytest.fixture(scope="module")

@@ -13,6 +13,7 @@ import pytest
 import tiny_models
 import torch
 from safetensors.torch import save_file
+from torch_threads import on_one_thread
 
 from attnwarp.encoders import load_encoder
 from attnwarp.encoders._weights import state_of
@@ -24,12 +25,7 @@ FAST, SLOW = 6, 120
 TYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "u1"}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
 
 def tensors_in(data):

@@ -7,6 +7,7 @@ import pytest
 import tiny_models
 import torch
 from torch import nn
+from torch_threads import on_one_thread
 
 from attnwarp.encoders import PerceptualDistance, load_encoder
 from attnwarp.encoders.lpips import BACKBONES, SCALE, SHIFT, features
@@ -19,12 +20,7 @@ CHANNELS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
 
 @pytest.fixture(scope="module", params=["alex", "vgg", "squeeze"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny_models
 import torch
+from torch_threads import on_one_thread
 
 from attnwarp.encoders import ImageEncoder, TextImageEncoder, TokenEncoder, load_encoder
 from attnwarp.encoders.preprocess import read_preprocessing
@@ -29,12 +30,7 @@ def no_network():
         yield
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch_threads import on_one_thread
 
 from attnwarp import Camera, Gaussians
 from attnwarp.fit import Views
@@ -60,11 +61,4 @@ def scene():
     return pictures(truth, train), pictures(truth, test), points, colors
 
 
-@pytest.fixture(autouse=True, scope="package")
-def one_thread():
-    """Pictures this small gain nothing from threads, and lose much where others want the cores
-    too."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, autouse=True, scope="package")

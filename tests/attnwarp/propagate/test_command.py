@@ -231,16 +231,6 @@ def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_pa
     assert {p.name: p.read_bytes() for p in (tmp_path / "out" / "segments").iterdir()} == stored
 
 
-def test_help_imports_nothing_heavy():
-    code = (
-        "import sys; from typer.testing import CliRunner; from attnwarp.cli.main import app;"
-        "assert CliRunner().invoke(app, ['edit', '--help']).exit_code == 0;"
-        "print([m for m in ('torch', 'diffusers', 'cv2', 'numpy') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.slow
 def test_a_process_that_is_killed_and_started_again_leaves_the_same_bytes(place, tmp_path):
     def command(out):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from torch_threads import on_one_thread
 
 from attnwarp import Camera, Gaussians
 from attnwarp_eval.stability.rendered import front_camera, quaternion_to, splats
@@ -68,13 +69,7 @@ def edge_on(mean: np.ndarray, camera: Camera, roll: float, tilt: float) -> np.nd
     return quaternion_to(normal)
 
 
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """The reference's tensors are small here: torch's threads would only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+one_thread = pytest.fixture(on_one_thread)
 
 
 @pytest.fixture

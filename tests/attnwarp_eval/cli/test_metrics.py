@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import tiny_models
-import torch
+from torch_threads import on_one_thread
 from typer.testing import CliRunner
 
 from attnwarp.encoders import load_encoder
@@ -23,12 +23,7 @@ VIEWS = ("view1", "view2", "view10")
 PROMPTS = ("--prompt", "a bear in the snow", "--source-prompt", "a photo of a bear")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, scope="module", autouse=True)
 
 
 @pytest.fixture(scope="module")

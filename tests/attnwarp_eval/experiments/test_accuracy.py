@@ -18,7 +18,8 @@ from attnwarp_eval.experiments import accuracy, suite
 from attnwarp_eval.experiments.accuracy import geometry, point_visibility
 from attnwarp_eval.experiments.accuracy.panel import Contestant, Panel
 from attnwarp_eval.experiments.accuracy.write import write
-from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
+from attnwarp_eval.scene.file import load_scene, scene_folders
 from attnwarp_eval.study.store import Store
 
 
@@ -190,6 +191,20 @@ def test_a_report_whose_panels_are_in_no_cell_is_not_overwritten(tmp_path):
 def test_an_unknown_scene_is_one_line(tmp_path):
     result = CliRunner().invoke(app, ["scenes", "accuracy", "nowhere", "--out", str(tmp_path)])
     assert result.exit_code == 2 and "nowhere" in result.output
+
+
+def test_two_scenes_of_one_name_are_refused_and_one_named_twice_is_one(tmp_path):
+    text = (scene_folders()[-1] / "opposed.yaml").read_text()
+    other = tmp_path / "opposed.yaml"
+    other.write_text(text.replace("bounces: auto", "bounces: 2"))
+    command = ["scenes", "accuracy", "opposed", str(other), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 2 and not (tmp_path / "out").exists()
+    line = f"opposed and {other}: two scenes have the name 'opposed'"
+    assert line in " ".join(result.stderr.split())
+    assert [s.content_hash for s in distinct_scenes(["opposed", "fog", "opposed"])] == [
+        load_scene(name).content_hash for name in ("opposed", "fog")
+    ]
 
 
 def test_the_suites_time_is_that_of_an_empty_cache_and_leaves_the_cache_alone(

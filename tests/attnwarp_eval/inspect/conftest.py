@@ -1,5 +1,5 @@
 import pytest
-import torch
+from torch_threads import on_one_thread
 
 from attnwarp_eval.inspect import subject
 
@@ -14,13 +14,7 @@ def pair(chosen):
     return chosen.pair("corrected", "yaw060")
 
 
-@pytest.fixture(autouse=True, scope="package")
-def one_thread():
-    """Pictures this small gain nothing from threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, autouse=True, scope="package")
 
 
 @pytest.fixture(scope="package")

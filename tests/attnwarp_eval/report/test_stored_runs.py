@@ -15,7 +15,10 @@ import tarfile
 import pytest
 from direct_light import direct
 
+from attnwarp.errors import InputError
 from attnwarp_eval.report import write_report
+from attnwarp_eval.report.results import read_results
+from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store
 from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.probes import probe
@@ -88,3 +91,52 @@ def test_swapped_labels_are_found_without_a_seal_and_refused_with_one(folder, tm
     for command in (runner.verify, write_report):
         with pytest.raises(StoreError, match="checksum does not fit"):
             command(store)
+
+
+def _no_scene(name):
+    raise InputError(f"{name}: no such scene")
+
+
+def _label(cells, probe, variants):
+    next(cell for cell in cells if cell["probe"] == probe)["variants"] = variants
+
+
+def _swap(cells):
+    first, second = [cell for cell in cells if cell["probe"] == "warp"][:2]
+    first["variants"], second["variants"] = second["variants"], first["variants"]
+
+
+def _another_seed(cells):
+    cells[0]["seed"] = 1
+
+
+def _another_scene(cells):
+    cells[0]["scene"] = "bear"
+
+
+@pytest.mark.parametrize(
+    ("load", "damage"),
+    [
+        # Today's scenes have another light than the run's, so other ids: the rest of a spec tells.
+        (load_scene, _swap),
+        (load_scene, lambda cells: _label(cells, "calibration", ["calibratiof"])),
+        (load_scene, _another_seed),
+        # Without the scenes, the records tell.
+        (_no_scene, lambda cells: _label(cells, "warp", ["slippee"])),
+        (_no_scene, _another_seed),
+        (_no_scene, _another_scene),
+    ],
+)
+def test_a_former_run_whose_scenes_have_changed_is_read_and_a_wrong_label_in_it_is_refused(
+    folder, tmp_path, monkeypatch, load, damage
+):
+    monkeypatch.setattr(runner, "load_scene", load)
+    shutil.copytree(folder / "variants", tmp_path / "run")
+    store = Store(tmp_path / "run")
+    assert read_results(store).measured == 16
+    path = store.root / "study.json"
+    study = json.loads(path.read_text())
+    damage(study["cells"])
+    path.write_text(json.dumps(study))
+    with pytest.raises(StoreError, match=r"study\.json: cell .* (is called|has the variant)"):
+        read_results(store)

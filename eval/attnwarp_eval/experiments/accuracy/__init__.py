@@ -19,6 +19,7 @@ from attnwarp_eval.experiments.accuracy.geometry import depth, triangles
 from attnwarp_eval.experiments.accuracy.images import pictures
 from attnwarp_eval.experiments.accuracy.panel import Panel, panel_spec
 from attnwarp_eval.experiments.accuracy.point_visibility import visibility
+from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
 from attnwarp_eval.progress import Progress, Tell, silent
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.record import Json
@@ -46,13 +47,12 @@ def measure(
         progress: told of each step of each panel.
 
     Raises:
-        InputError: a scene that cannot be used; another run is writing to ``out``; panels of its
-            accuracy.json would be lost.
+        InputError: a scene that cannot be used, or two of one name; another run is writing to
+            ``out``; panels of its accuracy.json would be lost.
     """
-    from attnwarp_eval.scene.file import load_scene
     from attnwarp_eval.truth.mitsuba import forget
 
-    cells = _cells([load_scene(name) for name in names])
+    cells = _cells(distinct_scenes(names))
     check_overwriting(out, {(question.__name__, scene.name) for question, scene in cells})
     tasks = (_task(question, scene, rounds) for question, scene in cells)
     for panel in results(Store(out), tasks, len(cells), progress):

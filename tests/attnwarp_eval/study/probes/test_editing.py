@@ -8,11 +8,11 @@ import re
 
 import numpy as np
 import pytest
-import torch
 import yaml
 from ball_scene import SCENE
 from edited_run import write_run
 from PIL import Image
+from torch_threads import on_one_thread
 
 from attnwarp.baselines import Budget
 from attnwarp_eval.compare.snapshot import read_snapshot
@@ -398,10 +398,4 @@ def test_one_answer_of_an_ambiguous_edit_can_be_asked_for_in_other_words(folder)
     assert (edit["instruction"], edit["answers"]) == ("make the ball blue", [["blue", blue]])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Pictures this small gain nothing from threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+one_thread = pytest.fixture(on_one_thread, autouse=True, scope="module")

@@ -1,0 +1,31 @@
+"""Scenes of a table whose rows, cells and pictures carry their names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from attnwarp.errors import InputError
+from attnwarp_eval.scene.scene import Scene
+
+
+def distinct_scenes(names: Sequence[str]) -> list[Scene]:
+    """Load scenes of which no two have one name; one that is named twice is loaded once.
+
+    Args:
+        names: scenes' names or paths.
+
+    Raises:
+        InputError: a scene that cannot be used, or two scenes of one name.
+    """
+    from attnwarp_eval.scene.file import load_scene
+
+    first: dict[str, tuple[str, Scene]] = {}
+    for path in names:
+        scene = load_scene(path)
+        other, same = first.setdefault(scene.name, (path, scene))
+        if same.content_hash != scene.content_hash:
+            raise InputError(
+                f"{other} and {path}: two scenes have the name {scene.name!r}, expected one of"
+                " each name in a table; rename one of them"
+            )
+    return [scene for _, scene in first.values()]

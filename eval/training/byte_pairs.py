@@ -1,0 +1,43 @@
+"""Tokenizers that the recipes learn from their own sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from tokenizers import (
+    Tokenizer,
+    decoders,
+    models,
+    normalizers,
+    pre_tokenizers,
+    processors,
+    trainers,
+)
+
+
+def learn_byte_pairs(
+    corpus: Iterable[str], *, vocabulary: int, most_tokens: int, length: int | None = None
+) -> Tokenizer:
+    """Byte-level byte pairs: any text can be encoded, and a word of the corpus takes a token or two.
+
+    Args:
+        corpus: sentences.
+        vocabulary: how many tokens there are; 0 pads and 1 ends a sentence.
+        most_tokens: of a sentence; the rest is cut.
+        length: to which every sentence is padded; that of a batch's longest if left out.
+    """
+    tokenizer = Tokenizer(models.BPE())
+    tokenizer.normalizer = normalizers.Sequence([normalizers.NFKC(), normalizers.Lowercase()])
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=True)
+    tokenizer.decoder = decoders.ByteLevel()
+    trainer = trainers.BpeTrainer(
+        vocab_size=vocabulary, special_tokens=["<pad>", "<end>"], initial_alphabet=pre_tokenizers.ByteLevel.alphabet(),
+        show_progress=False,
+    )  # fmt: skip
+    tokenizer.train_from_iterator(corpus, trainer)
+    tokenizer.post_processor = processors.TemplateProcessing(
+        single="$A <end>", special_tokens=[("<end>", 1)]
+    )
+    tokenizer.enable_padding(pad_id=0, pad_token="<pad>", length=length)
+    tokenizer.enable_truncation(most_tokens)
+    return tokenizer
