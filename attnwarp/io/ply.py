@@ -246,6 +246,9 @@ def write_ply(
 def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
     """Read a point cloud: the initial points of a dataset.
 
+    Args:
+        path: a PLY file with ``x y z``.
+
     Returns:
         points: (P, 3) float64.
         colors: (P, 3) uint8 from ``red green blue``, or None when the file has none.
@@ -289,6 +292,9 @@ def write_points(
         path: the file; an older one is replaced.
         points: (P, 3) finite.
         colors: (P, 3) uint8, optional.
+
+    Raises:
+        ValueError: another shape, a point that is not finite, or colours that are not uint8.
 
     Example:
         >>> import numpy as np

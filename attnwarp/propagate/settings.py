@@ -312,7 +312,11 @@ study ``comparison-quick`` can't tell.
 
 
 def preset(name: str, **changes: Any) -> PropagateSettings:
-    """A preset, with some of its fields changed; ``warp.NAME`` reaches a field of its warp.
+    """A preset, with some of its fields changed.
+
+    Args:
+        name: a key of :data:`PRESETS`.
+        changes: fields of :class:`PropagateSettings`; ``warp.NAME`` is a field of its warp.
 
     Raises:
         ValueError: an unknown preset or field, or a value out of range; the message names it.

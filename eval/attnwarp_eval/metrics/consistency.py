@@ -149,11 +149,14 @@ def view_dependent(
     False where the source does not show the pixel.
 
     Args:
-        source_srgb, target_srgb: truth of the two views, unedited. An edit that makes a matt thing
-            shiny has highlights of its own: where its truth is known, ask for it too and join the
-            two masks.
+        source_srgb, target_srgb: (h, w, 3) and (H, W, 3), truth of the two unedited views, in
+            [0, 1]. An edit that makes a matt object shiny has highlights of its own: join the mask
+            of its truth with this one.
         pair: as for :func:`cross_view`.
         tolerance: in linear light, of 1; above the noise of the pictures.
+
+    Raises:
+        ValueError: pictures of another size, type or range, or a negative tolerance.
 
     Example:
         >>> import numpy as np
@@ -302,6 +305,9 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
         over those of them that pass the forward-backward check; ``flow_recall``, the share that
         passes; and ``flow_false``, of all that pass the share that the source certainly does not
         show. NaN where there is nothing to measure.
+
+    Raises:
+        ValueError: a flow of another size than the pair's.
 
     Example:
         >>> from attnwarp_eval import metrics

@@ -66,6 +66,13 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
     0, gains -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see
     :func:`edit_psnr`.
 
+    Args:
+        image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all pixels if left out.
+
+    Raises:
+        ValueError: another shape, type or range, or a value inside the mask that is not finite.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp_eval import metrics
@@ -81,12 +88,19 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
     at most 1.
 
     The windows are 11 x 11, Gaussian with sigma 1.5, and lie wholly inside the picture and, given a
-    mask, wholly inside the mask: a window that is partly outside would score what is not in
-    question. The values are those of :func:`attnwarp.losses.ssim`.
+    mask, wholly inside the mask, so that no pixel outside counts. The values are those of
+    :func:`attnwarp.losses.ssim`.
+
+    Args:
+        image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all pixels if left out.
 
     Returns:
         NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
         11 square.
+
+    Raises:
+        ValueError: another shape, type or range, or a value inside the mask that is not finite.
 
     Example:
         >>> import numpy as np
@@ -105,6 +119,12 @@ def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
 
     The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
     px.
+
+    Args:
+        image, target, mask: as :func:`ssim`.
+
+    Raises:
+        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np
@@ -142,9 +162,15 @@ def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count
     as in :func:`ssim`.
 
+    Args:
+        image, target, mask: as :func:`ssim`.
+
     Returns:
         NaN when some scale has no window: a side below 176 px, or a mask that holds no square of
         about that size.
+
+    Raises:
+        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np

@@ -204,6 +204,9 @@ def by_yaw(
     Returns:
         One entry for each bin, empty ones included: their scores are NaN.
 
+    Raises:
+        ValueError: edges that do not rise from 0 to 180.
+
     Example:
         >>> from attnwarp_eval import metrics
         >>> counts = dict.fromkeys(metrics.COUNTS, 0) | {"visible_accepted": 3}

@@ -225,10 +225,14 @@ def sample_surface(
     keeps the splats of a floor about equally large in the pictures of cameras that orbit it.
 
     Args:
+        geometry: of the scene.
         count: number of points, exactly.
         center: (3,) world.
         focus: scene units.
         seed: any integer >= 0.
+
+    Raises:
+        ValueError: a count below 1, or a scene without visible surfaces.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

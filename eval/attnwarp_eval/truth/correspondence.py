@@ -34,6 +34,8 @@ def two_view(
     labels.
 
     Args:
+        geometry: of the scene.
+        source, target: the cameras. The result has the target's (H, W).
         bands: :func:`edge_band` of the source and of the target, where they are computed already.
 
     Example:
@@ -173,6 +175,11 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
     """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it
     included.
+
+    Args:
+        geometry: of the scene.
+        camera: whose view; (H, W) is its size.
+        width: px.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
