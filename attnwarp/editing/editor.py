@@ -128,8 +128,8 @@ def edit(
         prompt: instruction or description.
         steps: of DDIM.
         seed: of the noise, which the views share.
-        start: Stable Diffusion's timestep T to start from, as publications give it: the views' own
-            latents are noised to the share of signal that T stands for, then ``steps`` steps follow
+        start: Stable Diffusion's timestep T to start from, as publications give it. The views' own
+            latents are noised to T's share of signal, then ``steps`` steps follow
             (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
             pure noise.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
