@@ -154,10 +154,10 @@ def whole_windows(mask: Mask) -> Mask:
 def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003), in [0, 1].
 
-    Contrast and structure at five scales, each half the one before (means of 2 x 2 pixels; an odd
-    last row or column is dropped), and luminance at the coarsest, each averaged over windows and
-    channels, then multiplied with the paper's exponents. A mean below 0 (pictures that are each
-    other's negatives) has no real power and counts as 0.
+    Contrast and structure count at five scales, luminance at the coarsest. Each is averaged over
+    windows and channels, then multiplied with the paper's exponents. A scale has means of 2 x 2
+    pixels of the one before; an odd last row or column is dropped. A mean below 0 (pictures that
+    are each other's negatives) has no real power and counts as 0.
 
     Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count
     as in :func:`ssim`.
@@ -198,11 +198,10 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
     """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN
     for an empty mask.
 
-    Outside the mask the picture is made equal to the target first, so that nothing there differs,
-    and the distance is divided by the share of the picture that the mask covers. For a distance
-    that is a mean over places it then is the mean over those of the mask, apart from what spills
-    over the mask's border: networks see a neighbourhood of each place. Pictures that are equal
-    inside the mask are at distance 0, whatever stands outside.
+    Outside the mask the picture is replaced by the target. The distance is then divided by the
+    share of the picture that the mask covers. So a distance that is a mean over pixels becomes a
+    mean over those of the mask, except near its border: networks see a neighbourhood of each pixel.
+    Pictures that are equal inside the mask have distance 0.
 
     Args:
         image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the

@@ -139,10 +139,12 @@ def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.ND
 def edges(geometry: Geometry, camera: Camera) -> Mask:
     """Pixels beside a depth or object edge.
 
-    Two neighbours (left and right, above and below) are parted by an edge when they show different
-    objects, when only one of them shows any, or when the tangent plane of neither comes within one
-    pixel's footprint (z / f) of the other's depth. The planes keep a slanted floor from being
-    called an edge.
+    Two neighbours (left and right, above and below) have an edge between them if
+
+    - they show different objects,
+    - only one of them shows any, or
+    - neither tangent plane comes within one pixel's footprint (z / f) of the other's depth. So a
+      slanted floor is no edge.
 
     Returns:
         (H, W) bool: pixels with such a neighbour.
