@@ -244,8 +244,8 @@ def camera_frame(
     """The published code's test: camera-space normals, flipped to each camera, within ``angle``
     degrees of each other.
 
-    The two normals stand in the axes of two different cameras, so that the angle between them holds
-    the cameras' relative rotation: the same surface seen by a rolled camera fails.
+    The two normals are in the axes of different cameras, so the angle between them contains the
+    cameras' relative rotation. The same surface seen by a rolled camera fails.
 
     Args:
         correspondence, target_normal: as :func:`facing`.
