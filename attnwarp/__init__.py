@@ -1,4 +1,13 @@
-"""Attention warping for consistent 3D scene editing: cameras, splats, warps and visibility."""
+"""Attention warping for consistent 3D scene editing: the method as a library.
+
+- :mod:`attnwarp.io`: splats and posed pictures from files and to files.
+- :mod:`attnwarp.fit` and :mod:`attnwarp.render`: pictures to splats, and splats to pictures.
+- :mod:`attnwarp.warp`: correspondences, visibility and sampling between two views.
+- :mod:`attnwarp.editing`: editors, and their attention recorded, warped and injected.
+- :mod:`attnwarp.propagate`: Algorithm 1, from one edited view to an edited scene.
+- :mod:`attnwarp.baselines`: the methods that it is compared with.
+- :mod:`attnwarp.encoders` and :mod:`attnwarp.losses`: what tuning and metrics need.
+"""
 
 from __future__ import annotations
 

@@ -182,8 +182,8 @@ class Camera:
     def relative_to(self, other: Camera) -> Array:
         """(4, 4) transform from ``other``'s camera axes to this one's.
 
-        Formed from the difference of the two centres in float64, so that a baseline of 1e-6 in a
-        world at 1e6 keeps its digits where a product of the two 4x4 matrices would not.
+        It is formed from the difference of the two centres in float64. So a baseline of 1e-6 in a
+        world at 1e6 keeps its digits. A product of the two 4x4 matrices would lose them.
         """
         pose = np.eye(4)
         pose[:3, :3] = self.rotation @ other.rotation.T

@@ -31,7 +31,13 @@ SSIM_C2 = 0.03**2
 
 
 def l1(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute difference of two (H, W, C) pictures.
+    """Mean absolute difference of two pictures, over pixels and channels.
+
+    Args:
+        image, target: (H, W, C) of one shape, of any range.
+
+    Raises:
+        ValueError: different shapes.
 
     Example:
         >>> import torch
@@ -43,7 +49,14 @@ def l1(image: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB of two pictures in [0, 1]; infinite when they are equal.
+    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error; infinite when they are
+    equal. The error is a mean in float64.
+
+    Args:
+        image, target: (H, W, C) of one shape, in [0, 1].
+
+    Raises:
+        ValueError: different shapes.
 
     Example:
         >>> import torch
@@ -94,6 +107,12 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
     """(H - 10, W - 10, C) structural similarity of each window; see :func:`ssim`.
 
+    Args:
+        image, target: as :func:`ssim`.
+
+    Raises:
+        ValueError: as :func:`ssim`.
+
     Example:
         >>> import torch
         >>> picture = torch.rand(16, 12, 3)
@@ -108,6 +127,9 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 def ssim_terms(image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The two factors of :func:`ssim_map`, which scales weigh apart in MS-SSIM: luminance, and
     contrast and structure.
+
+    Args:
+        image, target: as :func:`ssim`.
 
     Returns:
         Two (H - 10, W - 10, C) tensors without gradients.
@@ -217,7 +239,11 @@ def normal_consistency(view: Render) -> Tensor:
     """Mean over pixels of sum_i w_i (1 - n_i . N), N the normal of the rendered depth (2DGS).
 
     That sum is alpha - (sum_i w_i n_i) . N. Pixels where N is undefined (the image's border, edges
-    of what is drawn) count as 0. Gradients flow through both normals.
+    of what is drawn) count as 0. Gradients flow through both normals. Source: Huang et
+    al. 2024 (2DGS).
+
+    Args:
+        view: what was rendered.
 
     Example:
         >>> import torch

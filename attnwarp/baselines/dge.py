@@ -143,8 +143,9 @@ class _DGE:
 
 
 def by_angle(cameras: Sequence[Camera], views: Sequence[int]) -> list[int]:
-    """Views in the order of their direction's angle from that of the leftmost camera (the smallest
-    x), all round, in the sense in which its nearest neighbour lies.
+    """Views by the angle of their direction from that of the leftmost camera (the smallest x).
+
+    Angles go all round, toward that camera's nearest neighbour.
 
     Args:
         cameras: all of them.

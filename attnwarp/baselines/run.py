@@ -55,9 +55,9 @@ class Options(TypedDict, total=False):
     """What every baseline takes by name.
 
     Args:
-        folder: of everything that is made, made if need be. A run that was killed at any moment
-            goes on from there, and all files but ``times.json`` get the bytes of an uninterrupted
-            run (on one machine, with the same number of threads, without a budget in seconds).
+        folder: of all results, created if need be. A killed run resumes from it. All files but
+            ``times.json`` then get the bytes of an uninterrupted run, on one machine, with the same
+            number of threads and without a budget in seconds.
         budget: limits of the run, :class:`Budget`.
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. The original stays outside.

@@ -348,6 +348,11 @@ inverts with the instruction. ``random``: GaussCtrl without its inversion.
 def preset(method: str, name: str = "default", **changes: Any) -> BaselineSettings:
     """Settings of a method by name, with some fields changed.
 
+    Args:
+        method: a key of :data:`attnwarp.baselines.METHODS`.
+        name: of a preset of that method: "default", or one of its published settings.
+        changes: fields of the method's settings.
+
     Raises:
         ValueError: an unknown method, preset or field, or a value out of range; the message names
             it.

@@ -83,7 +83,11 @@ class Layer:
 
 
 def all_layers(unet: torch.nn.Module) -> tuple[Layer, ...]:
-    """Every attention layer of a diffusers UNet, in the order of its processors."""
+    """Every attention layer of a diffusers UNet, in the order of its processors.
+
+    Args:
+        unet: with ``attn_processors`` and ``up_blocks``.
+    """
     levels = len(list(unet.get_submodule("up_blocks").children()))
     layers = []
     for processor in unet.attn_processors:  # type: ignore[union-attr]
@@ -119,7 +123,9 @@ def choose_layers(
         blocks: "down", "mid" or "up".
 
     Raises:
-        ValueError: an unknown kind or block, or a choice that no layer answers to.
+        ValueError: an unknown kind or block, or a choice that no layer matches.
+
+    An example is at :func:`record`.
     """
     for kind in kinds:
         check.one_of(kind, get_args(Kind), "kinds")
@@ -322,10 +328,13 @@ class Call:
 
 @contextmanager
 def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterator[None]:
-    """Call ``hook(layer, features, call)`` on every output of the layers.
+    """Call ``hook(layer, features, call)`` on every output of the layers while the block runs.
 
-    What the hook returns takes the place of the features; None leaves them. The gradient is not
-    stopped.
+    Args:
+        unet: a diffusers UNet.
+        layers: of it, by :func:`all_layers` or :func:`choose_layers`.
+        hook: its (batch, H W, C) result replaces the features; None leaves them. Gradients flow
+            through.
     """
     now: list[Call] = []
 
@@ -354,7 +363,9 @@ def hooked(unet: torch.nn.Module, layers: Sequence[Layer], hook: Hook) -> Iterat
 def record(
     unet: torch.nn.Module, plan: RecordingPlan, *, announce: Callable[[str], None] | None = None
 ) -> Iterator[Recording]:
-    """Record what the UNet's attention layers give while the block runs; no bit of it changes.
+    """Record the outputs of the UNet's attention layers while the block runs.
+
+    An output is taken after its projection and before the residual. No bit of it changes.
 
     Args:
         unet: a diffusers UNet; any pipeline or loop may call it.
@@ -363,6 +374,18 @@ def record(
 
     Raises:
         ValueError: latents of another size, or a batch of another number of rows, than planned.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.editor import edit
+        >>> from attnwarp.editing.small import load_editor
+        >>> editor = load_editor("small-plain")
+        >>> layers = choose_layers(editor.unet, fractions=(1,), kinds=("self",))
+        >>> plan = RecordingPlan(layers, (8, 8), editor.branches, ("text",), steps=1)
+        >>> with record(editor.unet, plan) as recording:
+        ...     source = edit(editor, [np.zeros((32, 32, 3), np.float32)], "make it red", steps=1)
+        >>> recording.features(recording.timesteps[0], layers[0], "text").shape[:2]  # (views, H W)
+        torch.Size([1, 64])
     """
     if announce is not None:
         announce(str(plan))
@@ -388,6 +411,12 @@ def record(
 def decay(a0: float = 0.9) -> Callable[[int, int], float]:
     """The paper's weight, a_t = a0 (T - t) / T with the step's number t of T.
 
+    Args:
+        a0: weight of the first step, in [0, 1].
+
+    Raises:
+        ValueError: a weight outside [0, 1].
+
     Example:
         >>> [round(decay()(step, 4), 3) for step in range(4)]
         [0.9, 0.675, 0.45, 0.225]
@@ -398,6 +427,12 @@ def decay(a0: float = 0.9) -> Callable[[int, int], float]:
 
 def constant(a: float) -> Callable[[int, int], float]:
     """The same weight at every step.
+
+    Args:
+        a: in [0, 1].
+
+    Raises:
+        ValueError: a weight outside [0, 1].
 
     Example:
         >>> [constant(0.5)(step, 4) for step in range(4)]
@@ -437,6 +472,22 @@ def inject(
     Raises:
         ValueError: a timestep, layer, branch or size that does not match the recording; the message
             names it.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.editor import edit
+        >>> from attnwarp.editing.small import load_editor
+        >>> editor = load_editor("small-plain")
+        >>> plan = RecordingPlan(
+        ...     choose_layers(editor.unet), (8, 8), editor.branches, editor.branches, steps=1
+        ... )
+        >>> picture = np.full((32, 32, 3), 0.5, np.float32)
+        >>> with record(editor.unet, plan) as recording:
+        ...     source = edit(editor, [picture], "make it red", steps=1)
+        >>> with inject(editor.unet, recording, branches=editor.branches, weight=constant(1.0)):
+        ...     again = edit(editor, [picture], "make it red", steps=1)
+        >>> bool((again.images[0] == source.images[0]).all())  # its own features change no bit
+        True
     """
     weight = decay() if weight is None else weight
     plan = recording.plan

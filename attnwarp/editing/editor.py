@@ -56,7 +56,7 @@ class Editor(Protocol):
         ...
 
     def task(self, guides: Sequence[npt.NDArray[Any]], prompt: str) -> Task:
-        """An edit of views. What a guide is, the editor says: a picture or a depth map."""
+        """An edit of views; ``guide`` tells whether the guides are pictures or depth maps."""
         ...
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
@@ -92,6 +92,10 @@ def shared_noise(shape: tuple[int, int, int, int], seed: int) -> Tensor:
 
     It is drawn on the CPU, so that every device starts from the same bits.
 
+    Args:
+        shape: (B, C, h, w).
+        seed: of torch's generator.
+
     Example:
         >>> first, second = shared_noise((2, 4, 8, 8), seed=0)
         >>> torch.equal(first, second)
@@ -124,8 +128,8 @@ def edit(
         prompt: instruction or description.
         steps: of DDIM.
         seed: of the noise, which the views share.
-        start: Stable Diffusion's timestep T to start from, as publications give it: the views' own
-            latents are noised to the share of signal that T stands for, then ``steps`` steps follow
+        start: Stable Diffusion's timestep T to start from, as publications give it. The views' own
+            latents are noised to T's share of signal, then ``steps`` steps follow
             (:func:`attnwarp.editing.schedule.steps_as_published`). Left out, the edit starts from
             pure noise.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
@@ -140,6 +144,14 @@ def edit(
 
     Raises:
         ValueError: sizes or numbers that do not fit; the message names the argument.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.small import load_editor
+        >>> views = [np.full((32, 32, 3), grey, np.float32) for grey in (0.3, 0.6)]
+        >>> result = edit(load_editor("small-plain"), views, "make it red", steps=2)
+        >>> result.images[0].shape, result.latents.shape, len(result.timesteps)
+        ((32, 32, 3), torch.Size([2, 48, 8, 8]), 2)
     """
     task = editor.task(guides, prompt)
     device, dtype = editor.unet.device, editor.unet.dtype
@@ -179,6 +191,10 @@ def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> T
         images: at least one, all of one size.
         name: of the argument, for errors.
         multiple: what the sides have to be multiples of.
+
+    Raises:
+        ValueError: no picture, another shape, several sizes, sides of other multiples, values that
+            are not finite or not in [0, 1].
 
     Example:
         >>> import numpy as np

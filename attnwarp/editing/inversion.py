@@ -26,15 +26,15 @@ def ddim_invert(
     timesteps: list[int],
     begin: int | None = None,
 ) -> Tensor:
-    """(B, C, h, w) latents at the first of ``timesteps`` that DDIM leads back to the picture.
+    """(B, C, h, w) latents at the first of ``timesteps`` from which DDIM reconstructs the picture.
 
     Each step predicts the noise at the latents it starts from (Song et al. 2021, section 4.3), so
-    the way back is exact for small steps only. Guidance above 1 makes the two ways part: invert
+    the reconstruction is exact for small steps only. Guidance above 1 increases its error: invert
     with a task that has none.
 
     Args:
         schedule: of the model; its network predicts noise or v. One that predicts the picture
-            itself says nothing of a clean picture's noise, and needs ``begin``.
+            gives no noise of a clean picture, and needs ``begin``.
         predict: the network's output.
         latents: (B, C, h, w) scaled latents of the picture.
         timesteps: of the edit, falling.
@@ -43,6 +43,17 @@ def ddim_invert(
 
     Raises:
         ValueError: a network that predicts the picture, of clean latents.
+
+    Example:
+        >>> schedule = Schedule(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
+        >>> steps = [900, 600, 300]
+        >>> latents = torch.randn(1, 4, 2, 2, generator=torch.Generator().manual_seed(0))
+        >>> predict = lambda x, timestep: torch.zeros_like(x)  # a network that sees no noise
+        >>> x = ddim_invert(schedule, predict, latents, steps)
+        >>> for now, then in following(steps):
+        ...     x = schedule.step(predict(x, now), x, now, then)
+        >>> bool((x - latents).abs().max() < 1e-5)
+        True
     """
     if schedule.prediction == "sample" and begin is None:
         raise ValueError(
@@ -95,6 +106,18 @@ def edit_friendly_invert(
         timesteps: falling. To skip the noisiest, leave them out.
         noises: (steps, B, C, h, w) white noise of the steps, in the order of ``timesteps``; drawn
             from ``seed`` if left out.
+        seed: of the drawn noises.
+
+    Raises:
+        ValueError: noises of another shape.
+
+    Example:
+        >>> schedule = Schedule(torch.linspace(0.99, 0.01, 1000), "epsilon", 1.0)
+        >>> latents = torch.randn(1, 4, 2, 2, generator=torch.Generator().manual_seed(0))
+        >>> predict = lambda x, timestep: 0.1 * x  # any network
+        >>> maps = edit_friendly_invert(schedule, predict, latents, [900, 600, 300])
+        >>> bool((replay(schedule, predict, maps) - latents).abs().max() < 1e-5)
+        True
     """
     shape = (len(timesteps), *latents.shape)
     if noises is None:
@@ -127,7 +150,13 @@ def replay(
 ) -> Tensor:
     """(B, C, h, w) latents that the noise maps lead to.
 
-    With the task of the inversion that is its picture; with another prompt, its edit.
+    With the task of the inversion they are those of its picture; with another prompt, of its edit.
+
+    Args:
+        schedule: of the model, that of the inversion.
+        predict: the network's output.
+        noise: of :func:`edit_friendly_invert`.
+        watch: called with the step, the number of steps and the latents after each step.
     """
     x = noise.start
     with torch.no_grad():

@@ -87,6 +87,14 @@ def segments_of(
 
     Raises:
         NoDetectionError: by the function; the message names the words and the view.
+
+    Example:
+        >>> class Bright:  # a segmenter of one's own
+        ...     def segment(self, image, words):
+        ...         return image.mean(-1) > 0.5
+        >>> masks = segments_of(Bright(), "snow", ["view0"])
+        >>> masks(0, np.linspace(0, 1, 12, dtype=np.float32).reshape(2, 2, 3)).tolist()
+        [[False, False], [True, True]]
     """
 
     def segment(index: int, image: Image) -> Mask:

@@ -34,7 +34,15 @@ DEPTH_GUIDANCE = 2.0
 
 
 def bundled(folder: Path = WEIGHTS) -> list[str]:
-    """Names of the editors that are there."""
+    """Names of the bundled editors.
+
+    Args:
+        folder: with a folder for each editor.
+
+    Example:
+        >>> bundled()
+        ['small', 'small-depth', 'small-plain']
+    """
     return sorted(path.parent.name for path in folder.glob("*/model_index.json"))
 
 
@@ -118,6 +126,11 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
 
     Raises:
         InputError: no such editor or folder, or files that are missing, by name.
+
+    Example:
+        >>> editor = load_editor("small-plain")
+        >>> editor.guide, editor.branches
+        ('picture', ('text', 'image'))
     """
     from attnwarp.editing.folder import require_diffusers
 

@@ -1,8 +1,10 @@
 """CLIP and DINOv2 from a local folder in the format of transformers. Nothing is ever downloaded.
 
-Three mistakes give plausible figures in transformers and are refused here: tensors that the file
-lacks (it fills them with random numbers), a tokenizer of another model (every text is read at its
-first token), and a model of another kind.
+Three mistakes give plausible figures in transformers and are refused here:
+
+- tensors that the file lacks, which transformers fills with random numbers;
+- a tokenizer of another model, with which every text is read at its first token;
+- a model of another kind.
 """
 
 from __future__ import annotations

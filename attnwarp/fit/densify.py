@@ -32,12 +32,12 @@ def screen_gradient(
     """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2
     wide and 2 high.
 
-    With c = R m + t the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel, a loss
-    that knows a centre only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z dL/dy.
-    Read backwards, the two components of R dL/dm across the view give the gradient on screen. What
-    the loss knows of a centre beyond its pixel (its depth, the direction it is seen from, how its
-    outline turns with it) enters as well, which the published code leaves out or, for 2DGS,
-    overwrites. A screen 2 wide makes the thresholds of 3DGS independent of the image's size.
+    Let c = R m + t be the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel. A loss
+    that depends on a centre only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z
+    dL/dy. So the two components of R dL/dm across the view give the gradient on screen. A loss may
+    also depend on the centre's depth, on the direction of view, and on the outline. These parts
+    enter here; the published code leaves them out or, for 2DGS, overwrites them. A screen 2 wide
+    makes the thresholds of 3DGS independent of the image's size.
 
     Args:
         gradient, means: (N, 3) in world axes, ``means`` relative to ``origin``.

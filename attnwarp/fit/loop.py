@@ -146,9 +146,9 @@ def fit(
     """Fit splats to posed pictures.
 
     With ``folder``, the splats (``splats.ply``) and a checkpoint are written there every
-    ``checkpoint_seconds`` and at the end, each atomically. A fit whose checkpoint is there is
-    resumed, and gives the same bits as one that was never interrupted (on the same machine, with
-    the same number of torch threads).
+    ``checkpoint_seconds`` and at the end, each atomically. A fit with a checkpoint is
+    resumed. On the same machine, with the same number of torch threads, it gives the bits of an
+    uninterrupted fit.
 
     Args:
         start: what to begin with, see :func:`attnwarp.fit.from_points`; of the settings' kind.

@@ -39,9 +39,9 @@ class FitSettings:
             :func:`attnwarp.losses.depth_distortion`.
         normal_from, distortion_from: share of the iterations after which these begin (2DGS: 7,000
             and 3,000 of 30,000).
-        background: what is behind the splats and behind transparent pixels of the images: "black",
-            "white", "random" (another colour each iteration, so that transparency cannot be faked
-            by colour), or "auto": random for images with transparency and black for others.
+        background: colour behind the splats and behind transparent pixels of the images: "black",
+            "white" or "random". Random is another colour each iteration, so that no colour can
+            stand for transparency. "auto" is random for images with transparency, else black.
         densify: clone, split and prune splats.
         densify_from: first iteration at which splats are added.
         densify_every: iterations between two refinements.

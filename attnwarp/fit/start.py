@@ -121,15 +121,23 @@ def from_points(
 def random_points(
     cameras: Sequence[Camera], count: int, *, seed: int = 0
 ) -> tuple[Array, npt.NDArray[np.uint8]]:
-    """Points and colours to begin with where nothing is known of the surfaces.
+    """Random points and colours for data sets without points.
 
-    They fill a cube about the point that the cameras look at (the nearest to all optical axes),
-    with half an edge of the cameras' mean distance from it; cameras that look along parallel axes
-    get one in front of them.
+    They fill a cube about the point that the cameras look at, which is nearest to all optical
+    axes. Half of the cube's edge is the cameras' mean distance from that point. For parallel axes
+    the cube lies in front of the cameras.
+
+    Args:
+        cameras: at least one.
+        count: of points, at least 1.
+        seed: of positions and colours.
 
     Returns:
         points: (count, 3) world coordinates.
         colors: (count, 3) uint8, at random.
+
+    Raises:
+        ValueError: a count below 1.
 
     Example:
         >>> import numpy as np

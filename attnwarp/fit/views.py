@@ -183,14 +183,20 @@ def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
 
 
 def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Dataset | None]:
-    """The part to fit on and the part to measure on.
+    """The part of a data set to fit on and the part to measure on.
 
-    Where the data set names splits, those: "train", and "test" or else "val". Elsewhere one of
-    ``every`` images is held out, in the order of their names, beginning with the first; 0 holds out
-    none.
+    Splits of the data set come first: "train", and "test" or else "val".
+
+    Args:
+        dataset: posed images, see :func:`attnwarp.io.read_dataset`.
+        every: without splits, one of so many images is held out, in the order of their names,
+            beginning with the first; 0 holds out none.
+
+    Returns:
+        The part to fit on, and the held-out part or None.
 
     Raises:
-        ValueError: the data set's splits leave nothing to fit on.
+        ValueError: the data set's splits leave nothing to fit on, or ``every`` is 1 or negative.
 
     Example:
         >>> from attnwarp import Camera

@@ -43,9 +43,8 @@ class Dataset:
         splits: one for each camera: "train", "val", "test", or None where the file names no split.
         lenses: one for each camera; None for a pinhole, as which every camera is used. Pictures
             taken through another lens must be undistorted first: see :func:`undistort`.
-        applied_transform: (3, 4) transform that the program which wrote a transforms.json applied
-            to the original world before it wrote; cameras and points are in the world after it.
-            Information only.
+        applied_transform: (3, 4) transform from the original world to that of the cameras and
+            points, as the writer of a transforms.json states it. Information only.
 
     Raises:
         ValueError: lists of different lengths, a wrong shape or dtype.

@@ -82,8 +82,8 @@ def write_atomically(
     """Call ``write`` on a temporary file beside ``path`` and rename it to ``path``.
 
     A reader, or a run that is killed, sees the old file or the new one and never a part. When
-    ``write`` raises, the old file stays and the temporary one is removed; that of a process that
-    was killed is removed by the next one that writes to the folder.
+    ``write`` raises, the old file stays and the temporary one is removed. The temporary file of a
+    killed process is removed by the next one that writes to the folder.
 
     Args:
         path: of the file; its folder must exist.

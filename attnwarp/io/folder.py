@@ -34,11 +34,13 @@ def read_dataset(
 ) -> Dataset:
     """Read a transforms.json, a COLMAP model or a scene of BlendedMVS.
 
-    A file is a transforms.json. A folder with transforms.json, or transforms_train.json and its
-    like, is that; one with a sparse model (``cameras.bin`` or ``.txt`` in it, in ``sparse/0`` or in
-    ``sparse``) is COLMAP's. A folder that is both needs ``format``, except that a model under
-    ``colmap/`` is what nerfstudio made the transforms.json from, and is passed over. A folder with
-    ``cams`` and ``blended_images`` is a scene of BlendedMVS.
+    - A file is a transforms.json, and so is a folder with transforms.json, transforms_train.json or
+      another split.
+    - A folder with a sparse model is COLMAP's: ``cameras.bin`` or ``.txt`` in it, in ``sparse/0``
+      or in ``sparse``.
+    - A folder that is both needs ``format``. A model under ``colmap/`` does not count: nerfstudio
+      made the transforms.json from it.
+    - A folder with ``cams`` and ``blended_images`` is a scene of BlendedMVS.
 
     Args:
         path: file or folder.

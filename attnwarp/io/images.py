@@ -24,7 +24,10 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """(width, height) in px from a picture's header, without decoding it.
 
-    The size is that of the stored pixels: an EXIF tag that asks for a turn is not followed.
+    The size is that of the stored pixels: EXIF orientation is ignored.
+
+    Args:
+        path: of any format that Pillow or OpenCV reads.
 
     Raises:
         FileNotFoundError: no such file.

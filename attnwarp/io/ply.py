@@ -60,10 +60,13 @@ def read_ply(
     """Read splats.
 
     ASCII and binary PLY of either byte order are read; further properties and elements are ignored.
-    The kind is, in this order: ``kind``; what a comment says (``attnwarp kind 2d``,
-    ``SplatRenderMode: 2dgs``); 2D when there is no ``scale_2``; 2D when every ``scale_2`` is
-    exactly the logarithm of :data:`THIRD_SCALE`; else 3D. A third scale that is one constant, a
-    hundredth of both others or less in every row, could be either and is refused without ``kind``.
+    The kind is the first of these that applies:
+
+    1. ``kind``, or that of a comment (``attnwarp kind 2d``, ``SplatRenderMode: 2dgs``);
+    2. 2D without ``scale_2``, or where every ``scale_2`` is the logarithm of :data:`THIRD_SCALE`;
+    3. 3D. But a third scale that is one constant, and in every row at most a hundredth of both
+       others, could be of either kind. It is refused without ``kind``.
+
     For the 2D kind a third scale is dropped.
 
     Args:
@@ -164,10 +167,10 @@ def write_ply(
 ) -> None:
     """Write splats as binary little-endian PLY, all properties float32, atomically.
 
-    Read back, quaternions, spherical harmonics, kind and the antialias flag are the same bit for
-    bit, and opacities 0 and 1 are exact; other opacities and the scales pass through a float32
-    logarithm and come back within 4e-6 of their value. Means are world coordinates rounded to
-    float32, as every other program reads them; with an origin they are the same bit for bit.
+    Read back, quaternions, spherical harmonics, kind and the antialias flag have the same bits.
+    Opacities 0 and 1 are exact. Other opacities and the scales pass through a float32 logarithm,
+    with an error below 4e-6 of their value. Means are world coordinates rounded to float32, as
+    every other program reads them; with an origin they have the same bits.
 
     Args:
         path: the file; an older one is replaced.
@@ -246,6 +249,9 @@ def write_ply(
 def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
     """Read a point cloud: the initial points of a dataset.
 
+    Args:
+        path: a PLY file with ``x y z``.
+
     Returns:
         points: (P, 3) float64.
         colors: (P, 3) uint8 from ``red green blue``, or None when the file has none.
@@ -289,6 +295,9 @@ def write_points(
         path: the file; an older one is replaced.
         points: (P, 3) finite.
         colors: (P, 3) uint8, optional.
+
+    Raises:
+        ValueError: another shape, a point that is not finite, or colours that are not uint8.
 
     Example:
         >>> import numpy as np

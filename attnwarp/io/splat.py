@@ -33,11 +33,11 @@ def write_splat(
     """Write splats as ``.splat``, for viewing; the format keeps neither view-dependent colour nor
     the origin.
 
-    Each record holds the position, the linear scales, the colour 0.5 + SH_C0 f_dc and the opacity
-    as bytes (255 c), and the unit quaternion wxyz as bytes (128 + 128 q); all bytes are rounded and
-    clipped to 0..255. Records are sorted by size times opacity, largest first, since viewers draw
-    them while the file still loads; size is the product of the scales (of the two scales for the 2D
-    kind). Ties keep their order.
+    Each record holds the position and the linear scales in float32. The colour 0.5 + SH_C0 f_dc and
+    the opacity are bytes (255 c), and so is the unit quaternion wxyz (128 + 128 q). Bytes are
+    rounded and clipped to 0..255. Records are sorted by size times opacity, largest first, since
+    viewers draw them while the file loads. Size is the product of the scales, of which the 2D kind
+    has two. Ties keep their order.
 
     Args:
         path: the file; an older one is replaced, atomically.

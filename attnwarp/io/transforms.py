@@ -198,9 +198,9 @@ def write_transforms(
     """Write ``dataset`` as a transforms.json, and its points as a PLY beside it; atomically, images
     are not copied.
 
-    Read back, rotations, camera centres to one rounding of float64, intrinsics, points and splits
-    are the same. nerfstudio asks for all three splits as soon as there is one: where only "test" or
-    only "val" is there beside "train", its images are written under both names.
+    Read back, rotations, intrinsics, points and splits are the same, and camera centres to one
+    rounding of float64. nerfstudio needs all three splits as soon as there is one. If only one of
+    "test" and "val" stands beside "train", its images are written under both names.
 
     Args:
         path: the file, or a folder in which transforms.json is written.

@@ -120,14 +120,14 @@ def propagate(
 ) -> Propagation:
     """Edit one view of a scene, carry the edit into others, and tune the splats on all of them.
 
-    The source view's edit is recorded once. Each stage then edits a random subset of the views
-    that are still unedited, with features of the source warped along the scene's geometry, and
-    tunes the splats on edited views.
+    The source view's edit is recorded once. Each stage then edits a random subset of the unedited
+    views, with features of the source warped along the scene's geometry. At its end it tunes the
+    splats on edited views.
 
-    With ``folder``, everything is written there at once (:mod:`attnwarp.propagate.folder` lists
-    the files). A run that was killed at any moment goes on from there, and all files but
-    ``times.json`` get the bytes of an uninterrupted run (on one machine, with the same number of
-    threads). Edited views are rounded to 8 bits, with a folder or without.
+    With ``folder``, every result is written there as soon as it exists
+    (:mod:`attnwarp.propagate.folder` lists the files). A killed run resumes from it. On one
+    machine, with the same number of threads, all files but ``times.json`` then get the bytes of an
+    uninterrupted run. Edited views are rounded to 8 bits, with a folder or without.
 
     Args:
         gaussians: the scene before the edit, N splats of either kind.

@@ -78,8 +78,8 @@ class PropagateSettings:
             view they see least of is taken among those.
         confidence: weigh the features by how well the source sees the surface (foreshortening and
             the margin of depth agreement) instead of by the mask alone.
-        estimate: weight of the source's estimate of the clean latents, warped, in the target's own
-            at the first step; it falls to 0 at ``estimate_until``. 0 leaves it out.
+        estimate: weight at the first step of the source's warped estimate of the clean latents, in
+            the target's estimate. It falls to 0 at ``estimate_until``. 0 leaves it out.
         estimate_until: share of the steps after which it is left out.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
@@ -312,7 +312,11 @@ study ``comparison-quick`` can't tell.
 
 
 def preset(name: str, **changes: Any) -> PropagateSettings:
-    """A preset, with some of its fields changed; ``warp.NAME`` reaches a field of its warp.
+    """A preset, with some of its fields changed.
+
+    Args:
+        name: a key of :data:`PRESETS`.
+        changes: fields of :class:`PropagateSettings`; ``warp.NAME`` is a field of its warp.
 
     Raises:
         ValueError: an unknown preset or field, or a value out of range; the message names it.

@@ -90,9 +90,9 @@ def choose_chain(
 ) -> tuple[int, ...]:
     """Further sources, outward from the first.
 
-    The next source is the view that the sources so far see least of, among those of whose surface
-    they see a share of at least ``coverage``; if there is none, the view that they see most of. Of
-    equals the first.
+    The next source is the least covered view among those with a share of at least ``coverage``. The
+    share is that of the view's surface that the sources so far see. If there is no such view, it is
+    the most covered one. Of equal views it is the first.
 
     Args:
         views: their number.

@@ -48,11 +48,11 @@ class Render:
             near / z) and the planes ``ndc`` (the original 2DGS code). No unit.
         weight: (N,) sum over pixels of w_i: how much of the picture a splat makes up; 0 means it is
             not seen. From backend "cuda" it carries no gradient.
-        counters: how much work it was: "splats" (in), "visible" (can show in the picture),
-            "tile_pairs" (splats over 16 x 16 tiles), "pairs" (splats over pixels whose intersection
-            was computed), "composited" (those of them in a 4 x 4 square that the splat draws to),
-            "contributing" (those drawn), "tiles". These are the "cpu" backend's; "reference" has
-            "splats", "pairs" and "contributing", "cuda" only "splats".
+        counters: amounts of work. "splats": of the model. "visible": can show in the picture.
+            "tiles", "tile_pairs": splats over 16 x 16 tiles. "pairs": splats over pixels whose
+            intersection was computed. "composited": those pairs in a 4 x 4 square that the splat
+            draws to. "contributing": those drawn. Backend "reference" has "splats", "pairs" and
+            "contributing", "cuda" only "splats".
         camera: the camera, with the pose that was used.
         depth_mode, backend: what was asked for, and what rendered it.
 
@@ -176,19 +176,16 @@ def render(
     """Render Gaussian splats: colour, coverage, depth, normals, distortion; differentiable.
 
     Gradients reach every tensor that requires them: means, quats, scales, opacities, sh (or
-    ``features``), ``pose`` and ``background``, from every output (of ``Render.counters`` and the
-    mask ``valid`` there are none). Backend "cuda" is the
-    exception: none from ``weight``, and ``median_depth`` and ``distortion_l1`` are NaN, so a loss
-    must not use them.
+    ``features``), ``pose`` and ``background``. They come from every output except
+    ``Render.counters`` and the mask ``valid``. Backend "cuda" gives none from ``weight``. Its
+    ``median_depth`` and ``distortion_l1`` are NaN, so a loss must not use them.
 
     Args:
         gaussians: N splats of kind "2d" (2DGS) or "3d" (3DGS), float32 or float64.
         camera: the view; H x W pixels.
-        backend: "cpu" (numba, float32 with float64 set-up), "reference" (brute force in float64,
-            for small scenes), "cuda" (gsplat on a GPU: no "intersection" or "peak" depth, no skew,
-            ``median_depth`` and ``distortion_l1`` NaN, ``weight`` without a gradient, ``counters``
-            only "splats"; see :mod:`attnwarp.render.cuda`). "auto" is "cuda" where the splats lie
-            on a GPU and "cpu" elsewhere.
+        backend: "cpu" is numba, float32 with a float64 projection. "reference" is brute force in
+            float64, for small scenes. "cuda" is gsplat on a GPU; :mod:`attnwarp.render.cuda` has
+            its limits. "auto" is "cuda" where the splats lie on a GPU and "cpu" elsewhere.
         depth: which z a splat has at a pixel. "2d": "intersection" of ray and disc (default) or
             "center". "3d": "center" (default) or "peak", where the Gaussian is largest along the
             ray.

@@ -1,16 +1,16 @@
 """The GPU backend: gsplat, where it and CUDA are present.
 
-Colour, alpha, depth, normal, distortion_l2_ndc and weight mean what they mean everywhere: each
-splat's colour, normal, depth z, 1/z and 1/z^2 are composited as features, and the outputs are made
-from the sums. What gsplat (1.5.3) does differently:
+Colour, alpha, depth, normal, distortion_l2_ndc and weight have the definitions of
+:mod:`attnwarp.render.reference`. Each splat's colour, normal, depth z, 1/z and 1/z^2 are composited
+as features, and the outputs are made from the sums. Differences of gsplat (1.5.3):
 
 - Depth is that of the splat's centre. "intersection" and "peak" are refused; ask for
   depth="center".
-- A 2D splat is cut off by a box of 3.33 times its one-sigma extent, which is too small in
-  perspective (colour errors up to 1.6e-2), its screen filter sits in the middle of that box, and
-  only centres are tested against ``near``, so that a splat that crosses the camera plane is drawn
-  wrong. These cannot be emulated from outside: kind "2d" is refused unless ``ATTNWARP_GSPLAT_2D=1``
-  is set in the environment, which says that they are accepted.
+- A 2D splat is cut off by a box of 3.33 times its one-sigma extent. In perspective the box is too
+  small (colour errors up to 1.6e-2), and the screen filter sits in its middle. Only centres are
+  tested against ``near``, so a splat that crosses the camera plane is drawn wrong. These errors
+  cannot be corrected from outside. So kind "2d" is refused unless the environment accepts them by
+  ``ATTNWARP_GSPLAT_2D=1``.
 - Of the camera's K only fx, fy, cx and cy are read: a camera with skew (K[0, 1] not 0) is refused.
 - alpha is clamped at 0.999 or 0.99 depending on the version, and the splat that brings the
   transmittance below 1e-4 is left out. Both differ by less than 1 % of a pixel, behind opaque

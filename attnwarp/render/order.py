@@ -16,9 +16,9 @@ def break_ties(
 ) -> None:
     """Put splats of equal depth into an order that depends on what they are, in place.
 
-    Depths count as equal when they round to the same float32: a plane of splats seen by a rotated
-    camera differs in the last bits of float64 only, and those are noise. Splats equal in everything
-    are interchangeable.
+    Depths count as equal when they round to the same float32. In a plane of splats before a rotated
+    camera, depths differ in the last bits of float64 only, which are noise. Splats equal in all
+    parameters are interchangeable.
 
     Args:
         order: (M,) indices of splats, sorted by ``depth``; changed in place.

@@ -1,8 +1,8 @@
 """Threads for kernels that release the GIL.
 
-Python's own threads, not numba's parallel loops: numba's "workqueue" layer aborts when two threads
-enter it at once, its OpenMP layer aborts after a fork, and both multiply the time it takes to
-compile. These may be called from any thread of any process, forked or not.
+Python's own threads, not numba's parallel loops. numba's "workqueue" layer aborts when two threads
+enter it at once, its OpenMP layer aborts after a fork, and both multiply the time of compilation.
+These threads may be used from any thread of any process, forked or not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Warps: correspondences between two views, what the source saw, and sampling along them."""
+"""Warps: correspondences between two views, visibility from the source, and sampling. See
+docs/warping.md."""
 
 from attnwarp.warp.correspondence import (
     Correspondence,

@@ -94,9 +94,9 @@ def correspond(
 ) -> Correspondence:
     """Where each target pixel's surface point lies in the source image.
 
-    The pixel is unprojected with its depth, moved by the relative pose of the cameras (formed from
-    the difference of their centres, so that far-away worlds and tiny baselines keep their digits)
-    and projected.
+    The pixel is unprojected with its depth, moved by the relative pose of the cameras, and
+    projected. The pose is formed from the difference of the cameras' centres, so that far-away
+    worlds and tiny baselines keep their digits.
 
     Args:
         source, target: cameras in one world.

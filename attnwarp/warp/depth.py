@@ -47,6 +47,9 @@ def resize_depth(
     Returns:
         (h, w) float64, NaN where a tap that counts is undefined or where the taps were rejected.
 
+    Raises:
+        ValueError: a depth of another shape or type, or a size below 1 x 1.
+
     Example:
         >>> import torch
         >>> from attnwarp.warp import resize_depth

@@ -25,6 +25,9 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize = "area") 
     Returns:
         (h, w) bool.
 
+    Raises:
+        ValueError: a mask of another shape or type, or another mode.
+
     Example:
         >>> import torch
         >>> from attnwarp.warp import resize_mask

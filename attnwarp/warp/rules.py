@@ -28,6 +28,9 @@ misses whole."""
 def in_front(correspondence: Correspondence) -> Tensor:
     """The point lies in front of the source camera (z > 0).
 
+    Args:
+        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp import Camera
@@ -53,10 +56,14 @@ def opaque(
     """Both images show surface rather than background.
 
     Args:
+        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
         minimum: smallest alpha that counts.
         target_alpha: (H, W) in [0, 1]; left out, every pixel passes.
         source_alpha: (h, w) in [0, 1], read bilinearly at the source position; left out, every
             pixel passes.
+
+    Raises:
+        ValueError: an alpha of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -91,16 +98,20 @@ def depth_agrees(
     slope: float = 0.5,
     spread: float | None = TAP_SPREAD,
 ) -> Tensor:
-    """The point's depth in the source camera is the depth the source itself sees there.
+    """The point's depth in the source camera is the source's own depth at its position.
 
     ``|z - d| <= relative * z + slope * (depth_slope at the nearest source pixel)``, with d
     interpolated in 1 / z and taps that straddle an edge rejected.
 
     Args:
+        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
         source_depth: (h, w) depth along the source's optical axis, NaN where undefined.
         relative: tolerance as a fraction of z, :data:`EXACT_DEPTH_TOLERANCE` for exact depth.
         slope: pixels of the source's depth slope to allow.
         spread: as in :func:`attnwarp.warp.depth.resize_depth`.
+
+    Raises:
+        ValueError: a depth of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -131,7 +142,13 @@ def photometric(
     difference <= ``limit``.
 
     Args:
-        source_image: (h, w, C) and target_image: (H, W, C), before any edit, sRGB in [0, 1].
+        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
+        source_image: (h, w, C), before any edit, sRGB in [0, 1].
+        target_image: (H, W, C), likewise.
+        limit: the largest difference that passes.
+
+    Raises:
+        ValueError: an image of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -162,8 +179,12 @@ def facing(correspondence: Correspondence, target_normal: Array) -> Tensor:
     side of the tangent plane.
 
     Args:
+        correspondence: of the target's pixels, by :func:`attnwarp.warp.correspond`.
         target_normal: (H, W, 3) world normals of either sign and any length; zero and NaN are
             undefined.
+
+    Raises:
+        ValueError: normals of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -188,6 +209,13 @@ def source_incidence(
     correspondence: Correspondence, target_normal: Array, angle: float = 60.0
 ) -> Tensor:
     """:func:`facing`, and the source sees the surface within ``angle`` degrees of its normal.
+
+    Args:
+        correspondence, target_normal: as :func:`facing`.
+        angle: degrees.
+
+    Raises:
+        ValueError: normals of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -216,8 +244,15 @@ def camera_frame(
     """The published code's test: camera-space normals, flipped to each camera, within ``angle``
     degrees of each other.
 
-    The two normals stand in the axes of two different cameras, so that the angle between them holds
-    the cameras' relative rotation: the same surface seen by a rolled camera fails.
+    The two normals are in the axes of different cameras, so the angle between them contains the
+    cameras' relative rotation. The same surface seen by a rolled camera fails.
+
+    Args:
+        correspondence, target_normal: as :func:`facing`.
+        angle: degrees.
+
+    Raises:
+        ValueError: normals of another shape or type.
 
     Example:
         >>> import numpy as np
@@ -241,9 +276,11 @@ def camera_frame(
 def gaussian_filter(
     gaussians: Gaussians, source: Camera, target: Camera, rule: GaussianFilter, angle: float = 60.0
 ) -> Tensor:
-    """Which Gaussians are left in before the target's depth is rendered.
+    """Which Gaussians remain when the target's depth is rendered.
 
     Args:
+        gaussians: of the scene.
+        source, target: the cameras.
         rule: "none" keeps all. "facing" keeps those of which both cameras see the same side,
             "source_incidence" those the source also sees within ``angle`` of the normal.
             "camera_frame" keeps those whose camera-space normals, each flipped to its camera, are

@@ -203,6 +203,10 @@ splats and come from the measurements in reports/warp/choices.md; exact depth ta
 def preset(name: str, **changes: Any) -> WarpSettings:
     """A preset, with some of its fields changed.
 
+    Args:
+        name: "paper", "released" or "corrected".
+        changes: fields of :class:`WarpSettings`.
+
     Raises:
         ValueError: an unknown preset or field, or a value out of range; the message names it.
 

@@ -304,11 +304,20 @@ def render_surface(
     *,
     backend: str = "auto",
 ) -> Surface:
-    """Depth, normals, alpha and colour of splats as ``settings`` wants them rendered, on the
-    CPU.
+    """Depth, normals, alpha and colour of splats, rendered as ``settings`` demand.
 
-    Nothing nearer than the renderer's default near plane is drawn, or than a hundredth of the
-    splats' median distance where that is less: a world in small units has a surface too.
+    The near plane is the renderer's default, or a hundredth of the splats' median distance where
+    that is less. So a world in small units has a surface too.
+
+    Args:
+        gaussians: to render.
+        camera: whose view is rendered; (H, W) is its size.
+        settings: their ``depth`` and ``depth_statistic`` choose the depth. 3D splats have "peak"
+            depth in place of "intersection".
+        backend: of :func:`attnwarp.render.render`.
+
+    Returns:
+        A surface of (H, W) tensors without gradients, on the CPU.
 
     Example:
         >>> import torch

@@ -1,1 +1,11 @@
-"""Scenes with exact answers, and the checks of warp, mask and depth against them."""
+"""The evaluation harness: scenes with exact truth, and figures of a method against it.
+
+- :mod:`attnwarp_eval.scene` and :mod:`attnwarp_eval.truth`: scenes, and what is exactly known of
+  them.
+- :mod:`attnwarp_eval.metrics`: figures of depth, warps, masks and edited views.
+- :mod:`attnwarp_eval.study`: runs of scenes x variants x seeds x probes.
+- :mod:`attnwarp_eval.report` and :mod:`attnwarp_eval.compare`: what a run shows, and whether it got
+  worse.
+- :mod:`attnwarp_eval.inspect`: a warp in 3D.
+- :mod:`attnwarp_eval.stability`: hard inputs, swept until they break.
+"""

@@ -84,6 +84,9 @@ def _lines(snapshot: Snapshot) -> Iterator[str]:
 def read_baseline(path: Path) -> Snapshot:
     """Read a baseline's file.
 
+    Args:
+        path: of the JSON lines that ``compare --update`` wrote.
+
     Raises:
         BaselineError: it is not a baseline, or was changed since it was written.
         OSError: it cannot be read.

@@ -10,6 +10,10 @@ from attnwarp_eval.statistics.intervals import Interval
 def number(value: float | None, digits: int = 3) -> str:
     """A number to ``digits`` significant digits; a dash where it is undefined.
 
+    Args:
+        value: None and NaN are undefined.
+        digits: significant ones.
+
     Example:
         >>> number(0.0123456), number(12345.6), number(None)
         ('0.0123', '12346', '–')

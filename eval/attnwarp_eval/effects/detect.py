@@ -1,9 +1,9 @@
 """Which light transport a scene needs.
 
-:func:`detect` looks at the file, at the graph handed to Mitsuba (plugin names) and at what Mitsuba
-made of it (BSDF flags, emitter flags, media, textures by class name), and refuses to go on where
-they disagree. :mod:`attnwarp_eval.effects.proof` holds a plan against a rendering with everything
-on. docs/effects.md has the reasons.
+:func:`detect` compares the file with the graph handed to Mitsuba (plugin names) and with Mitsuba's
+scene (BSDF flags, emitter flags, media, textures by class name). An effect in one that another
+lacks is an error. :mod:`attnwarp_eval.effects.proof` compares a plan with a rendering with
+everything on. docs/effects.md has the reasons.
 """
 
 from __future__ import annotations

@@ -338,6 +338,13 @@ def climb(
     Two of them can refuse: paired bias and Welch's test. Their pictures have different seeds, so
     each has Sidak's share of ``alpha``.
 
+    Args:
+        pictures: renders stacks of a side; see :data:`Pictures`.
+        seeds: of each side in Welch's test.
+        seconds: that Welch's pictures may take; fewer samples a pixel are the consequence.
+        seed: the first; the rungs take the next ones.
+        alpha: chance that two equal sides are refused.
+
     Example:
         >>> def pictures(side, spp, first, count):
         ...     noise = np.random.default_rng((side, spp, first)).normal(size=(count, 8, 8, 3))

@@ -104,6 +104,11 @@ class CellReport:
 def cell_of(pair: Pair, size: Size, column: int, row: int) -> tuple[int, int]:
     """The cell (column, row) of a feature grid that a target pixel's centre lies in.
 
+    Args:
+        pair: of views.
+        size: (h, w) of the feature grid.
+        column, row: of the pixel.
+
     Example:
         >>> from attnwarp.warp import PRESETS
         >>> from attnwarp_eval.world import world

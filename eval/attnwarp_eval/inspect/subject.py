@@ -161,6 +161,10 @@ class Subject:
 def of_scene(scene: str, size: int = SIZE) -> Subject:
     """A scene under the three presets, with splats as studies put them on its surfaces.
 
+    Args:
+        scene: a name, or the path of a file.
+        size: side of the pictures in px.
+
     Raises:
         InputError: there is no such scene.
 

@@ -1,9 +1,9 @@
 """Metrics of depth, warps, masks and edited views: pure functions, arrays in and figures out, no
 I/O.
 
-What each figure is stands in :data:`attnwarp_eval.metrics.registry.METRICS`, and at length in
-docs/metrics.md. A figure that is undefined (nothing to measure it on) is NaN, never 0, with a count
-beside it.
+:data:`attnwarp_eval.metrics.registry.METRICS` has each figure's unit, direction and tolerance.
+docs/metrics.md tells which one to use. A figure with nothing to measure is NaN, never 0, with a
+count beside it.
 """
 
 from __future__ import annotations

@@ -4,13 +4,13 @@ approximates it.
 Exactly: :func:`cross_view` compares the colours that two pictures give the same surface point, at
 correspondences known from the scene itself. Published work has no such correspondences and takes
 optical flow between the unedited pictures instead (Lai et al. 2018, Learning Blind Video Temporal
-Consistency): :func:`optical_flow` and :func:`flow_consistency` do that, :func:`flow_error` says how
-far the flow is from the truth, and :func:`approximation_error` what it does to the figure. Both
-paths share everything but where they look.
+Consistency). :func:`optical_flow` and :func:`flow_consistency` do that. :func:`flow_error` measures
+the flow's error, and :func:`approximation_error` its effect on the figure. Both paths differ in the
+positions alone.
 
-Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light; at exact
-positions in float64 (``cv2.remap`` rounds positions to 1/32 px, and the sampler of
-:mod:`attnwarp.warp.correspondence` is what is being judged).
+Pictures are sRGB in [0, 1]. Sampling is in linear light, since a pixel is a mean of light, and at
+exact positions in float64. Neither of two other samplers is used: ``cv2.remap`` rounds positions to
+1/32 px, and that of :mod:`attnwarp.warp` is under test.
 """
 
 from __future__ import annotations
@@ -99,12 +99,16 @@ def cross_view(
 ) -> Disagreement:
     """Disagreement of two pictures about the same surface points, at exact correspondences.
 
-    Counted are pixels of the target that the source certainly shows (``pair.visible``), that lie in
-    neither view within 2 px of a depth or object edge (``pair.edge``), whose position has all four
-    bilinear taps, and that ``exclude`` does not name. Among them the pictures of a perfect, matt
-    scene still differ: by what bilinear sampling cannot follow, by the area that a pixel covers in
-    either view, and by the noise of the renderer. That floor is the same function of the two TRUE
-    pictures; a figure without its floor says little.
+    A target pixel counts if
+
+    - the source certainly shows it (``pair.visible``),
+    - it lies in neither view within 2 px of a depth or object edge (``pair.edge``),
+    - its position has all four bilinear taps, and
+    - ``exclude`` does not contain it.
+
+    There the two TRUE pictures of a matt scene differ too. The causes are bilinear sampling, the
+    area that a pixel covers in either view, and the noise of the renderer. The same function of the
+    true pictures is this floor; report it beside the figure.
 
     Args:
         source_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of the sizes of ``pair``'s cameras.
@@ -149,11 +153,14 @@ def view_dependent(
     False where the source does not show the pixel.
 
     Args:
-        source_srgb, target_srgb: truth of the two views, unedited. An edit that makes a matt thing
-            shiny has highlights of its own: where its truth is known, ask for it too and join the
-            two masks.
+        source_srgb, target_srgb: (h, w, 3) and (H, W, 3), truth of the two unedited views, in
+            [0, 1]. An edit that makes a matt object shiny has highlights of its own: join the mask
+            of its truth with this one.
         pair: as for :func:`cross_view`.
         tolerance: in linear light, of 1; above the noise of the pictures.
+
+    Raises:
+        ValueError: pictures of another size, type or range, or a negative tolerance.
 
     Example:
         >>> import numpy as np
@@ -302,6 +309,9 @@ def flow_error(flow: Flow, pair: TwoView, *, mask: Any = None) -> dict[str, floa
         over those of them that pass the forward-backward check; ``flow_recall``, the share that
         passes; and ``flow_false``, of all that pass the share that the source certainly does not
         show. NaN where there is nothing to measure.
+
+    Raises:
+        ValueError: a flow of another size than the pair's.
 
     Example:
         >>> from attnwarp_eval import metrics

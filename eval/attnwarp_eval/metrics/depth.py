@@ -26,6 +26,9 @@ def depth_error(
         surface and a depth; the delta shares over all pixels with a surface: one without a depth is
         not within anything. NaN where there is nothing to measure.
 
+    Raises:
+        ValueError: another shape or type, or one of the two normal maps without the other.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp_eval import metrics

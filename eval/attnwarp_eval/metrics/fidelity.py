@@ -33,12 +33,12 @@ def fidelity(
 ) -> dict[str, float]:
     """The ``fidelity.*`` figures of an edited view against the truth of the edit.
 
-    Whole, ``.inside`` the edited object and ``.outside`` of it: a method that paints the object
-    well and the rest of the picture too shows it in the last alone. Pixels on the object's outline,
-    one on each side, count in neither: the mask is of pixel centres and a pixel shows the mean of
-    its area, so the truth itself changes there. ``preserved_*`` is outside too, but against the
-    picture before the edit: what the truth gets there is the best to be had, less than perfect
-    where an edited object throws another light, so put ``preserved_*`` of the truth beside it.
+    Figures are of the whole picture, ``.inside`` the edited object and ``.outside`` of it. Only the
+    last shows that a method also painted the rest of the picture. Pixels on the object's outline,
+    one on each side, count in neither: the mask is of pixel centres, and a pixel shows the mean of
+    its area. ``preserved_*`` compares the outside with the picture before the edit. It is less than
+    perfect for the truth too where an edited object reflects other light. So report ``preserved_*``
+    of the truth beside it.
 
     Args:
         image_srgb: (H, W, 3) sRGB in [0, 1], the edited view.

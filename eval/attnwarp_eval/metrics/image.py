@@ -66,6 +66,13 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
     0, gains -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see
     :func:`edit_psnr`.
 
+    Args:
+        image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all pixels if left out.
+
+    Raises:
+        ValueError: another shape, type or range, or a value inside the mask that is not finite.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp_eval import metrics
@@ -81,12 +88,19 @@ def ssim(image: Any, target: Any, mask: Any = None) -> float:
     at most 1.
 
     The windows are 11 x 11, Gaussian with sigma 1.5, and lie wholly inside the picture and, given a
-    mask, wholly inside the mask: a window that is partly outside would score what is not in
-    question. The values are those of :func:`attnwarp.losses.ssim`.
+    mask, wholly inside the mask, so that no pixel outside counts. The values are those of
+    :func:`attnwarp.losses.ssim`.
+
+    Args:
+        image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].
+        mask: (H, W) bool, True where a pixel counts; all pixels if left out.
 
     Returns:
         NaN when there is no such window: a picture below 11 x 11 px, or a mask that holds no 11 x
         11 square.
+
+    Raises:
+        ValueError: another shape, type or range, or a value inside the mask that is not finite.
 
     Example:
         >>> import numpy as np
@@ -105,6 +119,12 @@ def ssim_map(image: Any, target: Any, mask: Any = None) -> Array:
 
     The window at [i, j] is centred on the pixel [i + 5, j + 5]. Empty for a picture below 11 x 11
     px.
+
+    Args:
+        image, target, mask: as :func:`ssim`.
+
+    Raises:
+        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np
@@ -134,17 +154,23 @@ def whole_windows(mask: Mask) -> Mask:
 def ms_ssim(image: Any, target: Any, mask: Any = None) -> float:
     """Multi-scale structural similarity (Wang, Simoncelli & Bovik 2003), in [0, 1].
 
-    Contrast and structure at five scales, each half the one before (means of 2 x 2 pixels; an odd
-    last row or column is dropped), and luminance at the coarsest, each averaged over windows and
-    channels, then multiplied with the paper's exponents. A mean below 0 (pictures that are each
-    other's negatives) has no real power and counts as 0.
+    Contrast and structure count at five scales, luminance at the coarsest. Each is averaged over
+    windows and channels, then multiplied with the paper's exponents. A scale has means of 2 x 2
+    pixels of the one before; an odd last row or column is dropped. A mean below 0 (pictures that
+    are each other's negatives) has no real power and counts as 0.
 
     Given a mask, a pixel of a coarser scale is inside when its four pixels are, and windows count
     as in :func:`ssim`.
 
+    Args:
+        image, target, mask: as :func:`ssim`.
+
     Returns:
         NaN when some scale has no window: a side below 176 px, or a mask that holds no square of
         about that size.
+
+    Raises:
+        ValueError: as :func:`ssim`.
 
     Example:
         >>> import numpy as np
@@ -172,11 +198,10 @@ def perceptual(image_srgb: Any, target_srgb: Any, distance: Distance, mask: Any 
     """A perceptual distance (LPIPS's kind) of two pictures, or of what a mask leaves of them; NaN
     for an empty mask.
 
-    Outside the mask the picture is made equal to the target first, so that nothing there differs,
-    and the distance is divided by the share of the picture that the mask covers. For a distance
-    that is a mean over places it then is the mean over those of the mask, apart from what spills
-    over the mask's border: networks see a neighbourhood of each place. Pictures that are equal
-    inside the mask are at distance 0, whatever stands outside.
+    Outside the mask the picture is replaced by the target. The distance is then divided by the
+    share of the picture that the mask covers. So a distance that is a mean over pixels becomes a
+    mean over those of the mask, except near its border: networks see a neighbourhood of each pixel.
+    Pictures that are equal inside the mask have distance 0.
 
     Args:
         image_srgb, target_srgb: (H, W, 3) sRGB in [0, 1], of one size. What they hold outside the

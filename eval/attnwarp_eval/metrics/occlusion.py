@@ -1,8 +1,7 @@
 """Masks against true visibility from the source: precision, recall and other scores.
 
-Truth has three classes for a pixel that shows a surface: visible, hidden (occluded, turned away)
-and ambiguous, and those whose point falls outside the source image or behind its camera. Ambiguous
-pixels are counted and not scored.
+A pixel that shows a surface is visible, hidden (occluded, turned away) or ambiguous, or its point
+falls outside the source image or behind its camera. Ambiguous pixels are counted and not scored.
 """
 
 from __future__ import annotations
@@ -203,6 +202,9 @@ def by_yaw(
 
     Returns:
         One entry for each bin, empty ones included: their scores are NaN.
+
+    Raises:
+        ValueError: edges that do not rise from 0 to 180.
 
     Example:
         >>> from attnwarp_eval import metrics

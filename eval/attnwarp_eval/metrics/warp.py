@@ -29,6 +29,10 @@ def endpoint_error(
         not within anything. Median, percentile and mean are over those that have one, with
         ``coverage`` beside them. NaN where there is nothing to measure.
 
+    Raises:
+        ValueError: another shape or type, or an exact position that is not finite in a visible
+            pixel.
+
     Example:
         >>> import numpy as np
         >>> from attnwarp_eval import metrics

@@ -1,3 +1,3 @@
-"""Scenes: what a file of scenes/ says, and the geometry, materials, lights, cameras and edits that
-follow.
+"""Scenes: the format of a scene file, and its geometry, materials, lights, cameras and edits. See
+docs/scenes.md.
 """

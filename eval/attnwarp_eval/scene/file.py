@@ -46,9 +46,12 @@ def list_scenes() -> list[str]:
 def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     """A scene by name (``"bear"``) or by file (``"my/scene.yaml"``).
 
+    Args:
+        name_or_path: a name is looked up in ``./scenes``, then in the package.
+
     Raises:
-        SceneError: the file is missing or says something that cannot be used; the message names the
-            file, the line where it can, what came and the remedy.
+        SceneError: the file is missing, or an entry cannot be used. The message names the file, the
+            line if there is one, the value and the remedy.
 
     Example:
         >>> scene = load_scene("spheres")

@@ -110,6 +110,10 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
 def orbit_name(index: int, count: int) -> str:
     """Name of a camera of :func:`orbit`.
 
+    Args:
+        index: of the camera, from 0.
+        count: of all cameras, which decides the number of digits.
+
     Example:
         >>> orbit_name(0, 64) == orbit_name(1, 64)
         False
@@ -153,6 +157,9 @@ def first_points(
         seed: of the sampling and the noise.
         geometry: ``Geometry(scene)``, if there is one already.
 
+    Raises:
+        ValueError: a count below 10.
+
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
         >>> scene = load_scene("spheres")
@@ -183,7 +190,12 @@ def first_points(
 
 
 def picture(scene: Scene, camera: Camera, spp: int) -> npt.NDArray[np.uint8]:
-    """(H, W, 3) uint8 sRGB truth of a view, rounded as an 8-bit file would have it.
+    """(H, W, 3) uint8 sRGB truth of a view, rounded as in an 8-bit file.
+
+    Args:
+        scene: what is rendered.
+        camera: whose view; (H, W) is its size.
+        spp: samples a pixel.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -75,13 +75,12 @@ def surface_splats(
 ) -> Gaussians:
     """Splats that lie on the surfaces of a scene.
 
-    They are spread as blue noise, lie in the tangent plane, and carry the colour that the truth has
-    there: albedo times direct light, traced to each splat (see :mod:`attnwarp_eval.truth.shading`).
-    Light of further bounces, which pictures of a scene with ``bounces`` other than 1 show, is not
-    in them: those splats are darker than the pictures, by 1 to 13 % of the light in the package's
-    scenes (reports/effects). Colours are computed rather than picked from rendered views, since a
-    diffuse surface under direct light looks the same from everywhere, and pictures would add their
-    noise, mix colours across outlines and know nothing of surfaces that no view shows.
+    They are spread as blue noise and lie in the tangent plane. Their colour is albedo times direct
+    light, traced to each splat (:mod:`attnwarp_eval.truth.shading`). It has no light of further
+    bounces: where a scene's pictures do, its splats are darker (docs/surface-splats.md). Colours
+    are not taken from rendered views. Those have noise, mix colours across outlines, and lack the
+    surfaces that no view shows. A diffuse surface under direct light looks the same from
+    everywhere.
 
     Args:
         kind: "2d" (discs) or "3d" (flat ellipsoids, ``thickness`` thick).
@@ -90,9 +89,8 @@ def surface_splats(
             The colour stays that of the undisturbed point.
         normal_noise: standard deviation of a tilt about each of the two tangents, in degrees.
         seed: of the sampling and the noise; the noise of one seed does not change the sampling.
-        size: standard deviation of a splat in its plane, in local spacings. At 0.6 a surface has a
-            median alpha of 0.97 to 0.98 and 0.80 at its thinnest percentile, at 0.7 0.99 and 0.92,
-            with wider fringes at outlines.
+        size: standard deviation of a splat in its plane, in local spacings. Larger splats close
+            holes and reach further beyond outlines (reports/splats/surface.md).
         thickness: the third standard deviation of "3d" splats, in local spacings.
         opacity: of every splat.
         focus: the radius about the scene's centre, in scene units, within which points are about
@@ -221,14 +219,18 @@ def sample_surface(
 ) -> SurfaceSamples:
     """Blue noise on all surfaces by sample elimination (Yuksel 2015), denser near ``center``.
 
-    The density is proportional to 1 / (1 + (r / focus)^2), r the distance from ``center``, which
-    keeps the splats of a floor about equally large in the pictures of cameras that orbit it.
+    The density is proportional to 1 / (1 + (r / focus)^2), r the distance from ``center``. So the
+    splats of a floor are about equally large in the pictures of cameras that orbit it.
 
     Args:
+        geometry: of the scene.
         count: number of points, exactly.
         center: (3,) world.
         focus: scene units.
         seed: any integer >= 0.
+
+    Raises:
+        ValueError: a count below 1, or a scene without visible surfaces.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

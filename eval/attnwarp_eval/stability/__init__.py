@@ -1,6 +1,6 @@
-"""Numerically hard cases, each swept over its hardness until what is computed breaks.
+"""Numerically hard cases, each swept over its hardness until the computation breaks.
 
-A case names its input, an oracle that shares no code with what is tested, a tolerance with its
+A case has an input, an oracle that shares no code with the code under test, a tolerance with its
 reason, and the level up to which it must hold. The study's probe, the command and the tests all
 call the same cases.
 """

@@ -154,6 +154,10 @@ def time_ratio(
     """Seconds of ``a`` over those of ``b``, taken in turn: one sequence of rounds a group, paired
     round by round.
 
+    Args:
+        a, b: groups of rounds, seconds > 0.
+        resamples: of the bootstrap over rounds.
+
     Raises:
         ValueError: other numbers of groups or rounds, or seconds that are not positive.
 
@@ -258,7 +262,9 @@ def verdict(
 def front(cost: Sequence[float], error: Sequence[float]) -> list[int]:
     """Indices of the Pareto front, cheapest first: a point stays when its error strictly improves.
 
-    NaN and infinite points never enter.
+    Args:
+        cost: of each point, such as seconds.
+        error: of each point; less is better. Points that are not finite are left out.
 
     Example:
         >>> front([1.0, 2.0, 3.0], [0.5, 0.6, 0.1])  # the second costs more and errs more

@@ -34,6 +34,8 @@ def two_view(
     labels.
 
     Args:
+        geometry: of the scene.
+        source, target: the cameras. The result has the target's (H, W).
         bands: :func:`edge_band` of the source and of the target, where they are computed already.
 
     Example:
@@ -137,10 +139,12 @@ def _corner_status(geometry: Geometry, source: Camera, target: Camera) -> npt.ND
 def edges(geometry: Geometry, camera: Camera) -> Mask:
     """Pixels beside a depth or object edge.
 
-    Two neighbours (left and right, above and below) are parted by an edge when they show different
-    objects, when only one of them shows any, or when the tangent plane of neither comes within one
-    pixel's footprint (z / f) of the other's depth. The planes keep a slanted floor from being
-    called an edge.
+    Two neighbours (left and right, above and below) have an edge between them if
+
+    - they show different objects,
+    - only one of them shows any, or
+    - neither tangent plane comes within one pixel's footprint (z / f) of the other's depth. So a
+      slanted floor is no edge.
 
     Returns:
         (H, W) bool: pixels with such a neighbour.
@@ -173,6 +177,11 @@ def edges(geometry: Geometry, camera: Camera) -> Mask:
 def edge_band(geometry: Geometry, camera: Camera, width: float = EDGE_BAND) -> Mask:
     """(H, W) bool: pixels within ``width`` pixels of an edge (see :func:`edges`), those beside it
     included.
+
+    Args:
+        geometry: of the scene.
+        camera: whose view; (H, W) is its size.
+        width: px.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene

@@ -1,9 +1,9 @@
 """Exact geometry: what each pixel's central ray hits, and which points a camera can see.
 
-Triangles go through Open3D (Embree, float32) and the hit is then put on the plane of its triangle
-in float64; spheres and rectangles are closed forms in float64 throughout. Before any float32 number
-is made the scene is moved to the middle of its bounding box and scaled to unit size, both in
-float64, so that neither the scene's place nor its unit changes an answer.
+Open3D (Embree, float32) finds the triangle of a ray, and the triangle's plane in float64 gives the
+point. Spheres and rectangles are closed forms in float64. First the scene is moved to the middle of
+its bounding box and scaled to unit size, in float64. So neither the scene's place nor its unit
+changes an answer.
 """
 
 from __future__ import annotations
@@ -356,9 +356,8 @@ class Geometry:
     ) -> Mask:
         """Whether the way from an eye to a surface point is free.
 
-        The ray is cast from the eye to the point and no offset is used anywhere: the way is free
-        when the first hit is the point's own primitive or lies at 1 +- ``REACH_TOLERANCE`` of the
-        way.
+        The ray is cast from the eye to the point, without any offset. The way is free if the first
+        hit is the point's own primitive, or lies at 1 +- ``REACH_TOLERANCE`` of the way.
 
         Args:
             eyes: (N, 3) or (3,) world coordinates.

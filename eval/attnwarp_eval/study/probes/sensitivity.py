@@ -1,7 +1,7 @@
 """Which metric can see what: every metric on right results of an edit and on flawed ones.
 
-A metric that ranks the right result above the flawed one can see that flaw; one that ranks them as
-a coin does is blind to it; and one that prefers the flaw moves the wrong way.
+A metric that ranks the right result above the flawed one sees that flaw. One that ranks them at
+random is blind to it, and one that prefers the flaw moves the wrong way.
 """
 
 from __future__ import annotations

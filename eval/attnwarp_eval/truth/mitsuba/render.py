@@ -40,13 +40,15 @@ APPEARANCE_PROTOCOL = 2
 def render_plan(
     scene: Scene, camera: Camera, plan: Plan, seed: int, *, made_by: str | None = None
 ) -> Image:
-    """A picture as ``plan`` says: (H, W, 3) float32, linear RGB, every value finite. Nothing is
-    kept.
+    """A picture by a plan: (H, W, 3) float32, linear RGB, every value finite. It is not cached.
 
     Args:
+        scene: what is rendered.
+        camera: whose view; (H, W) is its size.
+        plan: of :func:`attnwarp_eval.truth.plan.plan`; it has the samples a pixel.
+        seed: the same seed and variant give the same bits, except for light paths ("ptracer").
+            Threads add those to pixels in any order, which changes the last bits of float32.
         made_by: Mitsuba's variant; :func:`~attnwarp_eval.truth.llvm.variant` if left out.
-        seed: the same seed and variant give the same bits, but for light paths ("ptracer"): threads
-            add them to pixels in any order, which shows in the last bits of float32.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
