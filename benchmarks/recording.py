@@ -6,7 +6,7 @@ come first, then passes that are recorded, then passes with the recorded feature
 
     python -m benchmarks.recording
 
-Peak memory is what a run holds at most beyond the weights (Linux).
+Peak memory is that of the process during a run, with weights, imports and recording (Linux).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LATENT_SIZE, TIMESTEPS, TOKENS = 64, (981, 481), 77
 
 @dataclass(frozen=True)
 class Row:
-    """A run: its name, CPU seconds of all threads, wall seconds, peak memory beyond the weights."""
+    """A run: its name, CPU seconds of all threads, wall seconds, the process's peak memory."""
 
     run: str
     cpu_s: float
@@ -90,7 +90,6 @@ def measure(unet: Any, size: int = LATENT_SIZE) -> tuple[RecordingPlan, list[Row
     }
     for name, around in runs.items():
         reset_peak()
-        held = memory("VmRSS")
         wall, cpu = time.perf_counter(), time.process_time()
         with around() as result, torch.no_grad():
             for timestep in TIMESTEPS:
@@ -104,7 +103,7 @@ def measure(unet: Any, size: int = LATENT_SIZE) -> tuple[RecordingPlan, list[Row
                 name,
                 time.process_time() - cpu,
                 time.perf_counter() - wall,
-                (memory("VmHWM") - held) / 2**30,
+                peak_memory() / 2**30,
             )
         )
     return plan, results
@@ -115,10 +114,10 @@ def reset_peak() -> None:
     Path("/proc/self/clear_refs").write_text("5")
 
 
-def memory(key: str) -> int:
-    """Bytes of this process: "VmRSS" resident, "VmHWM" its peak."""
+def peak_memory() -> int:
+    """Peak bytes of this process since :func:`reset_peak`."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
 
 
 def table(rows: Sequence[Row]) -> str:
