@@ -8,6 +8,9 @@ rounds.
 
 ``--against`` names another checkout, whose command then takes turns with this one's: ratios are
 medians of the ratios within a round.
+
+A second table has the milliseconds of a frame of this checkout's window with 100,000 discs, while
+the view stands and while it moves; it needs a display.
 """
 
 from __future__ import annotations
@@ -32,6 +35,9 @@ from benchmarks import command
 
 SPLATS = 200_000
 SIZE = 592
+
+DISCS, FRAMES = 100_000, 15
+"""Of the window whose frames are timed."""
 
 
 def write_scene(folder: Path, splats: int, size: int) -> None:
@@ -132,6 +138,64 @@ def measure(
     return {"splats": splats, "triangles": count, "rounds": rounds, "rows": rows}
 
 
+def frames(splats: int = DISCS, size: int = SIZE, count: int = FRAMES) -> dict[str, Any]:
+    """Milliseconds of the window's frames while the view stands and while it moves, medians.
+
+    The two take turns, ``count`` frames at a time over three rounds, each from another side.
+    """
+    from attnwarp_eval.inspect import subject, window
+    from attnwarp_eval.inspect.scene import State
+
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        write_scene(folder, splats, size)
+        chosen = subject.of_capture(folder / "scene.ply", folder, size=size)
+        state = State("corrected", chosen.targets[0], splats=True)
+        opened = window.Window(chosen, state)
+        plotter = opened.plotter
+        plotter.show(auto_close=False, interactive=False)
+        taken: dict[str, list[tuple[float, float]]] = {"standing": [], "moving": []}
+        for _ in range(3):
+            for name, event in (("standing", "End"), ("moving", "")):
+                plotter.iren.style.InvokeEvent(f"{event}InteractionEvent")
+                plotter.render_window.Render()  # uploads what was hidden
+                for _ in range(count):
+                    plotter.camera.Azimuth(2)
+                    wall, cpu = time.perf_counter(), time.process_time()
+                    plotter.render_window.Render()
+                    taken[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+        renderer = next(
+            (line for line in plotter.render_window.ReportCapabilities().splitlines()
+             if line.startswith("OpenGL renderer")), "",
+        ).partition(":")[2].strip()  # fmt: skip
+        opened.close()
+    rows = {
+        name: {
+            "wall_ms": 1000 * statistics.median(wall for wall, _ in values),
+            "cpu_ms": 1000 * statistics.median(cpu for _, cpu in values),
+        }
+        for name, values in taken.items()
+    }
+    return {"splats": splats, "window": list(window.SIZE), "renderer": renderer, "rows": rows}
+
+
+def frames_table(result: dict[str, Any]) -> str:
+    """The frames for a person, as Markdown."""
+    width, height = result["window"]
+    lines = [
+        f"{result['splats']:,} discs in a window of {width} x {height}, drawn by"
+        f" {result['renderer'] or 'an unknown renderer'}",
+        "",
+        "| the view | wall ms a frame | cpu ms a frame |",
+        "|---|---|---|",
+    ]
+    lines += [
+        f"| {name} | {row['wall_ms']:.0f} | {row['cpu_ms']:.0f} |"
+        for name, row in result["rows"].items()
+    ]
+    return "\n".join(lines)
+
+
 def table(result: dict[str, Any]) -> str:
     """The result for a person, as Markdown."""
     lines = [
@@ -151,7 +215,7 @@ def table(result: dict[str, Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line."""
-    parser = command.parser("inspecting", "Time the first picture of inspect.")
+    parser = command.parser("inspecting", "Time inspect: its first picture, and frames.")
     parser.add_argument("--rounds", type=int, default=5, help="times it is drawn (default 5)")
     parser.add_argument(
         "--against", type=Path, action="append", default=[], help="another checkout to take turns"
@@ -160,6 +224,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     here = Path(__file__).resolve().parent.parent
     result = measure([here, *(path.resolve() for path in options.against)], options.rounds)
     print(table(result))
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        result["frames"] = frames()
+        print(f"\n{frames_table(result['frames'])}")
+    else:
+        print("\nFrames of the window are left out: no display; run it under xvfb-run.")
     command.write_figures(options.out, result)
 
 

@@ -5,12 +5,14 @@ whose seconds and peak memory are read at its end.
 
     python -m benchmarks.scale --cells 1000 10000 100000 --out reports/scale/report.md
     python -m benchmarks.scale --cluster 2000      # a dask scheduler and two workers
+    python -m benchmarks.scale --cluster 200 --wait 0.25   # cells that take as long as real ones
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import shutil
@@ -40,13 +42,14 @@ LIMIT_SECONDS, LIMIT_MB = 120, 2048
 
 
 class VariantPart(Part):
-    """What tells the variants apart."""
+    """What tells the variants apart, and the seconds that their cells wait, as if they worked."""
 
     level: int = 0
+    wait: float = 0.0
 
 
 class Free(Probe[NoExtra]):
-    """Figures that follow from the cell's id and cost nothing."""
+    """Figures that follow from the cell's id and cost nothing but a wait, if one is asked for."""
 
     name = "free"
     variant_part = VariantPart
@@ -55,8 +58,9 @@ class Free(Probe[NoExtra]):
     contrasts = FIGURES
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
-        """The variant's level."""
-        return {"level": variant.part(VariantPart).level}
+        """The variant's level, and its wait if it has one."""
+        own = variant.part(VariantPart)
+        return {"level": own.level} | ({"wait": own.wait} if own.wait else {})
 
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """The variant's level."""
@@ -64,6 +68,7 @@ class Free(Probe[NoExtra]):
 
     def compute(self, work: Work) -> NoExtra:
         """Figures in [0, 1) out of the hash of the cell and the view."""
+        time.sleep(work.spec.get("wait", 0.0))
         for view in work.spec["views"]:
             with work.meter.view():
                 digits = digest([work.cell.id, view])
@@ -73,8 +78,8 @@ class Free(Probe[NoExtra]):
         return NoExtra()
 
 
-def study_of(cells: int) -> Study:
-    """A study of about so many cells: variants and seeds grow alike."""
+def study_of(cells: int, wait: float = 0.0) -> Study:
+    """A study of about so many cells, which wait so many seconds: variants and seeds grow alike."""
     side = max(2, round((cells / len(SCENES)) ** 0.5))
     names = [f"level {level}" for level in range(side)]
     return parse_study(
@@ -86,7 +91,7 @@ def study_of(cells: int) -> Study:
             "scenes": SCENES,
             "views": [],
             "seeds": list(range(max(1, round(cells / len(SCENES) / side)))),
-            "variants": {name: {"level": level} for level, name in enumerate(names)},
+            "variants": {name: {"level": level, "wait": wait} for level, name in enumerate(names)},
             "probes": {"free": names},
             "ablations": [
                 {"title": "Levels", "probe": "free", "baseline": names[0], "variants": names[1:]}
@@ -197,10 +202,15 @@ def table(rows: Sequence[tuple[int, str, dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
-def cluster(cells: int, folder: Path) -> str:
+WORKERS = 2
+"""Of the cluster."""
+
+
+def cluster(cells: int, folder: Path, wait: float = 0.0) -> str:
     """CPU milliseconds a cell of the command, of the scheduler and of the workers.
 
-    What the command and the scheduler need for a cell bounds how many workers they can feed.
+    What the command and the scheduler need for a cell bounds how many workers they can feed. Where
+    cells wait, their seconds over those of the workers is the efficiency.
     """
     import psutil
 
@@ -217,7 +227,7 @@ def cluster(cells: int, folder: Path) -> str:
         )
     ]
     try:
-        for number in range(2):
+        for number in range(WORKERS):
             local = ["--local-directory", str(folder / f"worker{number}")]
             processes.append(
                 subprocess.Popen(
@@ -227,8 +237,8 @@ def cluster(cells: int, folder: Path) -> str:
                 )
             )
         store = Store(folder / "cluster")
-        planned = plan(study_of(cells), store)
-        before = [0.0] * 4
+        planned = plan(study_of(cells, wait), store)
+        before = [0.0] * (2 + WORKERS)
         start = 0.0
         ended = 0
         warm = cells // 4
@@ -249,7 +259,7 @@ def cluster(cells: int, folder: Path) -> str:
         for process in processes:
             process.terminate()
             process.wait()
-    names = ["the command", "the scheduler", "worker 1", "worker 2"]
+    names = ["the command", "the scheduler", *(f"worker {k + 1}" for k in range(WORKERS))]
     count = summary.computed - warm
     size = sum(p.stat().st_size for p in store.cells.rglob("*.json")) / summary.computed
     lines = ["| process | CPU ms a cell |", "|---|---|"]
@@ -257,13 +267,13 @@ def cluster(cells: int, folder: Path) -> str:
         f"| {name} | {1000 * seconds / count:.1f} |"
         for name, seconds in zip(names, used, strict=True)
     ]
-    return "\n".join(
-        [
-            *lines,
-            "",
-            f"{count} cells, records of {size / 1000:.1f} kB, {count / wall:.0f} cells a second.",
-        ]
-    )
+    about = f"{count} cells, records of {size / 1000:.1f} kB, {count / wall:.1f} cells a second."
+    if wait:
+        about += (
+            f" Each waits {wait:g} s: with {WORKERS} workers the efficiency is"
+            f" {count * wait / WORKERS / wall:.0%}."
+        )
+    return "\n".join([*lines, "", about])
 
 
 def _cpu(processes: Sequence[subprocess.Popen[bytes]], psutil: Any) -> list[float]:
@@ -277,19 +287,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cells", type=int, nargs="+", default=[1000])
     parser.add_argument("--cluster", type=int, help="cells on a cluster, instead of the steps")
+    parser.add_argument(
+        "--wait", type=float, default=0.0, help="seconds that each cell of --cluster waits (0)"
+    )
     parser.add_argument("--out", type=Path, help="Markdown file of the table")
     parser.add_argument("--step", choices=STEPS, help=argparse.SUPPRESS)
     parser.add_argument(
         "--folder", type=Path, help="where the runs are made; a new one if left out"
     )
     arguments = parser.parse_args()
+    if not 0 <= arguments.wait < math.inf:
+        parser.error(f"--wait: got {arguments.wait:g}, expected seconds from 0 on")
+    if arguments.wait and not arguments.cluster:
+        parser.error("--wait: cells wait on a cluster alone; add --cluster CELLS")
     register(Free)
     if arguments.step:
         print(json.dumps(one_step(arguments.step, arguments.cells[0], arguments.folder)))
         return
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         if arguments.cluster:
-            text = cluster(arguments.cluster, Path(folder))
+            text = cluster(arguments.cluster, Path(folder), arguments.wait)
         else:
             rows = []
             for row in measure(arguments.cells, Path(folder)):

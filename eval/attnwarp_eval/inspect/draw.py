@@ -44,6 +44,23 @@ def add_part(plotter: Any, part: Part) -> Any:
     )
 
 
+def add_lighter(plotter: Any, name: str, mesh: pyvista.PolyData) -> Any:
+    """Draw what stands for a part while the view moves; the actor is returned, hidden."""
+    actor = plotter.add_mesh(
+        mesh,
+        scalars="colors",
+        rgb=True,
+        lighting=False,
+        point_size=3,
+        copy_mesh=False,
+        reset_camera=False,
+        pickable=False,
+        name=f"moving {name}",
+    )
+    actor.visibility = False
+    return actor
+
+
 def texture(image: Image) -> pyvista.Texture:
     """A texture of an (H, W, 3) sRGB picture in [0, 1]."""
     import pyvista

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,17 +27,21 @@ Array = npt.NDArray[np.float64]
 SEAM = 0.05
 """Neighbouring pixels whose depths differ by more than this fraction are not joined by a face."""
 
+MOVING = 20_000
+"""More faces than this of the surface or of the discs are drawn lighter while the view moves."""
+
 DISC_SIDES = ((20_000, 10), (60_000, 6))
 """(splats, corners): up to so many splats, a disc is a polygon of so many corners; beyond, it is a
 square. Software draws 200,000 ten-sided discs in a second, squares in a third of it."""
 
 
-def seen_surface(seen: Seen, colors: Image) -> pyvista.PolyData:
+def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyData:
     """The surface that a view sees: a vertex a pixel, faces between neighbours of one surface.
 
     Args:
         seen: of the view, H x W.
         colors: (H, W, 3) sRGB in [0, 1].
+        seam: pixels whose depths differ by more than this fraction are not joined.
 
     Returns:
         A mesh whose points carry ``colors`` (uint8) and ``pixel`` (row-major index).
@@ -48,7 +53,7 @@ def seen_surface(seen: Seen, colors: Image) -> pyvista.PolyData:
     index = np.cumsum(valid) - 1
     depths, owners = _squares(seen.depth), _squares(seen.owner)
     joined = np.logical_and.reduce(_squares(seen.valid))
-    joined &= np.maximum.reduce(depths) <= (1 + SEAM) * np.minimum.reduce(depths)
+    joined &= np.maximum.reduce(depths) <= (1 + seam) * np.minimum.reduce(depths)
     joined &= np.logical_and.reduce([owner == owners[0] for owner in owners[1:]])
     corners = [grid[joined] for grid in _squares(index.reshape(height, width))]
     points = seen.point.reshape(-1, 3)[valid]
@@ -56,6 +61,15 @@ def seen_surface(seen: Seen, colors: Image) -> pyvista.PolyData:
     mesh.point_data["colors"] = as_bytes(colors).reshape(-1, 3)[valid]
     mesh.point_data["pixel"] = np.flatnonzero(valid)
     return mesh
+
+
+def coarser_surface(seen: Seen, colors: Image, faces: int) -> pyvista.PolyData:
+    """:func:`seen_surface` with about ``faces`` faces: of every k-th pixel of every k-th row."""
+    step = math.ceil(math.sqrt(seen.valid.size / faces))
+    every = (slice(step // 2, None, step),) * 2
+    grids = {f.name: getattr(seen, f.name)[every] for f in fields(seen)}
+    # The depth of a slope changes that much more from one of these pixels to the next.
+    return seen_surface(replace(seen, **grids), colors[every], seam=step * SEAM)
 
 
 def _squares(grid: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
@@ -100,6 +114,15 @@ def discs(gaussians: Gaussians) -> pyvista.PolyData:
     flat = 0.5 + SH_C0 * gaussians.sh.detach()[:, 0].double().numpy()
     mesh.cell_data["colors"] = as_bytes(flat.astype(np.float32))
     return mesh
+
+
+def disc_points(mesh: pyvista.PolyData) -> pyvista.PolyData:
+    """A coloured point on each disc of :func:`discs`."""
+    import pyvista
+
+    points = pyvista.PolyData(np.asarray(mesh.points)[:: mesh.n_points // mesh.n_cells])
+    points.point_data["colors"] = mesh.cell_data["colors"]
+    return points
 
 
 def disc_sides(count: int) -> int:
@@ -226,6 +249,8 @@ class Part:
         color: "#rrggbb", or None for the mesh's own ``colors``.
         picture: makes the (H, W, 3) sRGB texture, where it has one.
         opacity: in [0, 1].
+        moving: makes, from the mesh, what is drawn in its place while the view moves, where the
+            mesh has more than :data:`MOVING` faces; None where it stays.
     """
 
     name: str
@@ -234,6 +259,7 @@ class Part:
     color: str | None = None
     picture: Callable[[], Image] | None = None
     opacity: float = 1.0
+    moving: Callable[[pyvista.PolyData], pyvista.PolyData] | None = None
 
 
 @dataclass(frozen=True)
@@ -275,6 +301,10 @@ def parts(
     """Everything in the 3D view, in the order of drawing."""
     source, target = pair.cameras
     reach = frustum_depth(subject, source)
+
+    def seen_colors() -> Image:
+        return pair.colors(state.coloring, state.layer, state.step or None)
+
     result = [
         *_camera("source", source, reach, SOURCE_COLOR, lambda: pair.images[0]),
         *_camera(
@@ -288,14 +318,18 @@ def parts(
         Part(
             "seen",
             (state.variant, state.target, state.coloring, state.layer, state.step),
-            lambda: seen_surface(
-                pair.seen, pair.colors(state.coloring, state.layer, state.step or None)
-            ),
+            lambda: seen_surface(pair.seen, seen_colors()),
+            moving=lambda _: coarser_surface(pair.seen, seen_colors(), MOVING),
         ),
     ]
     if state.splats and pair.model is not None:
         result.append(
-            Part("discs", (id(pair.model), state.step), lambda: discs(pair.splats(state.step)))
+            Part(
+                "discs",
+                (id(pair.model), state.step),
+                lambda: discs(pair.splats(state.step)),
+                moving=disc_points,
+            )
         )
     if state.surface and pair.world is not None:
         geometry = pair.world.geometry

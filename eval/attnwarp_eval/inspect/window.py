@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -47,9 +47,6 @@ LETTER_WIDTH = 0.56
 FLIGHT = 40
 """Pictures of a flight from the source to the target."""
 
-MOVING = 20_000
-"""More splats than this are points while the view moves, so that it follows the mouse."""
-
 PICKING_TOLERANCE = 5e-4
 """Of a click on the surface, as a share of the window's diagonal: about a pixel."""
 
@@ -93,9 +90,11 @@ class Window:
         self.changed: Callable[[], object] = lambda: None
         self._drawn: dict[str, tuple[Any, ...]] = {}
         self._insets: tuple[Any, ...] = ()
+        self._lighter: dict[str, tuple[Any, Any]] = {}
         self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
+        self._samples: int = self.plotter.render_window.GetMultiSamples()
         # Whoever shows the window, or takes its picture, renders it.
         self.plotter.suppress_rendering = True
         self._draw()
@@ -331,6 +330,12 @@ class Window:
         plotter.subplot(0, columns)
         plotter.renderer.AddObserver("StartEvent", self._clear_the_view)
         plotter.render_window.AddObserver("WindowResizeEvent", self._fit_insets)
+        # A button is pressed, the mouse moves, the button is released. A click picks a pixel of the
+        # surface itself, which therefore stays until the mouse moves.
+        for event, names in (("Start", {"discs"}), ("", {"discs", "seen"}), ("End", set[str]())):
+            plotter.iren.style.AddObserver(
+                f"{event}InteractionEvent", lambda *_, names=names: self._draw_lighter(names)
+            )
         return plotter
 
     def _clear_the_view(self, renderer: Any, *_: Any) -> None:
@@ -426,6 +431,7 @@ class Window:
         parts = scene.parts(self.subject, self.pair, self.state, self.picked)
         for name in set(self._drawn) - {part.name for part in parts}:
             self.plotter.remove_actor(name)
+            self._remove_lighter(name)
             del self._drawn[name]
         for part in parts:
             if self._drawn.get(part.name) != part.key:
@@ -434,34 +440,30 @@ class Window:
 
     def _add(self, part: scene.Part) -> None:
         actor = draw.add_part(self.plotter, part)
-        if part.name == "discs":
-            self._draw_lighter_while_moving(actor)
-
-    def _draw_lighter_while_moving(self, actor: Any) -> None:
-        """Let many discs be points while the view moves."""
-        import pyvista
-
+        self._remove_lighter(part.name)
         mesh = actor.mapper.dataset
-        if mesh.n_cells <= MOVING:
-            return
-        step = mesh.n_points // mesh.n_cells
-        points = pyvista.PolyData(np.asarray(mesh.points)[::step])
-        points.point_data["colors"] = mesh.cell_data["colors"]
-        cloud = self.plotter.add_mesh(
-            points, scalars="colors", rgb=True, lighting=False, point_size=3, pickable=False,
-            reset_camera=False, name="moving discs",
-        )  # fmt: skip
-        cloud.visibility = False
+        if part.moving is not None and mesh.n_cells > scene.MOVING:
+            lighter = draw.add_lighter(self.plotter, part.name, part.moving(mesh))
+            self._lighter[part.name] = (actor, lighter)
 
-        def swap(moving: bool) -> None:
-            # Hidden discs are no longer among the window's parts.
-            on_show = "discs" in self._drawn
-            actor.visibility = on_show and not moving
-            cloud.visibility = on_show and moving
+    def _remove_lighter(self, name: str) -> None:
+        if name in self._lighter:
+            _, lighter = self._lighter.pop(name)
+            self.plotter.remove_actor(lighter)
 
-        style = self.plotter.iren.style
-        style.AddObserver("StartInteractionEvent", lambda *_: swap(True))
-        style.AddObserver("EndInteractionEvent", lambda *_: swap(False))
+    def _draw_lighter(self, names: Collection[str]) -> None:
+        """Follow the mouse: draw some large meshes lighter, and edges not smooth; neither if empty.
+
+        Software spends more on smooth edges than on 100,000 discs.
+        """
+        moving = bool(names)
+        for name, (actor, lighter) in self._lighter.items():
+            actor.visibility, lighter.visibility = name not in names, name in names
+        window = self.plotter.render_window
+        if moving:
+            # What the graphics can do is known once they have drawn.
+            self._samples = window.GetMultiSamples() or self._samples
+        window.SetMultiSamples(0 if moving else self._samples)
 
     def _draw_texts(self) -> None:
         pair, state = self.pair, self.state

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from attnwarp.warp import PRESETS
 from attnwarp_eval.cli.main import app
-from attnwarp_eval.inspect import subject
+from attnwarp_eval.inspect import scene, subject
 from attnwarp_eval.inspect.cell import CellReport, cell_of, cell_report
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.pixel import report
@@ -299,6 +299,58 @@ def test_eight_insets_are_whole_and_their_titles_too(window, monkeypatch):
         assert np.ptp(letters_rows) >= 7  # capitals and stems, in pixels
         assert letters_columns.max() < part.shape[1] - 2
     opened.close()
+
+
+def test_while_the_view_moves_large_meshes_are_light_and_a_click_finds_its_pixel(
+    window, monkeypatch
+):
+    monkeypatch.setattr(scene, "MOVING", 400)  # of 1,000 discs and some 3,000 faces
+    window.show(variant="corrected", target="yaw060", coloring="rules", layer=None, splats=True)
+    actors, mouse = window.plotter.renderer.actors, window.plotter.iren.interactor
+    names = ("seen", "moving seen", "discs", "moving discs")
+
+    def visible():
+        return [bool(actors[name].visibility) for name in names]
+
+    assert visible() == [True, False, True, False]
+    samples = window.plotter.render_window.GetMultiSamples()
+    mouse.SetEventInformation(300, 150, 0, 0)
+    mouse.MiddleButtonPressEvent()
+    assert visible() == [True, False, False, True]
+    mouse.SetEventInformation(320, 160, 0, 0)
+    mouse.MouseMoveEvent()
+    assert visible() == [False, True, False, True]
+    assert window.plotter.render_window.GetMultiSamples() == 0
+    window.plotter.render()  # VTK fills a mapper when it draws
+    meshes = {name: actors[name].mapper.dataset for name in names}
+    assert 100 < meshes["moving seen"].n_cells <= 400 < meshes["seen"].n_cells
+    mouse.MiddleButtonReleaseEvent()
+    assert visible() == [True, False, True, False]
+    assert window.plotter.render_window.GetMultiSamples() == samples
+    # Points of the coarse surface are the surface's own, with their colours.
+    every = {tuple(p): tuple(c) for p, c in coloured(meshes["seen"])}
+    coarse = {tuple(p): tuple(c) for p, c in coloured(meshes["moving seen"])}
+    assert coarse.items() <= every.items()
+    # One point a disc, on it.
+    corners = np.asarray(meshes["discs"].points).reshape(1000, -1, 3)
+    assert np.array_equal(meshes["moving discs"].points, corners[:, 0])
+
+    window.show(splats=False)
+    assert "moving discs" not in window.plotter.renderer.actors
+    window.look_through("yaw060")
+    window.plotter.screenshot(return_img=True)
+    window.picked = None
+    click(window, 30.5, 40.5)
+    assert (window.picked.column, window.picked.row) == (30, 40)
+    monkeypatch.undo()
+    window.show(coloring="mask")
+    assert "moving seen" not in window.plotter.renderer.actors
+    window.picked = None
+    window.look_from_outside()
+
+
+def coloured(mesh):
+    return zip(np.asarray(mesh.points).tolist(), mesh.point_data["colors"].tolist(), strict=True)
 
 
 def test_a_flight_ends_at_the_target(window):
