@@ -29,7 +29,7 @@ from attnwarp.editing.command import (
     edit_image,
 )
 from attnwarp.errors import InputWarning
-from attnwarp.process import skip_last_collection
+from attnwarp.process import resend_lost_interrupts, skip_last_collection
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -884,6 +884,7 @@ def main() -> None:
     from attnwarp.errors import missing_extra
 
     skip_last_collection()
+    resend_lost_interrupts()
     try:
         try:
             app()

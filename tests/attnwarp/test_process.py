@@ -1,4 +1,6 @@
-"""The oracle is the interpreter's own count of what its collector leaves alone."""
+"""The oracles are the interpreter's own count of what its collector leaves alone, and its exit by
+KeyboardInterrupt.
+"""
 
 import subprocess
 import sys
@@ -13,3 +15,29 @@ def test_nothing_is_left_to_search_as_the_process_ends():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["0", "False", "True", "True"]
+
+
+def test_an_interrupt_that_a_destructor_swallows_still_ends_the_program():
+    code = (
+        "import signal, sys, time\n"
+        "if sys.argv[1] == 'resent':\n"
+        "    from attnwarp.process import resend_lost_interrupts as resend; resend()\n"
+        "class Freed:\n"
+        "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
+        "class Faulty:\n"
+        "    def __del__(self): raise OSError('another fault')\n"
+        "Faulty()\n"
+        "try:\n"
+        "    Freed(); time.sleep(2 if sys.argv[1] == 'resent' else 0); print('went on')\n"
+        "except KeyboardInterrupt: print('stopped')\n"
+    )
+
+    def outcome(how):
+        return subprocess.run(
+            [sys.executable, "-c", code, how], capture_output=True, text=True, check=True
+        )
+
+    alone, resent = outcome("alone"), outcome("resent")
+    assert (alone.stdout, resent.stdout) == ("went on\n", "stopped\n")
+    assert "KeyboardInterrupt" in alone.stderr and "KeyboardInterrupt" not in resent.stderr
+    assert "another fault" in resent.stderr

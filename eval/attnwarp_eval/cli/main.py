@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from attnwarp.process import skip_last_collection
+from attnwarp.process import resend_lost_interrupts, skip_last_collection
 from attnwarp_eval.cli import (
     cache,
     compare,
@@ -67,6 +67,7 @@ def main() -> None:
     from attnwarp.errors import missing_extra
 
     skip_last_collection()
+    resend_lost_interrupts()
     try:
         try:
             app()
