@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 import typer
 
 from attnwarp.editing.command import (
+    MOST_PIXELS,
     SEGMENTER,
     DeviceOption,
     EditorOption,
@@ -29,7 +30,7 @@ from attnwarp.editing.command import (
     edit_image,
 )
 from attnwarp.errors import InputWarning
-from attnwarp.process import resend_lost_interrupts, skip_last_collection
+from attnwarp.process import asked_to_stop, resend_lost_interrupts, skip_last_collection
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -155,6 +156,11 @@ def fail(message: str) -> typer.Exit:
     """Say what went wrong on stderr; raise what this returns."""
     typer.echo(f"attnwarp: {message}", err=True)
     return typer.Exit(USAGE)
+
+
+def _echo(text: str) -> None:
+    """Say something on stderr."""
+    typer.echo(text, err=True)
 
 
 @contextmanager
@@ -366,7 +372,7 @@ def _fit(
 
     import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT
-    from attnwarp.fit.progress import progress_display
+    from attnwarp.fit.progress import more_points, progress_display
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = _read_views(data, **reading)
@@ -384,7 +390,9 @@ def _fit(
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
-    with _asked_to_stop() as stop, progress_display(title=out.name) as watch:
+    if settings.max_splats is not None and len(start) > settings.max_splats:
+        _echo(more_points(len(start), settings.max_splats))
+    with asked_to_stop(_echo) as stop, progress_display(title=out.name) as watch:
         result = attnwarp.fit.fit(
             start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
             checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
@@ -439,28 +447,6 @@ def _assignments(changes: list[str], options: dict[str, str] = _FIT_OPTIONS) -> 
         except (ValueError, RecursionError):
             values[name] = text
     return values
-
-
-@contextmanager
-def _asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or a polite kill came; a second Ctrl-C stops at once, as it would without
-    this.
-    """
-    asked = False
-
-    def note(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        typer.echo("stopping after this iteration; press Ctrl-C again to leave at once", err=True)
-
-    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
 
 
 def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:
@@ -533,7 +519,11 @@ def edit(
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(min=16, help="Longest side in px to edit at; the editor's own if left out."),
+        typer.Option(
+            min=16,
+            max=MOST_PIXELS,
+            help="Longest side in px to edit at; the editor's own if left out.",
+        ),
     ] = None,
     alone: Annotated[
         bool, typer.Option("--each-view-alone", help="Edit view by view, for comparison.")
@@ -594,7 +584,7 @@ def edit(
             source_picture=source_picture, masks=masks, words=words,
             segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
             threads=threads,
-            say=lambda text: typer.echo(text, err=True),
+            say=_echo,
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")

@@ -5,8 +5,11 @@ from __future__ import annotations
 import _thread
 import atexit
 import gc
+import signal
 import sys
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 RETRY_SECONDS = 0.01
@@ -37,3 +40,27 @@ def resend_lost_interrupts() -> None:
             report(lost)
 
     sys.unraisablehook = resend
+
+
+@contextmanager
+def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or a polite kill came; a second one stops at once, as it would without this.
+
+    Args:
+        say: shows a line to the user.
+    """
+    asked = False
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        say("stopping after this iteration; press Ctrl-C again to leave at once")
+
+    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

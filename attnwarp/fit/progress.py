@@ -24,6 +24,18 @@ def _decibels(value: float) -> str:
     return f"{value:.2f} dB" if math.isfinite(value) else "inf dB"
 
 
+def more_points(count: int, most: int) -> str:
+    """What is said of a start that has more splats than a fit may grow to.
+
+    Example:
+        >>> more_points(5000, 4000)
+        '5000 first points, more than --max-splats 4000: the fit keeps them all and adds none'
+    """
+    return (
+        f"{count} first points, more than --max-splats {most}: the fit keeps them all and adds none"
+    )
+
+
 @contextmanager
 def progress_display(
     console: Console | None = None, *, title: str = "fit"

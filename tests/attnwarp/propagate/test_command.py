@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from base64 import b64decode
 from html.parser import HTMLParser
@@ -134,6 +135,24 @@ def test_without_splats_it_fits_them_first(place, tmp_path):
     assert (tmp_path / "edited.ply").is_file()
 
 
+def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):
+    def interrupt():
+        end = time.monotonic() + 60
+        while not (tmp_path / "fit").is_dir() and time.monotonic() < end:
+            time.sleep(0.05)
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    result = run(place, tmp_path, "--fit-iterations", 100_000, "--store", "cpu")
+    thread.join()
+    assert result.exit_code == 130
+    # Far less than the 30 seconds between two checkpoints have passed.
+    assert (tmp_path / "fit" / "checkpoint.pt").is_file()
+    assert "the same command goes on from it" in result.output
+
+
 def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     masks = tmp_path / "masks"
     masks.mkdir()
@@ -181,14 +200,17 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
         (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
+        (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
+        (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
 )
-def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path):
+def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, monkeypatch):
     ply = () if "--ply" in more else ("--ply", place / "splats.ply")
+    monkeypatch.chdir(place)
     result = run(place, tmp_path / "out", *ply, *more)
     assert result.exit_code == 2
     assert message in result.output
