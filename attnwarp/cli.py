@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
 
 import typer
 
+from attnwarp import __version__
 from attnwarp.editing.command import (
     MOST_PIXELS,
     SEGMENTER,
@@ -60,6 +61,24 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"attnwarp {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options without a command."""
 
 
 class Kind(StrEnum):
@@ -496,7 +515,11 @@ def edit(
     ] = None,
     editor: EditorOption = "small-plain",
     preset: Annotated[
-        Preset, typer.Option(help="The method's choices; see docs/editing-a-scene.md.")
+        Preset,
+        typer.Option(
+            metavar="NAME",
+            help=f"The method's choices: {', '.join(Preset)} (see editing-a-scene.md).",
+        ),
     ] = Preset.corrected,
     source: Annotated[
         str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
@@ -587,7 +610,16 @@ def edit(
             say=_echo,
         )  # fmt: skip
         seconds = sum(result.seconds.values())
-        typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")
+        views = len(result.edited)
+        carried = (
+            f"; {result.counters['injected']:.0%} of the targets' pixels got features of the source"
+            if settings.method == "warp" and views > 1
+            else ""
+        )
+        typer.echo(
+            f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in {seconds:.0f} s"
+            f"{carried}"
+        )
         typer.echo(page)
 
 

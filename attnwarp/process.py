@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import atexit
 import gc
 import signal
@@ -31,11 +30,11 @@ def resend_lost_interrupts() -> None:
     it is printed as ignored and the program goes on. The renderer's memory pool runs one for every
     freed array.
     """
-    report = sys.unraisablehook
+    report, main = sys.unraisablehook, threading.get_ident()
 
     def resend(lost: Any) -> None:
         if issubclass(lost.exc_type, KeyboardInterrupt):
-            threading.Timer(RETRY_SECONDS, _thread.interrupt_main).start()
+            threading.Timer(RETRY_SECONDS, signal.pthread_kill, (main, signal.SIGINT)).start()
         else:
             report(lost)
 

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 def describe(step: Step) -> str:
     """One line of figures."""
     held = "" if step.held_out is None else f", held out {_decibels(step.held_out)}"
+    if held and step.evaluated not in (None, step.iteration):
+        held += f" at {step.evaluated}"
     return f"loss {step.loss:.4f}, PSNR {_decibels(step.psnr)}{held}, {step.splats} splats"
 
 

@@ -4,6 +4,12 @@ KeyboardInterrupt.
 
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+import attnwarp.cli
 
 
 def test_nothing_is_left_to_search_as_the_process_ends():
@@ -28,7 +34,7 @@ def test_an_interrupt_that_a_destructor_swallows_still_ends_the_program():
         "    def __del__(self): raise OSError('another fault')\n"
         "Faulty()\n"
         "try:\n"
-        "    Freed(); time.sleep(2 if sys.argv[1] == 'resent' else 0); print('went on')\n"
+        "    Freed(); time.sleep(60 if sys.argv[1] == 'resent' else 0); print('went on')\n"
         "except KeyboardInterrupt: print('stopped')\n"
     )
 
@@ -41,3 +47,11 @@ def test_an_interrupt_that_a_destructor_swallows_still_ends_the_program():
     assert (alone.stdout, resent.stdout) == ("went on\n", "stopped\n")
     assert "KeyboardInterrupt" in alone.stderr and "KeyboardInterrupt" not in resent.stderr
     assert "another fault" in resent.stderr
+
+
+def test_the_command_tells_its_version():
+    """Oracle: the project's own file."""
+    root = Path(__file__).parents[2]
+    version = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
+    done = CliRunner().invoke(attnwarp.cli.app, ["--version"])
+    assert (done.exit_code, done.output) == (0, f"attnwarp {version}\n")

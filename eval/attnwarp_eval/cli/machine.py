@@ -209,6 +209,8 @@ def pictures() -> Check:
     """Mitsuba, and which of its variants renders."""
     from attnwarp_eval.truth import llvm
 
+    # The first call of variant() puts its own choice into this variable.
+    named = os.environ.get("ATTNWARP_MITSUBA")
     variant = llvm.variant()
     version = _version("mitsuba")
     if variant == llvm.LLVM:
@@ -224,7 +226,7 @@ def pictures() -> Check:
             f"no true picture can be made: {problem or printed}",
             "apt install libatomic1, or install attnwarp[eval] again",
         )
-    if os.environ.get("ATTNWARP_MITSUBA"):
+    if named:
         return Check("true pictures", "ok", f"Mitsuba {version}, {variant} by ATTNWARP_MITSUBA")
     return Check(
         "true pictures",

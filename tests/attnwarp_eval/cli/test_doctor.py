@@ -12,6 +12,7 @@ from attnwarp_eval.cli import machine
 from attnwarp_eval.cli.doctor import lines
 from attnwarp_eval.cli.machine import Check
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.truth import llvm
 
 COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main"]
 
@@ -26,6 +27,27 @@ def test_what_is_needed_works_here_and_each_lack_has_its_cost_and_remedy():
         assert checks[name].state == "ok", checks[name]
     for check in checks.values():
         assert bool(check.cost) == bool(check.remedy) == (check.state != "ok")
+
+
+def test_a_missing_llvm_is_a_lack_unless_the_user_names_a_variant(tmp_path, monkeypatch):
+    monkeypatch.delenv("ATTNWARP_MITSUBA", raising=False)
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "none.so"))
+    try:
+        for named, state in ((None, "lack"), ("scalar_rgb", "ok")):
+            llvm.variant.cache_clear()
+            if named:
+                monkeypatch.setenv("ATTNWARP_MITSUBA", named)
+            check = machine.pictures()
+            assert (check.state, "scalar_rgb" in check.text) == (state, True)
+            assert ("ATTNWARP_MITSUBA" in check.text) == bool(named)
+    finally:
+        llvm.variant.cache_clear()
+
+
+def test_the_command_tells_the_version_that_the_doctor_has():
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.exit_code == 0
+    assert f"attnwarp {done.output.split()[1]}" in machine.versions().text
 
 
 def test_lines_fit_a_terminal_of_80_columns():
