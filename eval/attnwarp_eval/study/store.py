@@ -74,7 +74,7 @@ class Store:
     def lock(self) -> Iterator[None]:
         """Hold the folder against a second run that would write to it."""
         if self.root.exists() and not self.root.is_dir():
-            raise InputError(
+            raise StoreError(
                 f"{self.root}: is a file, expected a run's folder (made if need be); choose another"
                 " name"
             )
