@@ -233,6 +233,23 @@ def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
     assert "name another folder" in result.output
 
 
+def test_a_damaged_view_of_a_cut_off_edit_is_made_again_as_its_message_says(place, tmp_path):
+    """Oracle: the bytes of the whole edit."""
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path, *ply).exit_code == 0
+    view = next(iter(sorted((tmp_path / "views").glob("*.png"))))
+    names = (view, tmp_path / "edited.ply")
+    whole = [path.read_bytes() for path in names]
+    view.write_bytes(whole[0][:40])
+    (tmp_path / "result.json").unlink()
+    result = run(place, tmp_path, *ply)
+    assert result.exit_code == 2
+    assert f"missing or damaged; remove {view.stem}.json beside it" in result.output
+    view.with_suffix(".json").unlink()
+    assert run(place, tmp_path, *ply).exit_code == 0
+    assert [path.read_bytes() for path in names] == whole
+
+
 def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):
     ply = ("--ply", place / "splats.ply")
     masks = tmp_path / "masks"
