@@ -50,6 +50,25 @@ def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
         )
 
 
+def instance(value: Any, kind: type, name: str, expected: str) -> None:
+    """Raise TypeError unless ``value`` is an instance of ``kind``.
+
+    Args:
+        value: of the argument.
+        kind: what it has to be.
+        name: of the argument.
+        expected: the kind for the reader, as it is imported.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.instance("corrected", dict, "settings", "a dictionary")
+        Traceback (most recent call last):
+        TypeError: settings: got str, expected a dictionary
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"{name}: got {type(value).__name__}, expected {expected}")
+
+
 def number(value: Any, low: float, high: float, name: str, *, whole: bool = False) -> None:
     """Raise ValueError unless ``value`` is a finite number in [low, high], whole if asked.
 

@@ -5,6 +5,15 @@ from __future__ import annotations
 import atexit
 import gc
 import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+RETRY_SECONDS = 0.01
+"""Pause before a lost interrupt is sent again: the destructor that lost it is left by then."""
 
 
 def skip_last_collection() -> None:
@@ -24,3 +33,45 @@ def core_count() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def resend_lost_interrupts() -> None:
+    """Send Ctrl-C again where a destructor has swallowed it.
+
+    Python raises KeyboardInterrupt in whatever runs. Out of a destructor no exception leaves, so
+    it is printed as ignored and the program goes on. The renderer's memory pool runs one for every
+    freed array.
+    """
+    report, main = sys.unraisablehook, threading.get_ident()
+
+    def resend(lost: Any) -> None:
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            threading.Timer(RETRY_SECONDS, signal.pthread_kill, (main, signal.SIGINT)).start()
+        else:
+            report(lost)
+
+    sys.unraisablehook = resend
+
+
+@contextmanager
+def asked_to_stop(say: Callable[[str], None]) -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C or a polite kill came; a second one stops at once, as it would without this.
+
+    Args:
+        say: shows a line to the user.
+    """
+    asked = False
+
+    def note(number: int, frame: Any) -> None:
+        nonlocal asked
+        if asked:
+            raise KeyboardInterrupt
+        asked = True
+        say("stopping after this iteration; press Ctrl-C again to leave at once")
+
+    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -8,7 +8,7 @@ import torch
 
 from attnwarp.baselines import METHODS, Baseline
 from attnwarp.baselines.settings import BaselineSettings, Budget
-from attnwarp.editing.small import load_editor, thread_count
+from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.fit import load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset
@@ -51,6 +51,7 @@ def edit_dataset(
     black = torch.zeros(3)
     images = [views.target(k, black).numpy() for k in range(len(views))]
     editor = load_editor(editor_name, device=device)
+    check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)

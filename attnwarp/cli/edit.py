@@ -21,8 +21,9 @@ from attnwarp.cli.options import (
     ResizeOption,
     Store,
 )
-from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
+from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
 from attnwarp.editing.command import (
+    MOST_PIXELS,
     SEGMENTER,
     DeviceOption,
     EditorOption,
@@ -53,7 +54,11 @@ def edit(
     ] = None,
     editor: EditorOption = "small-plain",
     preset: Annotated[
-        Preset, typer.Option(help="The method's choices; see docs/editing-a-scene.md.")
+        Preset,
+        typer.Option(
+            metavar="NAME",
+            help=f"The method's choices: {', '.join(Preset)} (see editing-a-scene.md).",
+        ),
     ] = Preset.corrected,
     source: Annotated[
         str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
@@ -76,7 +81,11 @@ def edit(
     ] = None,
     size: Annotated[
         int | None,
-        typer.Option(min=16, help="Longest side in px to edit at; the editor's own if left out."),
+        typer.Option(
+            min=16,
+            max=MOST_PIXELS,
+            help="Longest side in px to edit at; the editor's own if left out.",
+        ),
     ] = None,
     alone: Annotated[
         bool, typer.Option("--each-view-alone", help="Edit view by view, for comparison.")
@@ -137,8 +146,17 @@ def edit(
             source_picture=source_picture, masks=masks, words=words,
             segmenter=segmenter or SEGMENTER, max_size=max_size, store=store.value, device=device,
             threads=threads,
-            say=lambda text: typer.echo(text, err=True),
+            say=echo,
         )  # fmt: skip
         seconds = sum(result.seconds.values())
-        typer.echo(f"{out / 'edited.ply'}: {len(result.edited)} edited views in {seconds:.0f} s")
+        views = len(result.edited)
+        carried = (
+            f"; {result.counters['injected']:.0%} of the targets' pixels got features of the source"
+            if settings.method == "warp" and views > 1
+            else ""
+        )
+        typer.echo(
+            f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in {seconds:.0f} s"
+            f"{carried}"
+        )
         typer.echo(page)

@@ -20,14 +20,8 @@ from attnwarp.cli.options import (
     MissingOption,
     ResizeOption,
 )
-from attnwarp.cli.shell import (
-    STOPPED,
-    asked_to_stop,
-    assignments,
-    check_out,
-    clear_errors,
-    use_threads,
-)
+from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, echo, use_threads
+from attnwarp.process import asked_to_stop
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
@@ -163,7 +157,7 @@ def _fit(
 
     import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT
-    from attnwarp.fit.progress import progress_display
+    from attnwarp.fit.progress import more_points, progress_display
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = read_views(data, **reading)
@@ -181,7 +175,9 @@ def _fit(
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
-    with asked_to_stop() as stop, progress_display(title=out.name) as watch:
+    if settings.max_splats is not None and len(start) > settings.max_splats:
+        echo(more_points(len(start), settings.max_splats))
+    with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
         result = attnwarp.fit.fit(
             start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
             checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 
+from attnwarp import __version__
 from attnwarp.cli.baseline import baseline
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
@@ -14,7 +16,7 @@ from attnwarp.cli.inspect import inspect
 from attnwarp.cli.render import render
 from attnwarp.cli.shell import CLOSED_PIPE, clear_errors, closed_pipe, fail, file_error
 from attnwarp.editing.command import edit_image
-from attnwarp.process import skip_last_collection
+from attnwarp.process import resend_lost_interrupts, skip_last_collection
 
 app = typer.Typer(
     name="attnwarp",
@@ -31,6 +33,25 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"attnwarp {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options without a command."""
+
+
 app.command()(fit)
 app.command()(edit)
 app.command()(render)
@@ -46,6 +67,7 @@ def main() -> None:
     from attnwarp.errors import missing_extra
 
     skip_last_collection()
+    resend_lost_interrupts()
     try:
         try:
             app()

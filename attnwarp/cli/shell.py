@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,11 @@ def fail(message: str) -> typer.Exit:
     """Say what went wrong on stderr; raise what this returns."""
     typer.echo(f"attnwarp: {message}", err=True)
     return typer.Exit(USAGE)
+
+
+def echo(text: str) -> None:
+    """Say something on stderr."""
+    typer.echo(text, err=True)
 
 
 @contextmanager
@@ -136,25 +141,3 @@ def assignments(changes: list[str], options: dict[str, str]) -> dict[str, Any]:
         except (ValueError, RecursionError):
             values[name] = text
     return values
-
-
-@contextmanager
-def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C or a polite kill came; a second Ctrl-C stops at once, as it would without
-    this.
-    """
-    asked = False
-
-    def note(number: int, frame: Any) -> None:
-        nonlocal asked
-        if asked:
-            raise KeyboardInterrupt
-        asked = True
-        typer.echo("stopping after this iteration; press Ctrl-C again to leave at once", err=True)
-
-    handlers = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)

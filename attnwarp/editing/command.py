@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 TILE_COLUMNS = 5
 
+MOST_PIXELS = 4096
+"""Longest side that an edit works at; more is a typing error that would take all the memory."""
+
 SEGMENTER = "clip-small"
 """What ``--where`` asks if ``--segmenter`` is left out."""
 
@@ -47,7 +50,11 @@ def edit_image(
     steps: Annotated[int, typer.Option(min=1, max=1000, help="Of denoising.")] = 20,
     size: Annotated[
         int | None,
-        typer.Option(min=16, help="Longest side to work at in px; the editor's own if left out."),
+        typer.Option(
+            min=16,
+            max=MOST_PIXELS,
+            help="Longest side to work at in px; the editor's own if left out.",
+        ),
     ] = None,
     text_guidance: Annotated[
         float | None, typer.Option(help="How much the words count; the editor's if left out.")
@@ -75,6 +82,8 @@ def edit_image(
             raise ValueError(f"{path}: expected a name that ends in .png")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
+        if path is not None and path.exists() and picture.exists() and path.samefile(picture):
+            raise ValueError(f"{path}: is the picture to edit; choose another name for the result")
     image = _read(picture)
 
     import numpy as np
@@ -82,13 +91,14 @@ def edit_image(
 
     from attnwarp.editing.editor import edit
     from attnwarp.editing.segment import load_segmenter
-    from attnwarp.editing.small import load_editor, thread_count
+    from attnwarp.editing.small import check_instruction, load_editor, thread_count
 
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     model = load_editor(editor, device=device, **given)
     if model.guide != "picture":
         raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
+    check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
     image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)
     h, w = image.shape[:2]
@@ -131,6 +141,8 @@ def _read(path: Path) -> Image:
     import cv2
     import numpy as np
 
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder, expected a PNG or JPEG picture")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected a PNG or JPEG picture")
     pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.editing.attention import CONTROLNET_BRANCHES
-from attnwarp.editing.editor import Guide, Image, Latent, tensor_of
+from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Image, Latent, tensor_of
 
 
 def control_image(depth: npt.NDArray[Any]) -> Image:
@@ -65,6 +65,7 @@ class DepthControlNet(Latent):
         negative_prompt: str = "",
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        check.number(guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "guidance")
         self.controlnet = controlnet.eval().requires_grad_(False)
         self.guidance, self.control_scale = guidance, control_scale
         self.negative_prompt = negative_prompt

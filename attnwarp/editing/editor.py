@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +20,9 @@ Image = npt.NDArray[np.float32]
 Guide = Literal["picture", "depth"]
 
 STEPS = 20
+
+MOST_GUIDANCE = 1000.0
+"""Bound of guidance weights; those in use are below 20."""
 
 
 class Task(Protocol):
@@ -260,16 +264,21 @@ class Latent:
         pictures = (sample.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
         return list(pictures.cpu().numpy())
 
+    def check_text(self, text: str) -> None:
+        """Raise ValueError for a text that is longer than the encoder takes."""
+        limit = self.tokenizer.model_max_length
+        length = len(self.tokenizer(text, verbose=False).input_ids)
+        if length > limit:
+            raise ValueError(
+                f"prompt: {textwrap.shorten(text, 60)!r} has {length} tokens, the text encoder"
+                f" takes {limit}; shorten it"
+            )
+
     def embed(self, texts: Sequence[str]) -> Tensor:
         """(N, L, D) embeddings; a text longer than the encoder takes is refused."""
         limit = self.tokenizer.model_max_length
         for text in texts:
-            length = len(self.tokenizer(text).input_ids)
-            if length > limit:
-                raise ValueError(
-                    f"prompt: {text!r} has {length} tokens, the text encoder takes {limit};"
-                    " shorten it"
-                )
+            self.check_text(text)
         codes = self.tokenizer(
             list(texts), padding="max_length", max_length=limit, return_tensors="pt"
         ).input_ids

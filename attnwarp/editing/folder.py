@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
@@ -30,9 +31,10 @@ def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict
     """UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler of a folder.
 
     Raises:
-        InputError: files that are missing, by name, or that cannot be read.
+        InputError: no such device; files that are missing, by name, or that cannot be read.
     """
     require_diffusers()
+    device_of(device)
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected a model in diffusers' format")

@@ -11,8 +11,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from attnwarp import check
 from attnwarp.editing.attention import PIX2PIX_BRANCHES
-from attnwarp.editing.editor import Guide, Latent, tensor_of
+from attnwarp.editing.editor import MOST_GUIDANCE, Guide, Latent, tensor_of
 
 
 class InstructPix2Pix(Latent):
@@ -39,6 +40,8 @@ class InstructPix2Pix(Latent):
         image_guidance: float = 1.5,
     ) -> None:
         super().__init__(unet, vae, text_encoder, tokenizer, scheduler)
+        check.number(text_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "text_guidance")
+        check.number(image_guidance, -MOST_GUIDANCE, MOST_GUIDANCE, "image_guidance")
         self.text_guidance, self.image_guidance = text_guidance, image_guidance
 
     @classmethod

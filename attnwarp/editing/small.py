@@ -6,10 +6,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.errors import InputError, suggest
+from attnwarp.errors import InputError, InputWarning, suggest
 from attnwarp.process import core_count
 
 if TYPE_CHECKING:
@@ -84,6 +86,45 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
         return asked
     small = sum(p.numel() for p in editor.unet.parameters()) < ONE_THREAD_PARAMETERS
     return 1 if small else core_count()
+
+
+def check_instruction(name: str, editor: InstructPix2Pix | DepthControlNet, text: str) -> None:
+    """Refuse an instruction that an editor cannot take, and warn of words that it was not trained
+    on.
+
+    Args:
+        name: of the editor, as :func:`load_editor` takes it.
+        editor: the loaded one.
+        text: the instruction.
+
+    Raises:
+        InputError: no words.
+        ValueError: more words than the text encoder takes.
+    """
+    if not text.strip():
+        raise InputError("instruction: is empty, expected words such as 'make it red'")
+    editor.check_text(text)
+    unknown = unknown_words(editor, text) if name in bundled() else []
+    if unknown:
+        warnings.warn(
+            f"instruction: the editor {name!r} was not trained on {', '.join(map(repr, unknown))},"
+            f" so the result may have nothing to do with it; {WEIGHTS / name / 'card.md'} says what"
+            " it can do",
+            InputWarning,
+            stacklevel=2,
+        )
+
+
+def unknown_words(editor: Any, text: str) -> list[str]:
+    """Words that a bundled editor was not trained on: its tokenizer has a token for each word of
+    the training texts, and takes others apart.
+
+    Example:
+        >>> unknown_words(load_editor("small-plain"), "make the bear furious and red")
+        ['furious']
+    """
+    words = dict.fromkeys(re.findall(r"[^\W\d_]+", text))
+    return [word for word in words if len(editor.tokenizer.tokenize(word)) > 1]
 
 
 def guide_of(name_or_folder: str) -> Guide:

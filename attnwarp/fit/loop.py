@@ -76,6 +76,7 @@ class Step:
         held_out: PSNR at the last evaluation, dB, or None.
         splats: their number.
         seconds: spent on iterations.
+        evaluated: iteration of that evaluation.
 
     Example:
         >>> from attnwarp.fit import Step
@@ -91,6 +92,7 @@ class Step:
     held_out: float | None
     splats: int
     seconds: float
+    evaluated: int | None = None
 
 
 @dataclass(eq=False)
@@ -366,15 +368,16 @@ class _Run:
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain
 
     def step(self) -> Step:
-        held = self.history[-1].psnr if self.history else None
+        last = self.history[-1] if self.history else None
         return Step(
             self.iteration,
             self.settings.iterations,
             self.loss,
             losses.psnr_of_mse(self.error),
-            held,
+            last.psnr if last else None,
             len(self.model),
             self.seconds,
+            last.iteration if last else None,
         )
 
     def background(self, *, fitting: bool) -> Tensor:

@@ -17,11 +17,25 @@ if TYPE_CHECKING:
 def describe(step: Step) -> str:
     """One line of figures."""
     held = "" if step.held_out is None else f", held out {_decibels(step.held_out)}"
+    if held and step.evaluated not in (None, step.iteration):
+        held += f" at {step.evaluated}"
     return f"loss {step.loss:.4f}, PSNR {_decibels(step.psnr)}{held}, {step.splats} splats"
 
 
 def _decibels(value: float) -> str:
     return f"{value:.2f} dB" if math.isfinite(value) else "inf dB"
+
+
+def more_points(count: int, most: int) -> str:
+    """What is said of a start that has more splats than a fit may grow to.
+
+    Example:
+        >>> more_points(5000, 4000)
+        '5000 first points, more than --max-splats 4000: the fit keeps them all and adds none'
+    """
+    return (
+        f"{count} first points, more than --max-splats {most}: the fit keeps them all and adds none"
+    )
 
 
 @contextmanager

@@ -37,7 +37,7 @@ def extent_of(cameras: Sequence[Camera]) -> float:
     """
     centers = np.stack([camera.position for camera in cameras])
     radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-    return 1.1 * radius if radius > 1e-9 * max(1.0, float(np.abs(centers).max())) else 1.0
+    return 1.1 * radius if radius > 1e-12 * max(1.0, float(np.abs(centers).max())) else 1.0
 
 
 def from_points(
@@ -132,6 +132,9 @@ def random_points(
         count: of points, at least 1.
         seed: of positions and colours.
 
+    Raises:
+        ValueError: all cameras stand at one point.
+
     Returns:
         points: (count, 3) world coordinates.
         colors: (count, 3) uint8, at random.
@@ -162,6 +165,11 @@ def random_points(
     else:
         focus = middle + extent_of(cameras) * forward.mean(0)
     half = float(np.linalg.norm(centers - focus, axis=1).mean())
+    if half <= 1e-9 * max(1.0, float(np.abs(centers).max())):
+        raise ValueError(
+            "cameras: got cameras that all stand at one place and look different ways, so nothing"
+            " says how far the scene is; expected first points (ply_file_path, or COLMAP's)"
+        )
     random = np.random.default_rng(seed)
     points = focus + half * random.uniform(-1, 1, (count, 3))
     return points, random.integers(0, 256, (count, 3), dtype=np.uint8)

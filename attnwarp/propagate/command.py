@@ -13,11 +13,12 @@ import torch
 
 from attnwarp.camera import Camera
 from attnwarp.editing.segment import load_segmenter, segments_of
-from attnwarp.editing.small import load_editor, thread_count
+from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, progress, random_points
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
+from attnwarp.process import asked_to_stop
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
 from attnwarp.propagate.progress import progress_display
@@ -27,6 +28,10 @@ from attnwarp.propagate.settings import PropagateSettings
 FIT_FOLDER = "fit"
 
 FIRST_POINTS = 10_000
+
+COLORED = 0.1
+"""Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
+named as a mask by mistake."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +99,21 @@ def edit_dataset(
     """
     if masks is not None and words is not None:
         raise InputError("--where: got --masks too, expected one of the two")
+    if words is not None and not words.strip():
+        raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
     black = torch.zeros(3)
     images = [views.target(k, black).numpy() for k in range(len(views))]
     segments = None if masks is None else _masks(masks, views.cameras)
+    editor = load_editor(editor_name, device=device)
+    check_instruction(editor_name, editor, instruction)
     if words is not None:
         by_words = load_segmenter(segmenter, device=device)
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
         segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
         segments = [segment(k, image) for k, image in enumerate(images)]
     by_hand = None if source_picture is None else _rgb(read_image(source_picture))
-    editor = load_editor(editor_name, device=device)
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
@@ -156,9 +164,15 @@ def _fitted(
         say(f"no points in the data: the fit begins with {FIRST_POINTS} random ones")
         points, colors = random_points(views.cameras, FIRST_POINTS, seed=seed)
     start = from_points(points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
+    say(f"no --ply: fitting splats to {len(views)} views first: {folder}")
+    if len(start) > plan.max_splats:
+        say(progress.more_points(len(start), plan.max_splats))
     folder.mkdir(parents=True, exist_ok=True)
-    with progress.progress_display(title="fit") as watch:
-        return fit(start, views, settings, folder=folder, watch=watch).gaussians
+    with asked_to_stop(say) as stop, progress.progress_display(title="fit") as watch:
+        result = fit(start, views, settings, folder=folder, watch=watch, stop=stop)
+    if result.stopped == "asked":
+        raise KeyboardInterrupt
+    return result.gaussians
 
 
 def _view_of(cameras: Any, name: str | None) -> int:
@@ -193,7 +207,12 @@ def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
     import cv2
 
     pixels = read_image(path)
-    bright = pixels[..., :3].mean(axis=-1) / np.iinfo(pixels.dtype).max
+    top = np.iinfo(pixels.dtype).max
+    if np.ptp(pixels[..., :3], axis=-1).max() > COLORED * top:
+        raise InputError(
+            f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
+        )
+    bright = pixels[..., :3].mean(axis=-1) / top
     size = (camera.width, camera.height)
     if bright.shape != size[::-1]:
         bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)

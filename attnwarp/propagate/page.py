@@ -26,7 +26,8 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .25em .7em; text-align: right; border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { text-align: left; } th { background: var(--soft); }
 .row { display: flex; flex-wrap: wrap; gap: .6rem; margin: .3em 0 1em; }
-figure { margin: 0; width: 180px; } img { width: 100%; border-radius: 4px; image-rendering: auto; }
+figure { margin: 0; width: min(180px, calc(50% - .3rem)); }
+img { width: 100%; border-radius: 4px; image-rendering: auto; }
 figcaption { font-size: .82em; opacity: .8; }
 """
 
@@ -56,7 +57,9 @@ def write_page(folder: Folder) -> Path:
         ),
         *_chain(folder, source, chain, about),
         "<h2>Edited views</h2>",
-        f"<p>{min(len(targets), MOST_ROWS)} of {len(targets)}; the folder has all.</p>",
+        f"<p>{MOST_ROWS} of {len(targets)}; the folder has all.</p>"
+        if len(targets) > MOST_ROWS
+        else "",
     ]
     for name in _spread(targets, MOST_ROWS):
         parts += [

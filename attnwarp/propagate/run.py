@@ -23,7 +23,7 @@ from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
-from attnwarp.io import write_ply
+from attnwarp.io import FileFormatError, write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, Target, ViewEditor
 from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, digest
 from attnwarp.propagate.pictures import (
@@ -336,7 +336,7 @@ class _Run:
         if self.folder.has(record):
             file = "source.png" if not before else f"views/{name}.png"
             pixels = to_bytes(self._composite(view, source.picture))
-            if not np.array_equal(pixels, self.folder.read_picture(file)):
+            if not np.array_equal(pixels, self._read(file)):
                 raise InputError(
                     f"{self.folder.path}: the source's edit is not the one in {file}; go on"
                     " with the same device, number of threads and versions, or name another folder"
@@ -583,7 +583,19 @@ class _Run:
     def _edited(self, view: int) -> Bytes:
         source = view == self.plan.source
         name = "source.png" if source else f"views/{self.names[view]}.png"
-        return self.folder.read_picture(name)
+        return self._read(name)
+
+    def _read(self, name: str) -> Bytes:
+        """A picture that this edit wrote earlier."""
+        try:
+            return self.folder.read_picture(name)
+        except (FileFormatError, FileNotFoundError):
+            path = self.folder.path / name
+            raise FileFormatError(
+                path,
+                f"missing or damaged; remove {path.with_suffix('.json').name} beside it, and the"
+                " same command edits the view again",
+            ) from None
 
     # --- what is left for people
 

@@ -230,10 +230,8 @@ def render(
         >>> round(float(view.depth[24, 32]), 4)
         3.0
     """
-    if not isinstance(gaussians, Gaussians):
-        raise TypeError(f"gaussians: got {type(gaussians).__name__}, expected attnwarp.Gaussians")
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: got {type(camera).__name__}, expected attnwarp.Camera")
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    check.instance(camera, Camera, "camera", "attnwarp.Camera")
     check.one_of(backend, BACKENDS, "backend")
     chosen = ("cuda" if gaussians.means.is_cuda else "cpu") if backend == "auto" else backend
     inputs = _prepare(

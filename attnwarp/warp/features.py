@@ -53,6 +53,7 @@ class FeatureWarp:
         Args:
             features: (C, h, w) or (B, C, h, w) floating, of any size: :func:`attnwarp.warp.sample`.
         """
+        check.instance(features, Tensor, "features", "torch.Tensor")
         if features.ndim not in (3, 4) or not features.dtype.is_floating_point:
             return sampling.sample(features, self.correspondence)[0]  # says what is wrong
         taps = self._taps_for(features, *features.shape[-2:])

@@ -81,7 +81,13 @@ class WarpedView:
         Args:
             size: (h, w) of the target's features.
             source_size: (h, w) of the source's; by default at the same fraction of its image.
+
+        Raises:
+            ValueError: a size that is no pair, or below 1.
         """
+        for name, value in (("size", size), ("source_size", source_size)):
+            if value is not None and (not hasattr(value, "__len__") or len(value) != 2):
+                raise ValueError(f"{name}: got {value!r}, expected (height, width)")
         source, target = self.correspondence.source, self.correspondence.target
         source_size = layer_size(source, target, size) if source_size is None else source_size
         key = (*size, *source_size)
@@ -269,6 +275,10 @@ def warp_view(
         >>> view.mask[8, 8].item(), view.at((4, 4)).mask.shape
         (True, torch.Size([4, 4]))
     """
+    check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
+    check.instance(source, Camera, "source", "attnwarp.Camera")
+    check.instance(target, Camera, "target", "attnwarp.Camera")
+    check.instance(settings, WarpSettings, "settings", "WarpSettings, such as PRESETS['corrected']")
     keep = gaussian_filter(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
     )

@@ -1,9 +1,16 @@
-"""The oracle is the interpreter's own count of what its collector leaves alone."""
+"""The oracles are the interpreter's own count of what its collector leaves alone, and its exit by
+KeyboardInterrupt.
+"""
 
 import os
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
+from typer.testing import CliRunner
+
+import attnwarp.cli.main
 from attnwarp.process import core_count
 
 
@@ -29,3 +36,37 @@ def test_cores_are_those_that_this_process_may_use(monkeypatch):
     # As on macOS.
     monkeypatch.delattr(os, "sched_getaffinity")
     assert core_count() == os.cpu_count()
+
+
+def test_an_interrupt_that_a_destructor_swallows_still_ends_the_program():
+    code = (
+        "import signal, sys, time\n"
+        "if sys.argv[1] == 'resent':\n"
+        "    from attnwarp.process import resend_lost_interrupts as resend; resend()\n"
+        "class Freed:\n"
+        "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
+        "class Faulty:\n"
+        "    def __del__(self): raise OSError('another fault')\n"
+        "Faulty()\n"
+        "try:\n"
+        "    Freed(); time.sleep(60 if sys.argv[1] == 'resent' else 0); print('went on')\n"
+        "except KeyboardInterrupt: print('stopped')\n"
+    )
+
+    def outcome(how):
+        return subprocess.run(
+            [sys.executable, "-c", code, how], capture_output=True, text=True, check=True
+        )
+
+    alone, resent = outcome("alone"), outcome("resent")
+    assert (alone.stdout, resent.stdout) == ("went on\n", "stopped\n")
+    assert "KeyboardInterrupt" in alone.stderr and "KeyboardInterrupt" not in resent.stderr
+    assert "another fault" in resent.stderr
+
+
+def test_the_command_tells_its_version():
+    """Oracle: the project's own file."""
+    root = Path(__file__).parents[2]
+    version = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
+    done = CliRunner().invoke(attnwarp.cli.main.app, ["--version"])
+    assert (done.exit_code, done.output) == (0, f"attnwarp {version}\n")

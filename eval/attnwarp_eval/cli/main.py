@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
 
+from attnwarp import __version__
 from attnwarp.cli.shell import CLOSED_PIPE, USAGE, closed_pipe
-from attnwarp.process import skip_last_collection
+from attnwarp.process import resend_lost_interrupts, skip_last_collection
 from attnwarp_eval.cli import (
     cache,
     compare,
@@ -40,6 +42,26 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"attnwarp-eval {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options without a command."""
+
+
 for command in (
     run.run,
     run.report,
@@ -65,6 +87,7 @@ def main() -> None:
     from attnwarp.errors import missing_extra
 
     skip_last_collection()
+    resend_lost_interrupts()
     try:
         try:
             app()

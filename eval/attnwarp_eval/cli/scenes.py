@@ -56,8 +56,7 @@ def render(
         int | None, typer.Option(min=1, help="Samples a pixel, not the scene's.")
     ] = None,
 ) -> None:
-    """Render a scene's truth from its cameras: pictures, depth, normals, and one sheet of them
-    all."""
+    """Render a scene's truth from its cameras: pictures, depth, normals, one sheet of all."""
     with clear_errors():
         from attnwarp_eval.scene.file import load_scene
         from attnwarp_eval.truth.show import render_views
@@ -88,9 +87,7 @@ def export(
     ] = 0.5,
     seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
 ) -> None:
-    """Write a scene as transforms.json, images and points: what `attnwarp fit` and other programs
-    read.
-    """
+    """Write a scene as transforms.json, images and points, which `attnwarp fit` reads."""
     with clear_errors():
         import attnwarp_eval.splats.export
         from attnwarp_eval.scene.file import load_scene
@@ -142,9 +139,7 @@ def effects(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder of --all.")] = Path("runs/effects"),
 ) -> None:
-    """Which light transport a scene needs, how it is rendered, what that saves, and a proof that
-    nothing is lost.
-    """
+    """Which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
 
     if every == (scene is not None):
@@ -203,9 +198,7 @@ def accuracy(
     ] = Path("runs/accuracy"),
     rounds: Annotated[int, typer.Option(min=3, help="Of every timing.")] = 7,
 ) -> None:
-    """Error of the truth itself against time: samples a pixel, Mitsuba's variant, float64
-    refinement, visibility.
-    """
+    """Error of the truth itself against time, by samples, variant, refinement, visibility."""
     with clear_errors():
         from attnwarp_eval.experiments.accuracy import measure
         from attnwarp_eval.experiments.accuracy.write import write
@@ -271,9 +264,7 @@ def time_(
         bool, typer.Option("--json", help="JSON, with every scene's stages.")
     ] = False,
 ) -> None:
-    """How long the truth takes from nothing (an empty cache of its own): meshes, geometry,
-    pictures.
-    """
+    """How long meshes, geometry and pictures take from nothing (an empty cache)."""
     import json
 
     from rich.console import Console

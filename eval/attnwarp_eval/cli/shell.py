@@ -58,7 +58,10 @@ def clear_errors() -> Iterator[None]:
 
 def file_error(error: OSError) -> str:
     """An error of the file system, with the remedy."""
-    if error.errno is None:  # such as dask's timeouts, which have no text: no file is at fault
+    if isinstance(error, FileNotFoundError | FileExistsError | IsADirectoryError):
+        if error.errno is None:  # raised by the library, whose message has the remedy
+            return str(error)
+    elif error.errno is None:  # such as dask's timeouts, which have no text: no file is at fault
         text = f"{type(error).__name__}: {error}".removesuffix(": ")
         return f"a connection between processes failed ({text}); run the same command again"
     path = f"{error.filename}: " if error.filename else ""

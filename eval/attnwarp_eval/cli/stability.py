@@ -28,8 +28,9 @@ def stability(
 ) -> None:
     """Sweep numerically hard inputs until the numerics break. Exit code 1 if one breaks too early.
 
-    Without options the study `stability` is run and its report written; killed half-way and started
-    again, it goes on where it was.
+    Without options the study `stability` runs and writes its report.
+
+    Killed half-way and started again, it goes on where it was.
     """
     from attnwarp_eval import stability
 

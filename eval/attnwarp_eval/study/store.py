@@ -73,6 +73,11 @@ class Store:
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the folder against a second run that would write to it."""
+        if self.root.exists() and not self.root.is_dir():
+            raise StoreError(
+                f"{self.root}: is a file, expected a run's folder (made if need be); choose another"
+                " name"
+            )
         self.root.mkdir(parents=True, exist_ok=True)
         self.refuse_links()
         path = self.root / ".lock"

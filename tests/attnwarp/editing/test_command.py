@@ -113,20 +113,34 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
         ({"picture": "text.png"}, "text.png: cannot be read as a picture"),
         ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
         ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
-        ({"segmenter": "clip-small"}, "--segmenter: needs --where, the words that it looks for"),
+        ({"more": ("--segmenter", "clip-small")}, "--segmenter: needs --where, the words that it"),
+        ({"picture": "."}, "is a folder, expected a PNG or JPEG picture"),
+        ({"out": "photo.png"}, "photo.png: is the picture to edit; choose another name"),
+        ({"instruction": " "}, "instruction: is empty, expected words such as 'make it red'"),
+        ({"instruction": "make it red " * 40}, "prompt: 'make it red make it red"),
+        ({"more": ("--device", "gpu")}, "device 'gpu': unknown, expected cpu or cuda"),
+        ({"more": ("--text-guidance", "nan")}, "text_guidance: got nan, expected a number"),
     ],
 )
 def test_what_cannot_be_used_is_one_clear_line(change, message, folder, photo, tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     picture = tmp_path / change["picture"] if "picture" in change else photo[0]
-    segmenter = ("--segmenter", change["segmenter"]) if "segmenter" in change else ()
+    before = photo[0].read_bytes()
     result = run(
-        picture, "--instruction", "a bear", "--editor", change.get("editor", folder), "--out", tmp_path / change.get("out", "a.png"),
-        *segmenter,
+        picture, "--instruction", change.get("instruction", "a bear"), "--editor", change.get("editor", folder), "--out",
+        tmp_path / change.get("out", "a.png"), *change.get("more", ()),
     )  # fmt: skip
     assert result.exit_code == 2
     assert message in result.output
     assert len(result.output.strip().splitlines()) == 1
+    assert photo[0].read_bytes() == before
+
+
+def test_a_size_beyond_all_memory_is_refused_as_it_is_typed(folder, photo, tmp_path):
+    result = run(
+        photo[0], "--instruction", "a bear", "--editor", folder, "--out", tmp_path / "a.png", "--size", 100_000,
+    )  # fmt: skip
+    assert result.exit_code == 2 and "--size" in result.output
 
 
 def test_a_missing_extra_is_one_clear_line(folder, photo, tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """The bundled editors as they ship: sizes, cards, and diffusers' own pipeline on the same folder."""
 
 import shutil
+import warnings
 
 import numpy as np
 import pytest
@@ -17,11 +18,12 @@ from attnwarp.editing.small import (
     TEXT_GUIDANCE,
     WEIGHTS,
     bundled,
+    check_instruction,
     check_sums,
     guide_of,
     load_editor,
 )
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWarning")
 
@@ -78,3 +80,17 @@ def test_a_bundled_editor_with_a_flipped_bit_is_refused_by_the_files_name(name, 
         InputError, match="diffusion_pytorch_model.safetensors: is missing or damaged"
     ):
         check_sums(folder)
+
+
+def test_words_that_no_training_text_has_are_named_and_no_others():
+    """Oracle: the words that the card and the shipped scenes' edits use, and invented ones."""
+    editor = load_editor("small-plain")
+    with pytest.warns(InputWarning, match="not trained on 'zorgoblatt', 'Sphinx', so"):
+        check_instruction(
+            "small-plain", editor, "make the bear zorgoblatt and turn it into the Sphinx"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        for text in ("Make the ground snow!", "turn the man into bronze, at night", "striped"):
+            check_instruction("small-plain", editor, text)
+        check_instruction("a/folder", editor, "zorgoblatt")

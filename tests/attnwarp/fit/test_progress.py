@@ -22,6 +22,11 @@ def test_a_step_is_described_by_its_loss_and_psnr():
     )
 
 
+def test_an_older_evaluation_is_named_by_its_iteration():
+    assert describe(step(900, evaluated=500)).split(", ")[2] == "held out 33.20 dB at 500"
+    assert describe(step(500, evaluated=500)).split(", ")[2] == "held out 33.20 dB"
+
+
 def test_without_a_terminal_there_are_plain_lines_now_and_then():
     text = io.StringIO()
     with progress_display(Console(file=text, force_terminal=False), title="bear") as watch:

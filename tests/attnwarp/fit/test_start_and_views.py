@@ -214,3 +214,10 @@ def test_a_point_far_astray_costs_the_others_no_digits():
     g = from_points([*points, [1e9, 0, 0]], kind="3d")
     # float32 keeps 1e-7 of the few units that the others lie from their median.
     np.testing.assert_allclose(g.world_means()[:50], points, atol=1e-6)
+
+
+def test_cameras_at_one_place_that_look_different_ways_are_refused():
+    view = dict(width=8, height=8, fov_y=40)
+    cameras = [Camera.look_at((4, 0, 1), end, **view) for end in ((9, 0, 1), (4, 5, 1), (4, -5, 1))]
+    with pytest.raises(ValueError, match="cameras that all stand at one place"):
+        random_points(cameras, 10)

@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from base64 import b64decode
 from html.parser import HTMLParser
@@ -134,6 +135,24 @@ def test_without_splats_it_fits_them_first(place, tmp_path):
     assert (tmp_path / "edited.ply").is_file()
 
 
+def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):
+    def interrupt():
+        end = time.monotonic() + 60
+        while not (tmp_path / "fit").is_dir() and time.monotonic() < end:
+            time.sleep(0.05)
+        time.sleep(0.3)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    result = run(place, tmp_path, "--fit-iterations", 100_000, "--store", "cpu")
+    thread.join()
+    assert result.exit_code == 130
+    # Far less than the 30 seconds between two checkpoints have passed.
+    assert (tmp_path / "fit" / "checkpoint.pt").is_file()
+    assert "the same command goes on from it" in result.output
+
+
 def test_a_mask_and_a_picture_by_hand_are_read_from_files(place, tmp_path):
     masks = tmp_path / "masks"
     masks.mkdir()
@@ -181,14 +200,17 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--set", "a0=3"), "a0: got 3, expected a number in [0, 1]"),
         (("--masks", "nowhere"), "--masks: nowhere/v0.png is missing"),
         (("--masks", ".", "--where", "bear"), "--where: got --masks too, expected one of the two"),
+        (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
+        (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
 )
-def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path):
+def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, monkeypatch):
     ply = () if "--ply" in more else ("--ply", place / "splats.ply")
+    monkeypatch.chdir(place)
     result = run(place, tmp_path / "out", *ply, *more)
     assert result.exit_code == 2
     assert message in result.output
@@ -209,6 +231,23 @@ def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
     assert result.exit_code == 2
     assert 'instruction ("a bear", now "a robot")' in result.output
     assert "name another folder" in result.output
+
+
+def test_a_damaged_view_of_a_cut_off_edit_is_made_again_as_its_message_says(place, tmp_path):
+    """Oracle: the bytes of the whole edit."""
+    ply = ("--ply", place / "splats.ply")
+    assert run(place, tmp_path, *ply).exit_code == 0
+    view = next(iter(sorted((tmp_path / "views").glob("*.png"))))
+    names = (view, tmp_path / "edited.ply")
+    whole = [path.read_bytes() for path in names]
+    view.write_bytes(whole[0][:40])
+    (tmp_path / "result.json").unlink()
+    result = run(place, tmp_path, *ply)
+    assert result.exit_code == 2
+    assert f"missing or damaged; remove {view.stem}.json beside it" in result.output
+    view.with_suffix(".json").unlink()
+    assert run(place, tmp_path, *ply).exit_code == 0
+    assert [path.read_bytes() for path in names] == whole
 
 
 def test_a_refused_edit_leaves_the_masks_of_the_edit_that_is_there(place, tmp_path):

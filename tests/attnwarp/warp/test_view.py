@@ -246,6 +246,24 @@ def test_a_rule_says_what_it_needs():
         warp_surfaces(camera, camera, Surface(depth), Surface(depth), PRESETS["released"])
 
 
+def test_a_mistaken_argument_is_named_with_what_was_expected():
+    disc, camera = shell(50), orbit(0, size=8)
+    for change, message in (
+        ({"gaussians": "splats.ply"}, "gaussians: got str, expected attnwarp.Gaussians"),
+        ({"source": 0}, "source: got int, expected attnwarp.Camera"),
+        ({"target": None}, "target: got NoneType, expected attnwarp.Camera"),
+        ({"settings": "corrected"}, "settings: got str, expected WarpSettings, such as PRESETS"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            warp_view(**{"gaussians": disc, "source": camera, "target": camera, **change})
+    view = warp_view(disc, camera, camera)
+    for size in (64, (4,), (4, 4, 4)):
+        with pytest.raises(ValueError, match=r"size: got .*, expected \(height, width\)"):
+            view.at(size)
+    with pytest.raises(TypeError, match="features: got ndarray, expected torch.Tensor"):
+        view.at((4, 4)).warp(np.zeros((3, 4, 4), np.float32))
+
+
 def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():
     source, target = orbit(0, size=64), orbit(10, size=64)
     depth = plane_depth(target, (1, 0, 0), 0.0)

@@ -12,6 +12,7 @@ from attnwarp_eval.cli import machine
 from attnwarp_eval.cli.doctor import lines
 from attnwarp_eval.cli.machine import Check
 from attnwarp_eval.cli.main import app
+from attnwarp_eval.truth import llvm
 
 COMMAND = [sys.executable, "-m", "attnwarp_eval.cli.main"]
 
@@ -28,20 +29,25 @@ def test_what_is_needed_works_here_and_each_lack_has_its_cost_and_remedy():
         assert bool(check.cost) == bool(check.remedy) == (check.state != "ok")
 
 
-@pytest.mark.slow
-def test_a_machine_without_llvm_is_told_so_unless_it_asked_for_none():
-    environment = os.environ | {"DRJIT_LIBLLVM_PATH": os.devnull}
-    states = {}
-    for chosen in ("", "scalar_rgb"):
-        done = subprocess.run(
-            [*COMMAND, "doctor", "--json"],
-            capture_output=True,
-            text=True,
-            env=environment | {"ATTNWARP_MITSUBA": chosen},
-        )
-        states[chosen] = {c["name"]: c["state"] for c in json.loads(done.stdout)}
-    assert states[""]["true pictures"] == "lack"
-    assert states["scalar_rgb"]["true pictures"] == "ok"
+def test_a_missing_llvm_is_a_lack_unless_the_user_names_a_variant(tmp_path, monkeypatch):
+    monkeypatch.delenv("ATTNWARP_MITSUBA", raising=False)
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "none.so"))
+    try:
+        for named, state in ((None, "lack"), ("scalar_rgb", "ok")):
+            llvm.variant.cache_clear()
+            if named:
+                monkeypatch.setenv("ATTNWARP_MITSUBA", named)
+            check = machine.pictures()
+            assert (check.state, "scalar_rgb" in check.text) == (state, True)
+            assert ("ATTNWARP_MITSUBA" in check.text) == bool(named)
+    finally:
+        llvm.variant.cache_clear()
+
+
+def test_the_command_tells_the_version_that_the_doctor_has():
+    done = CliRunner().invoke(app, ["--version"])
+    assert done.exit_code == 0
+    assert f"attnwarp {done.output.split()[1]}" in machine.versions().text
 
 
 def test_lines_fit_a_terminal_of_80_columns():

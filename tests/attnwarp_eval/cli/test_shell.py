@@ -91,5 +91,7 @@ def test_an_error_of_a_connection_does_not_blame_the_disk():
     assert file_error(TimeoutError()) == (
         "a connection between processes failed (TimeoutError); run the same command again"
     )
+    missing = FileNotFoundError("runs/a.png: the folder runs does not exist; make it first")
+    assert file_error(missing) == str(missing)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/study.json")
     assert file_error(full).startswith("run/study.json: No space left on device; check the path")

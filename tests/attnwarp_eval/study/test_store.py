@@ -77,6 +77,15 @@ def test_a_folder_of_cells_that_is_a_link_is_refused(tmp_path):
         pass
 
 
+def test_a_file_in_place_of_a_runs_folder_is_named_and_left_alone(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text("name: mine")
+    message = "study.yaml: is a file, expected a run's folder"
+    with pytest.raises(StoreError, match=message), Store(path).lock():
+        pass
+    assert path.read_text() == "name: mine"
+
+
 def test_a_record_reads_back_as_written(tmp_path):
     store = Store(tmp_path)
     store.write(record())
