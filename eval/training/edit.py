@@ -124,16 +124,15 @@ def sheet(
     import torch
 
     from attnwarp.editing.small import load_editor
+    from training import editor_sheets
     from training.editing_pairs import load_pairs
     from training.editor_assess import answers_of
-    from training.editor_sheets import sheet as draw
-    from training.editor_sheets import write_sheet
 
     torch.set_num_threads(1)
     editor = load_editor(str(weights / name), text_guidance=1.5, image_guidance=1.0)
     size = editor.unet.config.sample_size * editor.factor
-    picture = draw(answers_of(editor), load_pairs(data, "edit-test"), size=size)
-    typer.echo(write_sheet(picture, to / f"{name}.png"))
+    picture = editor_sheets.sheet(answers_of(editor), load_pairs(data, "edit-test"), size=size)
+    typer.echo(editor_sheets.write_sheet(picture, to / f"{name}.png"))
 
 
 if __name__ == "__main__":

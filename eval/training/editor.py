@@ -21,8 +21,7 @@ from tokenizers import Tokenizer
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
 from attnwarp.errors import InputError
-from training import editor_pool, steps
-from training.assemblies import KINDS as ASSEMBLIES
+from training import assemblies, editor_pool, steps
 from training.byte_pairs import learn_byte_pairs
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -206,7 +205,7 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
     split = PAIR_SPLITS["edit-train"]
     corpus = []
     drawn = [edit_looks(k, split)[0] for k in range(worlds)]
-    things = len(OBJECTS) + len(ASSEMBLIES) * len(PARTS)
+    things = len(OBJECTS) + len(assemblies.KINDS) * len(PARTS)
     for k in range(count):
         looks, thing = drawn[k % worlds], k % things
         kind = list(KINDS)[int(rng.integers(len(KINDS)))]

@@ -247,7 +247,7 @@ def warped_figure(
     For each noise the target's colours at points that the source sees are compared with the source's
     (CIEDE2000). A world counts where the difference's 95 % interval over noises (Student's t) is above 0.
     """
-    from scipy.stats import t as student
+    from scipy import stats
 
     swap, cases = Swap(editor), cases_of(worlds, size)
     pairs = [(a, b) for a, b in itertools.pairwise(cases) if a.world == b.world][:count]
@@ -267,7 +267,7 @@ def warped_figure(
                 for a, r, w in zip(run_a, right, wrong, strict=True)
             ]
         )
-        margin = student.ppf(0.975, noises - 1) * gain.std(ddof=1) / noises**0.5
+        margin = stats.t.ppf(0.975, noises - 1) * gain.std(ddof=1) / noises**0.5
         clear.append(bool(gain.mean() > margin))
     return figure(
         "the true warp is clearly better than one displaced by an eighth", clear,

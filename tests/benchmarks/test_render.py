@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
+import benchmarks.render
 from attnwarp.render import render
-from benchmarks import render as bench
 
 
 def _cases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -18,7 +18,7 @@ def _cases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_fit_agrees_with_scipy_in_factors_and_intervals() -> None:
     x, z, y = _cases()
-    result = bench.fit({"x": x.tolist(), "z": z.tolist()}, y.tolist())
+    result = benchmarks.render.fit({"x": x.tolist(), "z": z.tolist()}, y.tolist())
     assert result is not None
     factors, covariance = optimize.curve_fit(
         lambda d, a, b: a * d[0] + b * d[1], np.stack([x, z]), y, sigma=y
@@ -34,13 +34,13 @@ def test_fit_agrees_with_scipy_in_factors_and_intervals() -> None:
 
 def test_fit_refuses_what_cases_do_not_determine() -> None:
     x, z, y = (part.tolist() for part in _cases())
-    assert bench.fit({"x": x[:2], "z": z[:2]}, y[:2]) is None
-    assert bench.fit({"x": x, "again": [3 * v for v in x]}, y) is None
+    assert benchmarks.render.fit({"x": x[:2], "z": z[:2]}, y[:2]) is None
+    assert benchmarks.render.fit({"x": x, "again": [3 * v for v in x]}, y) is None
 
 
 def test_a_row_is_worked_out_from_its_measurements() -> None:
     """By hand: shares are medians of the rounds' own quotients, not a quotient of medians."""
-    case = bench.Case(
+    case = benchmarks.render.Case(
         "3d",
         512,
         50_000,
@@ -52,7 +52,7 @@ def test_a_row_is_worked_out_from_its_measurements() -> None:
         peak=[1e11, 2e11, 1e11],
         counters={"pairs": 8_000_000, "composited": 6_000_000, "contributing": 5_000_000},
     )
-    row = bench.row(case)
+    row = benchmarks.render.row(case)
     # 1 / (time x peak): 1e-9, 2.5e-10 and 2.5e-10; times 45 operations a pair.
     assert row["fma_share"] == pytest.approx(0.09, abs=1e-9)
     assert row["fma_share_composited"] == pytest.approx(0.0675, abs=1e-9)
@@ -64,8 +64,8 @@ def test_a_row_is_worked_out_from_its_measurements() -> None:
 
 def test_a_small_run_ends_in_a_table() -> None:
     sizes = [(16, 40), (16, 80), (32, 40), (32, 160), (48, 100)]
-    cases = [bench.Case("2d", size, count, 0.1) for size, count in sizes]
-    result = bench.run(cases, rounds=1, gsplat=0)
+    cases = [benchmarks.render.Case("2d", size, count, 0.1) for size, count in sizes]
+    result = benchmarks.render.run(cases, rounds=1, gsplat=0)
     assert [row["splats"] for row in result["cases"]] == [count for _, count in sizes]
     for case, row in zip(cases, result["cases"], strict=True):
         assert 0 < row["contributing"] <= row["composited"] <= row["pairs"]
@@ -73,7 +73,7 @@ def test_a_small_run_ends_in_a_table() -> None:
         # Rounded to four digits behind the point.
         assert row["fma_share"] == pytest.approx(45 * row["pairs"] / (seconds * peak), abs=6e-5)
         assert 0 < row["forward_bytes"] < row["forward_backward_bytes"]
-    text = bench.table(result)
+    text = benchmarks.render.table(result)
     assert "ns a pair" in text and "bytes a splat" in text and "by pairs alone" in text
 
 
@@ -81,5 +81,7 @@ def test_a_small_run_ends_in_a_table() -> None:
 def test_hardly_a_pair_is_computed_where_a_splat_does_not_show(kind) -> None:
     """Squares are listed by exact outlines: few splats are worked on at 16 pixels and drawn to none
     of them. (That none is left out is what the comparisons with the reference show.)"""
-    counters = render(bench.scene(kind, 500, 0.1), bench.camera(128), backend="cpu").counters
+    counters = render(
+        benchmarks.render.scene(kind, 500, 0.1), benchmarks.render.camera(128), backend="cpu"
+    ).counters
     assert counters["composited"] <= counters["pairs"] <= 1.05 * counters["composited"]

@@ -6,7 +6,7 @@ import importlib.util
 
 import pytest
 
-from benchmarks import study as bench
+from benchmarks import study
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_a_stack_belongs_to_the_first_part_that_names_one_of_its_functions(stack
 
     def call(names):
         if not names:
-            return bench.part_of(bench.sys._getframe())
+            return study.part_of(study.sys._getframe())
         module, name = names[0].split(":")
         scope = {"__name__": module, "call": call, "rest": names[1:]}
         exec(f"def {name}(): return call(rest)", scope)
@@ -37,7 +37,7 @@ def test_a_stack_belongs_to_the_first_part_that_names_one_of_its_functions(stack
 
 
 def test_the_parts_name_modules_that_exist():
-    for _, beginnings in bench.PARTS:
+    for _, beginnings in study.PARTS:
         for beginning in beginnings:
             module = beginning.partition(":")[0].rstrip(".")
             module = module.replace("importlib._bootstrap", "importlib")

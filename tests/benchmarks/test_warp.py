@@ -5,28 +5,28 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks import warp as bench
+from benchmarks import warp
 
 
 def test_a_small_run_ends_in_a_table() -> None:
     cases = [
-        bench.pair_case(64),
-        bench.tokens_case(8, 16, torch.float32, others=True),
-        bench.tokens_case(8, 16, torch.bfloat16, others=False),
+        warp.pair_case(64),
+        warp.tokens_case(8, 16, torch.float32, others=True),
+        warp.tokens_case(8, 16, torch.bfloat16, others=False),
     ]
-    result = bench.run(cases, rounds=2)
+    result = warp.run(cases, rounds=2)
     copies = [row for row in result["rows"] if row["contestant"] == "copy"]
     assert [row["bytes"] for row in copies] == [2 * 2 * 64 * 16 * size for size in (4, 2)]
     assert all(row["bandwidth_share"] == pytest.approx(1) for row in copies)
     assert all(0 < row["taps"] <= 4 * 2 * 64 * 16 for row in copies)
     assert all(0 < row["wall_best_ms"] <= row["wall_ms"] for row in result["rows"])
-    text = bench.table(result)
+    text = warp.table(result)
     assert "grid_sample" in text and "kornia" in text and "bfloat16" in text
     assert len(text.splitlines()) == 4 + len(result["rows"])
 
 
 def test_the_contestants_warp_alike() -> None:
-    work = bench.tokens_case(16, 4, torch.float32, others=True).contestants
+    work = warp.tokens_case(16, 4, torch.float32, others=True).contestants
     tokens, maps, definition, sampled, kornia = (
         work[name]() for name in ("tokens", "maps", "definition", "grid_sample", "kornia")
     )

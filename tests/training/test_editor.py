@@ -18,7 +18,7 @@ from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError
 from training import editing_pairs, editor, editor_draws, editor_injection, steps
 from training.data import SPLITS
-from training.edit import app as recipe
+from training.edit import app
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -216,7 +216,7 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
     ],
 )
 def test_an_unknown_stage_or_device_is_refused_by_name(words, reason):
-    result = CliRunner().invoke(recipe, words)
+    result = CliRunner().invoke(app, words)
     assert result.exit_code == 2
     assert reason in " ".join(result.output.replace("│", " ").split())
 

@@ -5,7 +5,7 @@ import torch
 from typer.testing import CliRunner
 
 from training.common import Run
-from training.edit import app as recipe
+from training.edit import app
 from training.log import Entry, append, log_path, read_log, table
 
 
@@ -49,11 +49,11 @@ def test_the_table_has_what_each_stage_took_and_the_mean_of_its_last_losses(tmp_
     assert table([path]).splitlines()[2:] == [
         "| `drawn` | 2,000 | 80 | 25.0 | loss 0 4.5000, loss 1 0.2500 |"
     ]
-    printed = CliRunner().invoke(recipe, ["stages", "--out", str(tmp_path)])
+    printed = CliRunner().invoke(app, ["stages", "--out", str(tmp_path)])
     assert printed.exit_code == 0 and printed.stdout.strip() == table([path])
 
 
 def test_a_folder_without_a_log_is_refused_by_name(tmp_path):
-    result = CliRunner().invoke(recipe, ["stages", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["stages", "--out", str(tmp_path)])
     assert result.exit_code == 2
     assert "no log of a stage" in " ".join(result.output.replace("│", " ").split())

@@ -14,8 +14,7 @@ from attnwarp.encoders.base import PerceptualDistance, TextImageEncoder, TokenEn
 from attnwarp.encoders.bundled import WEIGHTS, load
 from attnwarp.errors import InputError
 from training import assess
-from training.data import Pictures as Shown
-from training.data import Split, looks_of, render_world
+from training.data import Pictures, Split, looks_of, render_world
 
 NAMES = ("clip-small", "dino-small", "perceptual-small")
 
@@ -35,7 +34,7 @@ def _rendered(split):
         for seed in seeds
         for image, shown, view, look in render_world(seed, split)
     ]
-    return Shown(*(np.array(column) for column in zip(*rows, strict=True)))
+    return Pictures(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 @pytest.fixture(scope="module")

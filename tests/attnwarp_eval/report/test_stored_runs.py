@@ -20,8 +20,8 @@ from attnwarp_eval.report import write_report
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store
-from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.run import verify
 from attnwarp_eval.study.store import StoreError
 
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
@@ -29,7 +29,7 @@ DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 
 @pytest.fixture(autouse=True)
 def scenes_of_direct_light(monkeypatch):
-    monkeypatch.setattr(runner, "load_scene", direct)
+    monkeypatch.setattr("attnwarp_eval.study.run.load_scene", direct)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def folder(tmp_path_factory):
 def test_ids_records_and_reports_are_the_bytes_that_they_were(folder, name):
     store = Store(folder / name)
     # The ids follow from the study, the scenes and the protocols of today.
-    problems = runner.verify(store)
+    problems = verify(store)
     assert problems.ok, problems
     assert problems.checked == {"variants": 16, "edits": 2}[name]
     for cell in store.done():
@@ -72,7 +72,7 @@ def test_swapped_labels_are_found_without_a_seal_and_refused_with_one(folder, tm
     first, second = [cell for cell in sealed["cells"] if cell["probe"] == "warp"][:2]
     first["variants"], second["variants"] = second["variants"], first["variants"]
     path.write_text(json.dumps(sealed))
-    problems = runner.verify(store)
+    problems = verify(store)
     assert not problems.sealed
     assert len(problems.damaged) == 2
     for line, cell in zip(
@@ -85,10 +85,10 @@ def test_swapped_labels_are_found_without_a_seal_and_refused_with_one(folder, tm
 
     first["variants"], second["variants"] = second["variants"], first["variants"]
     store.write_study(sealed)
-    assert runner.verify(store).ok and runner.verify(store).sealed
+    assert verify(store).ok and verify(store).sealed
     text = path.read_text()
     path.write_text(text.replace(first["variants"][0], "better"))
-    for command in (runner.verify, write_report):
+    for command in (verify, write_report):
         with pytest.raises(StoreError, match="checksum does not fit"):
             command(store)
 
@@ -130,7 +130,7 @@ def _another_scene(cells):
 def test_a_former_run_whose_scenes_have_changed_is_read_and_a_wrong_label_in_it_is_refused(
     folder, tmp_path, monkeypatch, load, damage
 ):
-    monkeypatch.setattr(runner, "load_scene", load)
+    monkeypatch.setattr("attnwarp_eval.study.run.load_scene", load)
     shutil.copytree(folder / "variants", tmp_path / "run")
     store = Store(tmp_path / "run")
     assert read_results(store).measured == 16

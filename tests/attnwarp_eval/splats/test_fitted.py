@@ -12,7 +12,7 @@ from attnwarp.io import read_dataset
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.splats import export, fitted
-from attnwarp_eval.study import run as runner
+from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.study.study import StudyError, load_study
 from attnwarp_eval.truth import Geometry
@@ -136,8 +136,8 @@ def finished(tmp_path_factory):
     (folder / "small.yaml").write_text(STUDY)
     study = load_study(str(folder / "small.yaml"))
     store = Store(folder / "run")
-    planned = runner.plan(study, store)
-    summary = runner.execute(planned, store)
+    planned = plan(study, store)
+    summary = execute(planned, store)
     assert summary.complete, summary.failures
     write_report(store)
     return planned, store

@@ -13,7 +13,7 @@ import yaml
 
 from attnwarp_eval.report.results import lines, read_results
 from attnwarp_eval.study import load_study
-from attnwarp_eval.study import run as runner
+from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.store import Store
 
 STUDY = {
@@ -63,7 +63,7 @@ def finish(folder, run):
     """The lines of results.jsonl of the run, gone on with in this process."""
     store = Store(run)
     with store.lock():
-        summary = runner.execute(runner.plan(load_study(str(folder / "study.yaml")), store), store)
+        summary = execute(plan(load_study(str(folder / "study.yaml")), store), store)
     assert summary.complete
     return list(lines(read_results(store), timings=False))
 

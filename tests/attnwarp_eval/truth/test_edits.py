@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+import attnwarp_eval.truth.edits
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.scene import edits
 from attnwarp_eval.scene.base import linear_rgb
@@ -13,7 +14,6 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene, SceneError
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.truth import Geometry, appearance
-from attnwarp_eval.truth import edits as shown
 from attnwarp_eval.truth.shading import object_albedo
 
 SIX = ["bear", "dinosaur", "face", "garden", "person", "stump"]
@@ -58,7 +58,10 @@ def test_edits_are_no_part_of_the_scene_that_they_edit(name):
 def test_an_edit_leaves_shapes_and_every_other_object_as_they_were(name):
     scene = shipped(name)
     for edit, answer in results(scene):
-        edited, touched = scene.edited(edit.name, answer), shown.touched(scene, edit.name, answer)
+        edited, touched = (
+            scene.edited(edit.name, answer),
+            attnwarp_eval.truth.edits.touched(scene, edit.name, answer),
+        )
         light = (edits.pick(edit, answer) or edit).lights
         assert bool(touched) != (light is not None)
         assert (edited.spec.lights == scene.spec.lights) == (light is None)
@@ -96,7 +99,7 @@ def test_outside_the_edited_object_the_albedo_is_identical_and_inside_it_is_not(
             for s, g in ((scene, before), (edited, after))
         )
         same = (a == b).all(-1)
-        mask = shown.edit_mask(scene, edit, hits, answer)[seen]
+        mask = attnwarp_eval.truth.edits.edit_mask(scene, edit, hits, answer)[seen]
         if scene.edit(edit).lights:
             assert mask.all() and same.all()
         else:

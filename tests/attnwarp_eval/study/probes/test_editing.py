@@ -19,12 +19,12 @@ from attnwarp_eval.compare.snapshot import read_snapshot
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
-from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.budgets import Spent, Stopwatch
 from attnwarp_eval.study.edit_truth import pair_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import editing, probe
 from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.work import compute
 
 STUDY = {
@@ -121,9 +121,9 @@ def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_na
 ):
     monkeypatch.setitem(EDITING_METHODS, "true pictures", planned([None, "red", "red", "red"]))
     study, store = load(folder), Store(tmp_path / "run")
-    summary = runner.execute(runner.plan(study, store), store)
+    summary = execute(plan(study, store), store)
     assert summary.complete, summary.failures
-    cell = next(c for c in runner.plan(study, store).cells if c.probe == "editing")
+    cell = next(c for c in plan(study, store).cells if c.probe == "editing")
     record = store.read_as(cell.id, probe("editing").read)
     assert not record.extra.source.done
     for name in ("multiview.same_answer.edit", "multiview.delta_e_above.edit_inside"):
@@ -171,8 +171,8 @@ def test_seconds_are_in_the_record_and_not_in_the_report_without_timings(
         )  # fmt: skip
         monkeypatch.setitem(EDITING_METHODS, "true pictures", slow)
         study, store = load(folder), Store(tmp_path / str(seconds))
-        assert runner.execute(runner.plan(study, store), store).complete
-        records = [store.read(cell.id) for cell in runner.plan(study, store).cells]
+        assert execute(plan(study, store), store).complete
+        records = [store.read(cell.id) for cell in plan(study, store).cells]
         assert [r["cost"]["seconds"].get("whole") for r in records] == [None, seconds]
         write_report(store, timings=False)
         reports.append([(store.root / n).read_bytes() for n in ("report.md", "results.jsonl")])
@@ -274,10 +274,10 @@ def test_the_seconds_of_another_variant_are_the_limit_and_the_report_names_who_d
         probes={"editing": ["equal time", "reference"]},
     )
     store = Store(tmp_path / "run")
-    planned_run = runner.plan(study, store)
+    planned_run = plan(study, store)
     # The reference's own cell comes last, and runs a third time.
     times = itertools.chain(times, iter([7.0]))
-    assert runner.execute(planned_run, store).complete
+    assert execute(planned_run, store).complete
     assert given == [Budget(2.5, None)]
     cell = next(c for c in planned_run.cells if c.variant == "equal time")
     record = store.read_as(cell.id, probe("editing").read)

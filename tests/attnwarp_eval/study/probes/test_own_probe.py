@@ -16,8 +16,8 @@ import attnwarp_eval
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, load_study
-from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.probes import probes, register, unregister
+from attnwarp_eval.study.run import execute, plan, verify
 
 YAWS = (30, 90)
 STUDY = {
@@ -58,13 +58,13 @@ def chord(yaw):
 
 def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path):
     study, store = load(tmp_path), Store(tmp_path / "run")
-    planned = runner.plan(study, store)
+    planned = plan(study, store)
     assert [(c.probe, c.labels) for c in planned.cells] == [
         ("calibration", ("calibration",)),
         ("chord", ("plain", "same")),
         ("chord", ("double",)),
     ]
-    summary = runner.execute(planned, store)
+    summary = execute(planned, store)
     assert summary.complete, summary.failures
     plain, double = (store.read(cell.id) for cell in planned.cells[1:])
     for record, stretch in ((plain, 1), (double, 2)):
@@ -73,7 +73,7 @@ def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path
         assert chords == pytest.approx(expected, rel=1e-12)
         assert record["longest"] == {"target": "yaw090", "chord": pytest.approx(expected[1])}
     assert [p["what"] for p in double["pictures"]] == ["grey"]
-    assert runner.verify(store).ok
+    assert verify(store).ok
 
     write_report(store, timings=False)
     names = ("report.md", "report.html", "results.jsonl")
@@ -86,9 +86,9 @@ def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path
     assert {line["also"][0] for line in lines if line["variant"] == "plain"} == {"same"}
 
     store.path(planned.cells[2].id).unlink()
-    resumed = runner.plan(study, store)
+    resumed = plan(study, store)
     assert [cell.labels for cell in resumed.todo] == [("double",)]
-    assert runner.execute(resumed, store).complete
+    assert execute(resumed, store).complete
     write_report(store, timings=False)
     assert {name: (store.root / name).read_bytes() for name in names} == before
 
@@ -119,8 +119,8 @@ def test_without_it_its_keys_are_unknown(tmp_path):
 def test_a_figure_that_its_metrics_do_not_specify_costs_the_cell(tmp_path, monkeypatch):
     monkeypatch.setattr(Chord, "metrics", {})
     store = Store(tmp_path / "run")
-    planned = runner.plan(load(tmp_path), store)
-    summary = runner.execute(planned, store)
+    planned = plan(load(tmp_path), store)
+    summary = execute(planned, store)
     assert [failure.probe for failure in summary.failures] == ["chord", "chord"]
     assert "gives 'chord.length', which its metrics do not specify" in summary.failures[0].error
 

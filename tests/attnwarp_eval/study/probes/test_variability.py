@@ -11,10 +11,10 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
-from attnwarp_eval.study import run as runner
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.run import execute, plan
 
 VIEWS = ("source", "yaw015", "yaw030", "yaw120")
 SEEDS = [3, 4, 5]
@@ -66,13 +66,13 @@ def study_of(folder, **changes):
 def measured(folder, tmp_path_factory):
     """(records by variant, the run's folder)."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, plan in PLANS.items():
-            patch.setitem(EDITING_METHODS, name, planned(plan))
+        for name, answers in PLANS.items():
+            patch.setitem(EDITING_METHODS, name, planned(answers))
         study, store = study_of(folder), Store(tmp_path_factory.mktemp("run"))
-        summary = runner.execute(runner.plan(study, store), store)
+        summary = execute(plan(study, store), store)
         assert summary.complete, summary.failures
         write_report(store)
-        cells = [c for c in runner.plan(study, store).cells if c.probe == "variability"]
+        cells = [c for c in plan(study, store).cells if c.probe == "variability"]
     reader = probe("variability").read
     return {cell.variant: store.read_as(cell.id, reader) for cell in cells}, store.root
 
