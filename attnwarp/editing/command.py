@@ -137,7 +137,7 @@ def _stderr() -> Any:
 
 
 def _read(path: Path) -> Image:
-    """(H, W, 3) sRGB in [0, 1]."""
+    """(H, W, 3) sRGB in [0, 1]; transparent pixels are laid over black, as in a scene's edit."""
     import cv2
     import numpy as np
 
@@ -148,7 +148,12 @@ def _read(path: Path) -> Image:
     pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if pixels is None:
         raise ValueError(f"{path}: cannot be read as a picture; expected PNG or JPEG")
-    return pixels[..., ::-1].astype(np.float32) / np.float32(255)
+    rgb = pixels[..., ::-1].astype(np.float32) / np.float32(255)
+    # The first reading turns a picture by its EXIF tag, and drops the alpha that this one keeps.
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored.dtype.kind == "u" and stored.shape == (*rgb.shape[:2], 4):
+        rgb *= stored[..., 3:].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    return rgb
 
 
 def _fit(image: Image, longest: int, multiple: int) -> Image:

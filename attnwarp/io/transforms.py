@@ -395,6 +395,10 @@ def _read_json(path: Path) -> Any:
         raise
     except RecursionError:
         raise FileFormatError(path, "not JSON: brackets are nested too deeply") from None
+    except UnicodeDecodeError:
+        raise FileFormatError(
+            path, "not JSON, and no text; name a transforms.json, its folder or a COLMAP folder"
+        ) from None
     except ValueError as error:
         first = str(error).splitlines()[0]
         raise FileFormatError(path, f"not JSON: {first}; write the file again") from None

@@ -90,6 +90,8 @@ def inspect(
         from attnwarp_eval.inspect.scene import State
 
         one_of(color, COLORINGS, "--color")
+        if screenshot is not None and screenshot.suffix.lower() != ".png":
+            raise InputError(f"--screenshot: got {screenshot}, expected a name that ends in .png")
         chosen = _subject(what, data, ply, images, source, scene, size, seed)
         variant = variant or chosen.preferred
         view = view or chosen.targets[0]

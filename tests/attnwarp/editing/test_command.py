@@ -71,6 +71,24 @@ def test_the_picture_is_worked_on_at_the_size_asked_for(folder, photo, tmp_path)
     assert cv2.imread(str(out)).shape == (32, 48, 3)  # 30 px rounded to a multiple of 8
 
 
+def test_transparent_pixels_are_laid_over_black(folder, photo, tmp_path):
+    """Oracle: the same edit of the picture laid over black by hand."""
+    _, rgb = photo
+    alpha = np.full((40, 64, 1), 255, np.uint8)
+    alpha[:, 20:] = 0
+    cv2.imwrite(str(tmp_path / "clear.png"), np.dstack([rgb[..., ::-1], alpha]))
+    cv2.imwrite(str(tmp_path / "black.png"), rgb[..., ::-1] * (alpha > 0))
+    results = []
+    for name in ("clear", "black"):
+        out = tmp_path / f"{name}-out.png"
+        done = run(
+            tmp_path / f"{name}.png", "--instruction", "a bear", "--editor", folder, "--steps", 1, "--out", out,
+        )  # fmt: skip
+        assert done.exit_code == 0, done.output
+        results.append(out.read_bytes())
+    assert results[0] == results[1]
+
+
 def test_words_edit_what_they_name_alone(folder, tmp_path):
     """Oracle: SAM and Grounding DINO called directly, and the edit without a mask."""
     models = tmp_path / "dino", tmp_path / "sam"

@@ -213,7 +213,7 @@ def test_coefficients_of_zero_are_a_pinhole(tmp_path):
         ('{"frames": []}', "frames"),
         ('{"frames": [3]}', "frames[0]"),
         ('{"frames": [{}]}', "frames[0].file_path"),
-        ("\xff", "not JSON"),
+        ("\xff", "not JSON, and no text; name a transforms.json"),
     ],
 )
 def test_what_is_no_transforms_file_is_refused(tmp_path, text, part):

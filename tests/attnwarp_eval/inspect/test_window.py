@@ -410,6 +410,7 @@ def test_the_command_refuses_by_name(tmp_path, folders, monkeypatch):
         ((tmp_path / "none.ply", "--data", folders), "none.ply"),
         ((hostile,), "study.json"),
         (small, "no display; draw a picture with --screenshot FILE"),
+        ((*small, "--screenshot", tmp_path / "a.jpg"), "a.jpg, expected a name that ends in .png"),
         ((*small, "--export", tmp_path / "a.stl"), "got .stl, expected .html, .glb or .vtp"),
     ):
         failed = invoke(*arguments)
