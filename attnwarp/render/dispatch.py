@@ -13,6 +13,10 @@ from typing import Any
 import numba
 import numpy as np
 
+SCALARS = frozenset({bool, int, float, np.float32, np.float64, np.int32, np.int64})
+"""Whose numba type follows from Python's; that of an integer of more bits follows from its value.
+"""
+
 _machine_code: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
 
@@ -25,7 +29,7 @@ def _type_key(value: Any) -> Any:
             return value.dtype, value.ndim, flags.writeable
     elif isinstance(value, tuple):
         return kind, *map(_type_key, value)
-    elif kind is not int or value.bit_length() < 64:
+    elif kind in SCALARS and (kind is not int or value.bit_length() < 64):
         return kind
     return numba.typeof(value)
 

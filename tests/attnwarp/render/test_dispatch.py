@@ -31,6 +31,14 @@ def _unaligned() -> np.ndarray:
     return np.zeros(33, np.uint8)[1:].view(np.float64)
 
 
+class Subclass(np.ndarray):
+    pass
+
+
+def _double(value: float) -> float:
+    return 2 * value
+
+
 VALUES = [
     np.zeros((2, 3)),
     np.zeros((2, 3), np.float32),
@@ -51,6 +59,11 @@ VALUES = [
     np.float32(1),
     np.float64(1),
     np.int32(1),
+    np.zeros((2, 3)).view(Subclass),
+    np.zeros((2, 3), np.float32).view(Subclass),
+    [1],
+    [1.0],
+    numba.njit(_double),
     (1, 2),
     (1, 2.0),
     (1, 2, 3),
@@ -69,6 +82,8 @@ def test_equal_keys_are_equal_types(first: int) -> None:
         types = [numba.typeof(value) for value in (VALUES[first], second)]
         if keys[0] == keys[1]:
             assert types[0] == types[1], (VALUES[first], second)
+    # A key that is new each time would compile at every call.
+    assert dispatch._type_key(VALUES[first]) == dispatch._type_key(VALUES[first])
 
 
 def test_a_call_gives_what_numba_gives() -> None:
@@ -80,6 +95,8 @@ def test_a_call_gives_what_numba_gives() -> None:
         for _ in range(2):
             result = dispatch.call(total, Pair(array, 1), 0.5)
             assert result == total(Pair(array, 1), 0.5) == 0.5 * array.sum() + 1
+    # Of float64, float32 and every other float64, each compiled once.
+    assert sum(key[0] is total for key in dispatch._machine_code) == 3
 
 
 def test_a_function_of_python_is_called_as_it_is() -> None:

@@ -218,8 +218,7 @@ class Calibration(Probe[Extra]):
             text.append(
                 f"The pictures are small: at {results.study.size} px, depth on a slope changes from"
                 f" pixel to pixel by more than the {100 * TAP_SPREAD:g} % that these rules let its"
-                " taps spread. So they reject much that is visible, and their F1 is low. The"
-                " study's variants use wider tolerances."
+                " taps spread. So they reject much that is visible, and their F1 is low."
             )
         if bad:
             text.insert(
