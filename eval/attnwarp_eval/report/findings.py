@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
 
@@ -27,13 +26,16 @@ CONTENTS = {
     "occlusion.": ("mask",),
     "warp.feature": ("warped",),
     "warp.": ("endpoint-error", "warped"),
-    "depth.": ("depth-error", "render", "edited"),
+    "depth.": ("depth-error", "render"),
     "fit.": ("render", "depth-error"),
     "multiview.": ("edited",),
     "fidelity.": ("edited",),
     "embedding.": ("edited",),
 }
 """Pictures that show a metric, by the beginning of its name."""
+
+RENDERED = {"render", "render_inside", "after"}
+"""Parts of a metric's name that speak of the tuned splats, not of the edited views."""
 
 
 def findings(results: Results, problems: list[str], *, pictures: bool = True) -> list[Finding]:
@@ -154,37 +156,35 @@ def _warped_and_true(results: Results) -> Slider | None:
 
 
 def _pair(results: Results, name: str, first: str, second: str, metric: str) -> Slider | None:
-    """The pictures of the view in which two variants differ most."""
+    """The pictures of the view in which two variants differ most.
+
+    Where the first variant of edits has none: the view before and after the edit of the second.
+    """
     contents = next((c for start, c in CONTENTS.items() if metric.startswith(start)), ())
+    if "edited" in contents and RENDERED.intersection(metric.split(".")):
+        contents = ("render",)
     before, after = (_pictures(results, name, variant) for variant in (first, second))
     left, right = (results.views(name, variant, metric) for variant in (first, second))
+    differences = {}
+    for key in after:
+        scene, view, seed, _ = key
+        values = [side.get(scene, {}).get(f"{view}/{seed}", math.nan) for side in (left, right)]
+        if math.isfinite(difference := abs(values[1] - values[0])):
+            differences[key] = difference
     for content in contents:
-        differences = {}
-        for key in sorted(before.keys() & after.keys()):
-            scene, view, seed, pictured = key
-            values = [side.get(scene, {}).get(f"{view}/{seed}", math.nan) for side in (left, right)]
-            if pictured == content and math.isfinite(difference := abs(values[1] - values[0])):
-                differences[key] = difference
-        if differences:
-            most = max(differences, key=lambda k: differences[k])
+        own = sorted(key for key in differences if key[3] == content)
+        if both := [key for key in own if key in before]:
+            most = max(both, key=differences.__getitem__)
             title = f"{content.replace('-', ' ')}, {most[0]}, {most[1]}"
             return Slider(
                 Picture(before[most].path, f"{title}: {first}"), Picture(after[most].path, second)
             )
-    if "edited" in contents:
-        return _unedited_and_edited(after, second)
-    return None
-
-
-def _unedited_and_edited(
-    pictures: Mapping[tuple[str, str, int, str], PictureFile], variant: str
-) -> Slider | None:
-    """A view before and after the edit, for a variant whose counterpart has no pictures."""
-    for (scene, view, seed, content), file in pictures.items():
-        unedited = pictures.get((scene, view, seed, "before"))
-        if content == "edited" and unedited is not None:
-            title = f"unedited, {scene}, {view}"
-            return Slider(Picture(unedited.path, title), Picture(file.path, variant))
+        if edits := [key for key in own if (*key[:3], "before") in after]:
+            most = max(edits, key=differences.__getitem__)
+            unedited, title = after[(*most[:3], "before")], f"unedited, {most[0]}, {most[1]}"
+            return Slider(
+                Picture(unedited.path, title), Picture(after[most].path, f"{content}: {second}")
+            )
     return None
 
 

@@ -99,7 +99,7 @@ def test_an_edit_is_shown_beside_its_counterpart_or_else_beside_the_unedited_vie
     cells = []
     for scene in SCENES:
         for name, value in zip(names, (20.0, 25.0), strict=True):
-            values = {"red/near": value, "red/far": 20.0}
+            values = {"red/far": 20.0, "red/near": value}
             data = written_runs.record([(v, 0.0, {metric: x}) for v, x in values.items()])
             data |= EDIT.to_json()
             cell = written_runs.outcome("editing", scene, [name], data)
