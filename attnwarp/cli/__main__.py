@@ -1,0 +1,5 @@
+"""``python -m attnwarp.cli``."""
+
+from attnwarp.cli.main import main
+
+main()
