@@ -68,12 +68,12 @@ def stages(out: Out = CACHE) -> None:
     """Print a table of the trained stages: steps, seconds and losses, from the logs of ``train``."""
     from training.depth_editor import DEPTH_STAGES
     from training.editor import STAGES
-    from training.log import log_path, table
+    from training.log import log_path, read_log, table
 
     logs = [log_path(out / f"{name}.pt") for name in (*STAGES, *DEPTH_STAGES)]
-    logs = [path for path in logs if path.exists()]
+    logs = [path for path in logs if read_log(path)]
     if not logs:
-        message = f"{out}: no log of a stage, which training writes; train one first"
+        message = f"{out}: no log of an epoch, which training writes; train a stage first"
         raise typer.BadParameter(message, param_hint="--out")
     typer.echo(table(logs))
 

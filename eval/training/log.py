@@ -49,9 +49,14 @@ def read_log(path: Path) -> list[Entry]:
 
 
 def cut_log(path: Path, epochs: int) -> None:
-    """Leave the first epochs alone: a resumed training takes those after its checkpoint again."""
-    entries = [entry for entry in read_log(path) if entry.epoch <= epochs]
+    """Leave the first epochs alone: a resumed training takes those after its checkpoint again.
+
+    No file is made where there is none: a checkpoint may be older than logs.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        return
+    entries = [entry for entry in read_log(path) if entry.epoch <= epochs]
     text = "".join(map(_line, entries)).encode()
     write_atomically(path, lambda file: file.write(text))
 
@@ -67,7 +72,7 @@ def _line(entry: Entry) -> str:
 
 
 def table(paths: Iterable[Path]) -> str:
-    """A Markdown table with a row for each log.
+    """A Markdown table with a row for each log that has an entry.
 
     Milliseconds a step are those of the epochs after the first, which compiles and warms up.
     Losses are those of training, means of the last :data:`LAST_EPOCHS` epochs; "unedited" is the
@@ -76,6 +81,8 @@ def table(paths: Iterable[Path]) -> str:
     lines = ["| stage | steps | seconds | ms a step | losses |", "|---|---|---|---|---|"]
     for path in paths:
         entries = read_log(path)
+        if not entries:  # of a training that was stopped in its first epoch
+            continue
         first, last = entries[0], entries[-1]
         steps, each = "–", "–"
         if last.steps is not None:

@@ -56,4 +56,22 @@ def test_the_table_has_what_each_stage_took_and_the_mean_of_its_last_losses(tmp_
 def test_a_folder_without_a_log_is_refused_by_name(tmp_path):
     result = CliRunner().invoke(app, ["stages", "--out", str(tmp_path)])
     assert result.exit_code == 2
-    assert "no log of a stage" in " ".join(result.output.replace("│", " ").split())
+    assert "no log of an epoch" in " ".join(result.output.replace("│", " ").split())
+
+
+def test_a_training_stopped_in_its_first_epoch_has_no_row(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "plain.pt", 2, stop_in=0)
+    assert not log_path(tmp_path / "plain.pt").exists()
+    # As a resumed training of lost epochs, or former code, leaves it.
+    log_path(tmp_path / "features.pt").write_text("")
+    assert CliRunner().invoke(app, ["stages", "--out", str(tmp_path)]).exit_code == 2
+    run(tmp_path / "drawn.pt", 1)
+    printed = CliRunner().invoke(app, ["stages", "--out", str(tmp_path)])
+    rows = printed.stdout.strip().splitlines()[2:]
+    assert printed.exit_code == 0 and len(rows) == 1 and rows[0].startswith("| `drawn` | 100 |")
+    finished = tmp_path / "control.pt"  # from before logs were written
+    run(finished, 1)
+    log_path(finished).unlink()
+    run(finished, 1)
+    assert not log_path(finished).exists()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.errors import InputError
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.effects.detect import detect
@@ -246,18 +247,27 @@ def _times(cost: Mapping[str, Any] | None) -> list[str]:
 
 
 def report(entries: Sequence[Mapping[str, Any]], about: Mapping[str, Any]) -> Report:
-    """The table, and the pictures side by side; ``about`` is the environment."""
+    """The table, and the pictures side by side; ``about`` is the environment.
+
+    Raises:
+        InputError: the entries were not timed alike.
+    """
     certified = sum(entry.get("proof", {}).get("verdict") == "certified" for entry in entries)
     partly = (
         sum(entry.get("proof", {}).get("of_simulated") == "certified" for entry in entries)
         - certified
     )
     variants = ", ".join(sorted({f"`{entry['variant']}`" for entry in entries}))
-    # Entries of one table have one: it follows from the rounds and Mitsuba's variant, which all
-    # share.
+    # The lead describes one: it follows from the rounds and Mitsuba's variant.
     costs = {
         tuple(e["cost"][key] for key in ("size", "spp", "rounds")) for e in entries if "cost" in e
     }
+    if len(costs) > 1:
+        kinds = "; ".join(f"{n} x {n}, {spp} samples, {k} rounds" for n, spp, k in sorted(costs))
+        raise InputError(
+            f"entries: timed in {len(costs)} ways ({kinds}), expected one;"
+            " make the table again in another folder"
+        )
     lead = [
         f"{len(entries)} scenes, {certified} of their plans certified"
         + (f", {partly} more but for what is not simulated" if partly else "")

@@ -170,7 +170,8 @@ def _check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
     among today's cells of the study. A scene or a protocol that has changed gives other ids today;
     the search leaves both out, and takes a scene's name from its hash in ``study.json``. A spec
     that today's code writes otherwise still tells its scene, probe and seed; of its variants only
-    the names can then be checked.
+    the names can then be checked. A preset or a default that has changed can give another variant
+    the settings of a record, so that today's cell has more names than the former one.
 
     Args:
         store: the run's folder.
@@ -198,7 +199,7 @@ def _check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
         label = _label(cell)
         of_record = (scene, spec.get("probe"), spec.get("seed", cell["seed"]), label[3])
         expected = expected_labels.get(_search_key(spec, scene), of_record)
-        if label != expected:
+        if label != expected and label != _without_names_of_others(expected, cell, stored["cells"]):
             raise StoreError(_wrong_label(store, cell["id"], label, expected))
         names = study.probes.get(cell["probe"], [])
         for name in cell["variants"] if probe(cell["probe"]).judges_variants else []:
@@ -207,6 +208,28 @@ def _check_labels(store: Store, stored: dict[str, Any], study: Study) -> None:
                     f"{store.root / 'study.json'}: cell {cell['id']} has the variant {name!r},"
                     f" which the study does not name for {cell['probe']}; {_remedy(store)}"
                 )
+
+
+def _without_names_of_others(
+    expected: Label, cell: dict[str, Any], listed: list[dict[str, Any]]
+) -> Label:
+    """What a cell was called before today's variants shared it.
+
+    A variant that formerly had other settings has a cell of its own in the run. So a name that
+    damage took from a label is told apart: no other cell has it.
+
+    Args:
+        expected: the label of today's cell.
+        cell: the run's.
+        listed: all cells of the run.
+    """
+    others = {
+        name
+        for other in listed
+        if other["id"] != cell["id"] and _label(other)[:3] == expected[:3]
+        for name in other["variants"]
+    }
+    return (*expected[:3], [name for name in expected[3] if name not in others])
 
 
 def _search_key(spec: dict[str, Any], scene: str | None) -> str:

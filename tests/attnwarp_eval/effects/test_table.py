@@ -104,6 +104,19 @@ def test_a_table_that_was_interrupted_goes_on_with_the_same_entries(small, monke
     assert (tmp_path / "effects.json").read_bytes() != written[tmp_path / "effects.json"]
 
 
+def test_entries_that_were_timed_otherwise_are_refused_in_one_table():
+    planned = {"integrator": "direct", "sensor": {"type": "perspective"}}
+    cost = {"size": 48, "spp": 16, "rounds": 7, "faster": 2.0, "at_equal_noise": 2.0}
+    cost |= {"interval": [1.0, 3.0], "cap": None}
+    one = {"scene": "a", "needed": [], "not_simulated": [], "plan": planned, "cost": cost}
+    one |= {"variant": "scalar_rgb"}
+    about = {"versions": {"mitsuba": "3"}}
+    other = {**one, "cost": {**cost, "size": 96}}
+    assert any("48 x 48, 16 samples" in text for text in table.report([one, one], about).lead)
+    with pytest.raises(InputError, match=r"2 ways \(48 x 48, 16 .*; 96 x 96, 16 .*another folder"):
+        table.report([one, other], about)
+
+
 def test_rows_that_no_cell_has_are_not_overwritten_and_a_name_is_one_scene(tmp_path):
     path = tmp_path / "effects.json"
     for content, words in (

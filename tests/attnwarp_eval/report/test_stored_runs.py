@@ -2,25 +2,30 @@
 
 ``data/runs.tar.xz`` holds ``variants`` (the probes of variants on two scenes, 24 x 24 px) and
 ``edits`` (sensitivity, without encoders) as revision 33b7813e6823 wrote them, with its report.md and
-results.jsonl of ``report --no-timings --no-pictures``. Its two scenes said ``bounces: 1``, so today's
+results.jsonl of ``report --no-timings --no-pictures``. One paragraph is younger: that about small
+pictures, in the report's calibration section, was inserted by hand. The runs' two scenes said ``bounces: 1``, so today's
 are given that. Where a protocol is changed on purpose, run the studies in their study.json again and
 put the new folders there.
 """
 
+import dataclasses
 import json
 import pathlib
 import shutil
 import tarfile
 
 import pytest
+import written_runs
 from direct_light import direct
 
 from attnwarp.errors import InputError
+from attnwarp.warp.settings import PRESETS
 from attnwarp_eval.report import write_report
 from attnwarp_eval.report.results import read_results
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store
 from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.run import verify
 from attnwarp_eval.study.store import StoreError
 
@@ -140,3 +145,50 @@ def test_a_former_run_whose_scenes_have_changed_is_read_and_a_wrong_label_in_it_
     path.write_text(json.dumps(study))
     with pytest.raises(StoreError, match=r"study\.json: cell .* (is called|has the variant)"):
         read_results(store)
+
+
+@pytest.mark.parametrize("load", [direct, load_scene])
+def test_a_former_run_is_read_where_a_changed_preset_merges_two_of_its_cells(
+    folder, tmp_path, monkeypatch, load
+):
+    merged = dataclasses.replace(PRESETS["corrected"], pixel_centers="integer")
+    monkeypatch.setitem(PRESETS, "corrected", merged)
+    monkeypatch.setattr("attnwarp_eval.study.run.load_scene", load)
+    shutil.copytree(folder / "variants", tmp_path / "run")
+    store = Store(tmp_path / "run")
+    path = store.root / "study.json"
+    text = path.read_text()
+    names = {cell["id"]: tuple(cell["variants"]) for cell in json.loads(text)["cells"]}
+    results = read_results(store)
+    assert results.measured == 16
+    assert {cell.id: cell.variants for cell in results.cells} == names
+
+    # Today both variants have the settings of the records of "slipped". The name of the other is
+    # that of another cell in the run.
+    def relabelled(variants):
+        study = json.loads(text)
+        cells = [c for c in study["cells"] if c["probe"] == "warp" and c["scene"] == "spheres"]
+        for cell in cells:
+            cell["variants"] = variants.get(cell["variants"][0], cell["variants"])
+        path.write_text(json.dumps(study))
+
+    for variants in (
+        {"slipped": ["corrected"]},
+        {"slipped": ["slippee"]},
+        {"slipped": ["slipped", "slipped"]},
+    ):
+        relabelled(variants)
+        with pytest.raises(StoreError, match="is called .* but the study calls it"):
+            read_results(store)
+
+
+@pytest.mark.parametrize(("size", "small"), [(255, True), (256, False)])
+def test_the_calibration_says_where_the_pictures_are_small(tmp_path, size, small):
+    study = {"name": "s", "scenes": ["a"], "size": size, "probes": {"calibration": []}}
+    data = written_runs.record([])
+    cell = written_runs.outcome("calibration", "a", ["calibration"], data)
+    made = probe("calibration").sections(written_runs.results(study, [cell]), Layout(tmp_path))
+    (section,) = [section for _, section in made if section.title == "Calibration"]
+    words = f"The pictures are small: at {size} px, "
+    assert sum(text.startswith(words) for text in section.text) == small
+    assert ("The pictures are small" in "".join(section.text)) == small
