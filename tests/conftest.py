@@ -10,7 +10,9 @@ _WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _WORKERS > 1:
     # Read by torch when it is first imported, and by every child process: workers share the cores
     # rather than each taking all of them.
-    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, len(os.sched_getaffinity(0)) // _WORKERS)))
+    _affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
+    _cores = len(_affinity(0)) if _affinity else os.cpu_count() or 1
+    os.environ.setdefault("OMP_NUM_THREADS", str(max(1, _cores // _WORKERS)))
 
 
 # Files that take a worker 10 s and more, longest first. They begin the run, as one of them at its

@@ -20,6 +20,15 @@ FIRST_OPACITY = 0.1
 NEIGHBOURS = 3
 """A first splat is as large as the root mean square distance to so many neighbours (3DGS)."""
 
+ROUNDINGS = 32
+"""Rounding of a camera's position, in float64 epsilons of the largest coordinate.
+
+A pose holds t = -R c, and the position is -R^T t. An entry of a product with a rotation errs by at
+most 1.5 epsilons of the vector's length, which is at most sqrt(3) times the largest coordinate.
+Both products together then err by at most 4.5 + 2.6 epsilons. R^T R differs from I by a few more,
+and two positions are compared.
+"""
+
 
 def extent_of(cameras: Sequence[Camera]) -> float:
     """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean
@@ -36,8 +45,18 @@ def extent_of(cameras: Sequence[Camera]) -> float:
         3.3
     """
     centers = np.stack([camera.position for camera in cameras])
-    radius = float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
-    return 1.1 * radius if radius > 1e-12 * max(1.0, float(np.abs(centers).max())) else 1.0
+    if _at_one_place(centers):
+        return 1.0
+    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+
+
+def _at_one_place(centers: Array) -> bool:
+    """Whether positions, (N, 3), differ by no more than their float64 rounding.
+
+    The size of the world's unit says nothing about it.
+    """
+    apart = float(np.abs(centers - centers[0]).max())
+    return apart <= ROUNDINGS * float(np.finfo(np.float64).eps * np.abs(centers).max())
 
 
 def from_points(
@@ -132,15 +151,12 @@ def random_points(
         count: of points, at least 1.
         seed: of positions and colours.
 
-    Raises:
-        ValueError: all cameras stand at one point.
-
     Returns:
         points: (count, 3) world coordinates.
         colors: (count, 3) uint8, at random.
 
     Raises:
-        ValueError: a count below 1.
+        ValueError: a count below 1; cameras that all stand at one place and look different ways.
 
     Example:
         >>> import numpy as np
@@ -161,15 +177,16 @@ def random_points(
     middle = centers.mean(0)
     A = across.sum(0)
     if np.linalg.eigvalsh(A)[0] > 1e-3 * len(cameras):
+        if _at_one_place(centers):
+            raise ValueError(
+                "cameras: got cameras that all stand at one place and look different ways, so"
+                " nothing says how far the scene is; expected first points (ply_file_path, or"
+                " COLMAP's)"
+            )
         focus = middle + np.linalg.solve(A, np.einsum("nij,nj->i", across, centers - middle))
     else:
         focus = middle + extent_of(cameras) * forward.mean(0)
     half = float(np.linalg.norm(centers - focus, axis=1).mean())
-    if half <= 1e-9 * max(1.0, float(np.abs(centers).max())):
-        raise ValueError(
-            "cameras: got cameras that all stand at one place and look different ways, so nothing"
-            " says how far the scene is; expected first points (ply_file_path, or COLMAP's)"
-        )
     random = np.random.default_rng(seed)
     points = focus + half * random.uniform(-1, 1, (count, 3))
     return points, random.integers(0, 256, (count, 3), dtype=np.uint8)

@@ -8,6 +8,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 import attnwarp.cli.main
@@ -25,6 +26,10 @@ def test_nothing_is_left_to_search_as_the_process_ends():
     assert done.stdout.split() == ["0", "False", "True", "True"]
 
 
+@pytest.mark.skipif(
+    not hasattr(os, "sched_setaffinity"),
+    reason="this system has no os.sched_setaffinity, with which the test takes cores away",
+)
 def test_cores_are_those_that_this_process_may_use(monkeypatch):
     cores = os.sched_getaffinity(0)
     try:

@@ -63,8 +63,16 @@ def seen_surface(seen: Seen, colors: Image, seam: float = SEAM) -> pyvista.PolyD
     return mesh
 
 
-def coarser_surface(seen: Seen, colors: Image, faces: int) -> pyvista.PolyData:
-    """:func:`seen_surface` with about ``faces`` faces: of every k-th pixel of every k-th row."""
+def coarser_surface(seen: Seen, surface: pyvista.PolyData, faces: int) -> pyvista.PolyData:
+    """:func:`seen_surface` with about ``faces`` faces: of every k-th pixel of every k-th row.
+
+    Args:
+        seen: of the view.
+        surface: the :func:`seen_surface` of it, for its colours.
+        faces: about so many.
+    """
+    colors = np.zeros((*seen.valid.shape, 3))
+    colors.reshape(-1, 3)[surface.point_data["pixel"]] = surface.point_data["colors"] / 255
     step = math.ceil(math.sqrt(seen.valid.size / faces))
     every = (slice(step // 2, None, step),) * 2
     grids = {f.name: getattr(seen, f.name)[every] for f in fields(seen)}
@@ -302,9 +310,6 @@ def parts(
     source, target = pair.cameras
     reach = frustum_depth(subject, source)
 
-    def seen_colors() -> Image:
-        return pair.colors(state.coloring, state.layer, state.step or None)
-
     result = [
         *_camera("source", source, reach, SOURCE_COLOR, lambda: pair.images[0]),
         *_camera(
@@ -318,8 +323,10 @@ def parts(
         Part(
             "seen",
             (state.variant, state.target, state.coloring, state.layer, state.step),
-            lambda: seen_surface(pair.seen, seen_colors()),
-            moving=lambda _: coarser_surface(pair.seen, seen_colors(), MOVING),
+            lambda: seen_surface(
+                pair.seen, pair.colors(state.coloring, state.layer, state.step or None)
+            ),
+            moving=lambda mesh: coarser_surface(pair.seen, mesh, MOVING),
         ),
     ]
     if state.splats and pair.model is not None:

@@ -90,7 +90,8 @@ class Window:
         self.changed: Callable[[], object] = lambda: None
         self._drawn: dict[str, tuple[Any, ...]] = {}
         self._insets: tuple[Any, ...] = ()
-        self._lighter: dict[str, tuple[Any, Any]] = {}
+        self._large: dict[str, tuple[Any, Callable[[Any], Any]]] = {}
+        self._lighter: dict[str, Any] = {}
         self._sliders: dict[str, tuple[Any, Callable[[], int], Callable[[], str]]] = {}
         # PyVista wraps its methods in a way that mypy cannot follow.
         self.plotter: Any = self._plotter(off_screen, size)
@@ -441,15 +442,23 @@ class Window:
     def _add(self, part: scene.Part) -> None:
         actor = draw.add_part(self.plotter, part)
         self._remove_lighter(part.name)
-        mesh = actor.mapper.dataset
-        if part.moving is not None and mesh.n_cells > scene.MOVING:
-            lighter = draw.add_lighter(self.plotter, part.name, part.moving(mesh))
-            self._lighter[part.name] = (actor, lighter)
+        if part.moving is not None and actor.mapper.dataset.n_cells > scene.MOVING:
+            self._large[part.name] = (actor, part.moving)
 
     def _remove_lighter(self, name: str) -> None:
+        self._large.pop(name, None)
         if name in self._lighter:
-            _, lighter = self._lighter.pop(name)
-            self.plotter.remove_actor(lighter)
+            self.plotter.remove_actor(self._lighter.pop(name))
+
+    def _make_lighter(self, name: str) -> Any:
+        """What stands for a large mesh while the view moves, made once it first does."""
+        actor, make = self._large[name]
+        self._main()
+        before, self.plotter.suppress_rendering = self.plotter.suppress_rendering, True
+        try:
+            return draw.add_lighter(self.plotter, name, make(actor.mapper.dataset))
+        finally:
+            self.plotter.suppress_rendering = before
 
     def _draw_lighter(self, names: Collection[str]) -> None:
         """Follow the mouse: draw some large meshes lighter, and edges not smooth; neither if empty.
@@ -457,8 +466,12 @@ class Window:
         Software spends more on smooth edges than on 100,000 discs.
         """
         moving = bool(names)
-        for name, (actor, lighter) in self._lighter.items():
-            actor.visibility, lighter.visibility = name not in names, name in names
+        for name, (actor, _) in self._large.items():
+            if name in names and name not in self._lighter:
+                self._lighter[name] = self._make_lighter(name)
+            actor.visibility = name not in names
+        for name, lighter in self._lighter.items():
+            lighter.visibility = name in names
         window = self.plotter.render_window
         if moving:
             # What the graphics can do is known once they have drawn.

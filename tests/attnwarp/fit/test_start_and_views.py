@@ -221,3 +221,30 @@ def test_cameras_at_one_place_that_look_different_ways_are_refused():
     cameras = [Camera.look_at((4, 0, 1), end, **view) for end in ((9, 0, 1), (4, 5, 1), (4, -5, 1))]
     with pytest.raises(ValueError, match="cameras that all stand at one place"):
         random_points(cameras, 10)
+
+
+@pytest.mark.parametrize(("radius", "place"), [(3e-3, 5e6), (3e-10, 0.0)])
+def test_a_small_ring_of_cameras_far_away_is_no_single_place(radius, place):
+    """Millimetres at a map's coordinates, and a world in tiny units."""
+    center = np.array([place, -place, 0.5 * place])
+    around = [np.array([np.cos(a), np.sin(a), 0]) for a in np.arange(8) * np.pi / 4]
+    view = dict(width=8, height=8, fov_y=40)
+    cameras = [Camera.look_at(center + radius * way, center, **view) for way in around]
+    # A step between neighbouring float64 numbers is 1e-9 at 5e6, and positions err by a few.
+    tolerance = 10 * np.spacing(place) + 1e-6 * radius
+    assert extent_of(cameras) == pytest.approx(1.1 * radius, abs=tolerance)
+    points, _ = random_points(cameras, 2000)
+    # Of 2,000 draws from a cube, the outermost of an axis is within 1% of its face.
+    reach = np.abs(points - center).max(0)
+    np.testing.assert_allclose(reach, radius, rtol=0.01, atol=tolerance)
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (3e-10, 1e-10, 0), (5e6, -4e6, 123.4)])
+def test_cameras_at_one_place_are_told_by_rounding_alone(place):
+    random = np.random.default_rng(1)
+    ways = random.normal(size=(300, 3)) * max(1.0, *np.abs(place))
+    view = dict(width=8, height=8, fov_y=40)
+    cameras = [Camera.look_at(place, place + way, **view) for way in ways]
+    assert extent_of(cameras) == 1
+    with pytest.raises(ValueError, match="cameras that all stand at one place"):
+        random_points(cameras, 10)

@@ -306,13 +306,18 @@ def test_while_the_view_moves_large_meshes_are_light_and_a_click_finds_its_pixel
 ):
     monkeypatch.setattr(scene, "MOVING", 400)  # of 1,000 discs and some 3,000 faces
     window.show(variant="corrected", target="yaw060", coloring="rules", layer=None, splats=True)
-    actors, mouse = window.plotter.renderer.actors, window.plotter.iren.interactor
+    renderer, mouse = window.plotter.renderer, window.plotter.iren.interactor
     names = ("seen", "moving seen", "discs", "moving discs")
 
     def visible():
-        return [bool(actors[name].visibility) for name in names]
+        actors = renderer.actors
+        return [name in actors and bool(actors[name].visibility) for name in names]
 
+    # Nothing is made for a movement before there is one.
+    assert not {"moving seen", "moving discs"} & set(renderer.actors.keys())
     assert visible() == [True, False, True, False]
+    colors, calls = Pair.colors, []
+    monkeypatch.setattr(Pair, "colors", lambda *given: calls.append(given) or colors(*given))
     samples = window.plotter.render_window.GetMultiSamples()
     mouse.SetEventInformation(300, 150, 0, 0)
     mouse.MiddleButtonPressEvent()
@@ -322,7 +327,7 @@ def test_while_the_view_moves_large_meshes_are_light_and_a_click_finds_its_pixel
     assert visible() == [False, True, False, True]
     assert window.plotter.render_window.GetMultiSamples() == 0
     window.plotter.render()  # VTK fills a mapper when it draws
-    meshes = {name: actors[name].mapper.dataset for name in names}
+    meshes = {name: renderer.actors[name].mapper.dataset for name in names}
     assert 100 < meshes["moving seen"].n_cells <= 400 < meshes["seen"].n_cells
     mouse.MiddleButtonReleaseEvent()
     assert visible() == [True, False, True, False]
@@ -331,6 +336,7 @@ def test_while_the_view_moves_large_meshes_are_light_and_a_click_finds_its_pixel
     every = {tuple(p): tuple(c) for p, c in coloured(meshes["seen"])}
     coarse = {tuple(p): tuple(c) for p, c in coloured(meshes["moving seen"])}
     assert coarse.items() <= every.items()
+    assert calls == []  # those colours are the mesh's, not computed again
     # One point a disc, on it.
     corners = np.asarray(meshes["discs"].points).reshape(1000, -1, 3)
     assert np.array_equal(meshes["moving discs"].points, corners[:, 0])
