@@ -150,10 +150,11 @@ def _read(path: Path) -> Image:
         raise ValueError(f"{path}: cannot be read as a picture; expected PNG or JPEG")
     rgb = pixels[..., ::-1].astype(np.float32) / np.float32(255)
     # The first reading turns a picture by its EXIF tag, and drops the alpha that this one keeps.
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if stored.dtype.kind == "u" and stored.shape == (*rgb.shape[:2], 4):
-        rgb *= stored[..., 3:].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
-    return rgb
+    stored: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype.kind != "u" or stored.shape != (*rgb.shape[:2], 4):
+        return rgb
+    alpha = stored[..., 3:].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    return np.asarray(rgb * alpha)
 
 
 def _fit(image: Image, longest: int, multiple: int) -> Image:
