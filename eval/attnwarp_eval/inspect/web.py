@@ -62,10 +62,15 @@ def serve(
         ) from None
 
 
+def server_arguments(secret: str) -> list[str]:
+    """The secret for trame's own command line; in one word, as a secret may begin with a dash."""
+    return [f"--authKey={secret}"]
+
+
 async def _serve(page: _Page, host: str, port: int, secret: str) -> None:
     page.url = lambda bound: f"http://{host}:{bound}/index.html?secret={secret}"
     # trame reads the command line by itself, in a way that clashes with this command's options.
-    arguments, sys.argv = sys.argv, ["attnwarp-eval", "--authKey", secret]
+    arguments, sys.argv = sys.argv, ["attnwarp-eval", *server_arguments(secret)]
     try:
         task = page.server.start(
             host=host,
