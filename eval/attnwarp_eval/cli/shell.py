@@ -129,8 +129,8 @@ class Progress:
         self._bar.update(self._task, description=text)
 
     def line(self, text: str) -> None:
-        """Print a line above the bar."""
-        self.console.print(text, markup=False, highlight=False)
+        """Print a line above the bar; a log file gets it whole, so that it can be searched."""
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from attnwarp_eval.cli.shell import file_error
+from attnwarp_eval.cli.shell import file_error, progress
 
 PRINTS = [sys.executable, "-m", "attnwarp_eval.cli.main", "cache", "info"]
 
@@ -95,3 +95,11 @@ def test_an_error_of_a_connection_does_not_blame_the_disk():
     assert file_error(missing) == str(missing)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "run/study.json")
     assert file_error(full).startswith("run/study.json: No space left on device; check the path")
+
+
+def test_a_log_file_gets_each_line_whole(capsys):
+    lost = "worker tcp://127.0.0.1:39003 was lost at spheres / calibration / calibration; " * 3
+    with progress(18, lines=True) as show:
+        show.line(lost)
+        show(1, 18, lost)
+    assert capsys.readouterr().err == f"{lost}\n[1/18] {lost}\n"
