@@ -43,6 +43,7 @@ class Claim:
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
     editors: tuple[str, ...] = ()
+    settings: Literal["complete", "own"] = "complete"
 
     def of_each_editor(self) -> list[Claim]:
         """The claim for each of its editors; itself where it has none."""
@@ -67,8 +68,9 @@ class Claim:
     def measure(self, results: Results) -> Measured | None:
         """The sides of the claim; None where the run has no variant of that content."""
         metric = self.metric.replace("{layer}", str(results.layer))
-        a = variant_like(results, self.a, self.probe)
-        b = None if self.b is None else variant_like(results, self.b, self.probe)
+        own = self.settings == "own"
+        a = variant_like(results, self.a, self.probe, own=own)
+        b = None if self.b is None else variant_like(results, self.b, self.probe, own=own)
         if a is None or (self.b is not None and b is None):
             return None
         if self.compare_yaw is not None:
@@ -122,7 +124,27 @@ class JudgedClaim:
 def load_claims() -> list[Claim]:
     """The claims that ship with the package."""
     text = (resources.files("attnwarp_eval.report") / "claims.yaml").read_text()
-    return [Claim(**_tuples(entry)) for entry in yaml.safe_load(text)]
+    return [
+        Claim(**_tuples(one)) for entry in yaml.safe_load(text) for one in _of_each_metric(entry)
+    ]
+
+
+def _of_each_metric(entry: dict[str, Any]) -> list[dict[str, Any]]:
+    """An entry with ``metrics`` is a claim for each of them; any other is one itself."""
+    common = dict(entry)
+    metrics = common.pop("metrics", None)
+    if metrics is None:
+        return [entry]
+    return [
+        {
+            **common,
+            "id": f"{entry['id']}-{key}",
+            "text": f"{one['text']} {entry['text']}",
+            "metric": one["metric"],
+            "expect": one["expect"],
+        }
+        for key, one in metrics.items()
+    ]
 
 
 def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
@@ -187,20 +209,27 @@ def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
     return "holds" if claim.sign * contrast.mean > 0 else "does not hold"
 
 
-def variant_like(results: Results, data: Mapping[str, Any], name: str) -> str | None:
-    """The name of the measured variant that means what ``data`` means.
+def variant_like(
+    results: Results, data: Mapping[str, Any], name: str, *, own: bool = False
+) -> str | None:
+    """The name of the first measured variant that means what ``data`` means.
 
     Args:
         results: of the run.
         data: a variant as a study's YAML has it.
         name: of the probe whose records are needed.
+        own: whether settings that ``data`` leaves out may be the variant's own.
     """
-    own, study = probe(name), results.study
+    asked, study = probe(name), results.study
     if name not in study.probes:
         return None
-    meaning = own.meaning(study, parse_variant(dict(data)))
+    wanted = parse_variant(dict(data))
     for label, variant in study.variants.items():
-        if own.meaning(study, variant) == meaning and results.records(name, label):
+        if own:
+            same = asked.alike(study, variant, wanted)
+        else:
+            same = asked.meaning(study, variant) == asked.meaning(study, wanted)
+        if same and results.records(name, label):
             return label
     return None
 

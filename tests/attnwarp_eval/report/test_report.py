@@ -1,6 +1,8 @@
 """Hand-made records with known numbers; the expected tables, verdicts and warnings follow by
 hand."""
 
+import dataclasses
+
 import pytest
 import written_runs
 
@@ -12,8 +14,11 @@ from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, JudgedClaim, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
 SLIP = "warp.epe_median_layer.64"
@@ -183,6 +188,74 @@ def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
     assert together([holds, holds], claim.editors) == ("seen", "holds")
     assert together([holds, fails], claim.editors) == ("depends on the editor",) * 2
     assert together([holds], claim.editors) == ("seen", "can't tell")
+
+
+METHODS = {
+    "igs2gs, short": {
+        "method": "igs2gs",
+        "options": {"iterations": 9},
+        "budget": {"network_rows": 5},
+    },
+    "igs2gs": {"method": "igs2gs", "options": {"iterations": 9}},
+    "igs2gs, long": {"method": "igs2gs", "options": {"iterations": 90}},
+    "alone": {"options": {"method": "each view alone"}},
+    "paper": {"preset": "paper"},
+    "mine": {"options": {"iterations": 5}},
+}
+OWN_CLAIM = Claim(
+    "own",
+    "It looks more like it",
+    "editing",
+    "embedding.dino_image.render",
+    {"method": "igs2gs"},
+    "higher",
+    {"options": {"method": "warp"}},
+    settings="own",
+)
+
+
+def edited(method, value):
+    done = Judgement("red", True, 30.0, 10.0, 10.0)
+    extra = EditResult("red", "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
+    data = written_runs.record(
+        [("red/v0", 15.0, {"embedding.dino_image.render": value})], **extra.to_json()
+    )
+    return written_runs.outcome("editing", "one", [method], data, method)
+
+
+@pytest.mark.parametrize(
+    ("measured", "sides"),
+    [
+        (METHODS, {"igs2gs": 0.2, "mine": 0.6}),  # the first without a limit of its own
+        (["igs2gs, long", "paper", "mine"], {"igs2gs, long": 0.3, "mine": 0.6}),
+        (["igs2gs, short", "alone", "paper"], {}),
+    ],
+)
+def test_a_claim_about_methods_finds_them_whatever_their_own_settings_are(measured, sides):
+    values = dict(zip(METHODS, [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], strict=True))
+    run = written_runs.results(
+        study(scenes=["one"], variants=METHODS, probes={"editing": list(METHODS)}, ablations=[]),
+        [edited(name, values[name]) for name in measured],
+    )
+    found = OWN_CLAIM.measure(run)
+    assert ({} if found is None else {name: s.mean for name, s in found.sides.items()}) == sides
+    complete = dataclasses.replace(OWN_CLAIM, settings="complete")
+    assert complete.measure(run) is None  # no variant has the defaults' iterations
+
+
+def test_every_comparison_that_ships_has_both_sides_of_each_claim_about_methods():
+    claims = [claim for claim in load_claims() if claim.settings == "own"]
+    for name in ("comparison", "comparison-six", "comparison-quick"):
+        measured = load_study(name)
+        for claim in claims:
+            for side in (claim.a, claim.b):
+                wanted = parse_variant(dict(side))
+                alike = [
+                    label
+                    for label, variant in measured.variants.items()
+                    if probe("editing").alike(measured, variant, wanted)
+                ]
+                assert alike, (name, claim.id)
 
 
 def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():

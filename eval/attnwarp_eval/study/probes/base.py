@@ -234,6 +234,13 @@ class Probe(ABC, Generic[E]):
         """What two variants must share to mean the same to a claim about this probe."""
         return variant.settings(), variant.geometry, study.splats_of(variant)
 
+    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
+        """Whether a variant is of the kind of ``wanted``, for a claim about kinds.
+
+        A probe of methods leaves a method's own settings out, but for those that ``wanted`` names.
+        """
+        return self.meaning(study, variant) == self.meaning(study, wanted)
+
     # From a cell to its record
 
     @abstractmethod

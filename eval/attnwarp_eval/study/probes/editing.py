@@ -345,6 +345,22 @@ class EditingProbe(Probe[EditResult]):
             editor_of(study, variant), own.budget, own.by_hand,
         )  # fmt: skip
 
+    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
+        """Whether both are the same method, with one editor, on the same splats and without a
+        budget of one alone; of their settings, the warp's and those that ``wanted`` names count.
+        """
+        if variant.part(VariantPart).method != wanted.part(VariantPart).method:
+            return False  # the study's options need not fit the other method
+        counts = {"warp", *wanted.part(VariantPart).options}
+
+        def kind(of: Variant) -> list[Any]:
+            return [
+                {k: v for k, v in part.items() if k in counts} if isinstance(part, dict) else part
+                for part in self.meaning(study, of)
+            ]
+
+        return kind(variant) == kind(wanted)
+
     # From a cell to its record
 
     def compute(self, work: Work) -> EditResult:
