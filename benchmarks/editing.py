@@ -33,6 +33,7 @@ from attnwarp.process import core_count
 from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
 from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
+from attnwarp_eval.cost import peak_memory_mb
 
 INSTRUCTION = "make it snow"
 
@@ -114,6 +115,8 @@ def measure(
     result = propagate(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
     figures["edit"] = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     figures["edit_psnr"] = result.edit_psnr["mean"]
+    figures["views"] = [len(result.edited), *images[0].shape[1::-1]]
+    figures["peak_mb"] = peak_memory_mb()
     stored.write_text(json.dumps(figures, indent=1) + "\n")
     return figures
 
@@ -125,18 +128,22 @@ def table(rows: Sequence[dict[str, Any]], data: Path, load: float) -> str:
         "",
         f"`attnwarp edit` on `{data.name}` with its defaults, and about half and twice their time."
         " 2DGS, three stages, all views edited, every 8th held out of the fit. CPU seconds are of"
-        " all threads.",
+        " all threads. Memory is the process's highest so far.",
         "",
         "| time | fit: iterations, splats | tuning a stage | held-out PSNR, dB | Edit PSNR, dB |"
-        " fit, CPU s | edit and tuning, CPU s | all, CPU s | all, s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        " fit, CPU s | edit and tuning, CPU s | all, CPU s | all, s | views, px | memory, GiB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         edit = row.get("edit")
-        rest = " not run | | |"
+        rest = " not run | | | | |"
         if edit is not None:
             cpu, wall = (row["fit"][unit] + edit[unit] for unit in ("cpu", "wall"))
-            rest = f" {edit['cpu']:.0f} | {cpu:.0f} | {wall:.0f} |"
+            count, width, height = row["views"]
+            rest = (
+                f" {edit['cpu']:.0f} | {cpu:.0f} | {wall:.0f} | {count}, {width} x {height} |"
+                f" {row['peak_mb'] / 1024:.2f} |"
+            )
         psnr = f"{row['edit_psnr']:.2f}" if edit is not None else ""
         lines.append(
             f"| {row['name']} | {row['iterations']:,}, {row['splats']:,} | {row['tuning']} |"

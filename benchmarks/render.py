@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import gc
 import platform
-import resource
 import statistics
 import time
 import tracemalloc
@@ -43,7 +42,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.render import _pool
 from attnwarp.render.api import render
 from attnwarp.render.threads import run_jobs, thread_count
-from attnwarp_eval.cost import in_turn
+from attnwarp_eval.cost import in_turn, peak_memory_mb
 from benchmarks import command
 
 FLOPS_PER_PAIR = 45
@@ -267,7 +266,7 @@ def run(cases: list[Case], rounds: int, gsplat: int) -> dict[str, Any]:
     time_in_turn(built, rounds)
     for case, splats, view in built:
         measure_memory(case, splats, view)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    memory = peak_memory_mb()
     if gsplat:
         judge(built, gsplat)
     rows = [row(case) for case in cases]

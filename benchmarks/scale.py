@@ -14,7 +14,6 @@ import argparse
 import json
 import math
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from attnwarp_eval.canonical_json import digest
+from attnwarp_eval.cost import peak_memory_mb
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Registry
 from attnwarp_eval.study.probes import register
@@ -165,7 +165,7 @@ def one_step(name: str, cells: int, root: Path) -> dict[str, float]:
     return {
         "wall": time.perf_counter() - wall,
         "cpu": time.process_time() - cpu,
-        "mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "mb": peak_memory_mb(),
     }
 
 

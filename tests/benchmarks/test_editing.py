@@ -1,6 +1,8 @@
 """The benchmark of editing: its ratios against sums done by hand."""
 
-from benchmarks.editing import ratio_table
+from pathlib import Path
+
+from benchmarks.editing import ratio_table, table
 
 
 def test_the_ratio_is_the_median_of_ratios_within_rounds_without_tuning() -> None:
@@ -23,3 +25,18 @@ def test_the_ratio_is_the_median_of_ratios_within_rounds_without_tuning() -> Non
     files = next(line for line in lines if line.startswith("| editing and files |"))
     assert "2.52 (2.36 to 2.68)" in files
     assert "Rows through the network: 8 and 8. 3 rounds" in text
+
+
+def test_a_row_of_the_table_adds_fit_and_edit_and_says_what_they_held_in_memory():
+    row = {
+        "name": "default", "iterations": 3000, "splats": 30_000, "tuning": 300, "held_out": 33.0,
+        "fit": {"cpu": 300.0, "wall": 200.0}, "edit": {"cpu": 150.0, "wall": 100.0},
+        "edit_psnr": 22.5, "views": [64, 256, 128], "peak_mb": 3072.0, "curve": [],
+    }  # fmt: skip
+    lines = table([row], Path("bear"), 0.5).splitlines()
+    head, ruler, first = lines[4:7]
+    assert head.count("|") == ruler.count("|") == first.count("|")
+    cells = [cell.strip() for cell in first.split("|")[1:-1]]
+    assert cells[5:] == ["300", "150", "450", "300", "64, 256 x 128", "3.00"]
+    unedited = table([{k: v for k, v in row.items() if k != "edit"}], Path("bear"), 0.5)
+    assert unedited.splitlines()[6].count("|") == head.count("|")
