@@ -1,6 +1,5 @@
 """The command line as a person meets it, in the process of the tests where that is not the point."""
 
-import functools
 import json
 import os
 import resource
@@ -185,13 +184,8 @@ def test_the_number_of_threads_changes_no_bit(data, tmp_path):
 
 
 def start_and_wait_for_a_checkpoint(arguments, out):
-    # A background job of a shell ignores the signal, and so would what it starts.
-    listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(
-        [*ATTNWARP, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=listening,
+        [*ATTNWARP, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     end = time.monotonic() + 100
     while not (out / "checkpoint.pt").exists():

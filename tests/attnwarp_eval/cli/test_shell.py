@@ -2,7 +2,6 @@
 
 import errno
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -25,7 +24,6 @@ with clear_errors(), resumable(lambda: "3 cells are kept"):
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
-    # A background job of a shell ignores SIGINT, and so would what it starts.
     program = "import typer\napp = typer.Typer()\n@app.command()\ndef main():\n"
     program += "".join(f"    {line}\n" for line in INTERRUPTED.format(name=name).splitlines())
     done = subprocess.run(
@@ -33,7 +31,6 @@ def test_a_polite_kill_says_what_is_kept_as_ctrl_c_does(name):
         capture_output=True,
         text=True,
         timeout=60,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     assert done.returncode == 130
     expected = "attnwarp-eval: interrupted; 3 cells are kept, the same command goes on from here\n"
