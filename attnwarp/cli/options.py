@@ -12,6 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
+from attnwarp import __version__
+
 
 class Kind(StrEnum):
     """What a person may type for the kind of splats."""
@@ -128,3 +130,20 @@ def reading_options(*, without: str | None = None) -> Callable[[Callable[..., No
         return run
 
     return decorate
+
+
+def _print_version(context: typer.Context, asked: bool) -> None:
+    if asked:
+        typer.echo(f"{context.command.name} {__version__}")
+        raise typer.Exit
+
+
+def program_options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options without a command, of either program."""
