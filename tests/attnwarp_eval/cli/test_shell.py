@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -103,3 +104,19 @@ def test_a_log_file_gets_each_line_whole(capsys):
         show.line(lost)
         show(1, 18, lost)
     assert capsys.readouterr().err == f"{lost}\n[1/18] {lost}\n"
+
+
+def test_a_log_file_gets_the_time_left_by_the_mean_of_the_cells_so_far(capsys, monkeypatch):
+    seconds = iter((0.0, 20.0, 70.0, 90.0))
+    fake = types.SimpleNamespace(perf_counter=lambda: next(seconds))
+    monkeypatch.setattr("attnwarp.progress.time", fake)
+    with progress(9, done=5, lines=True) as show:
+        for done in (6, 7, 8, 9):
+            show(done, 9, "cell")
+    # After 20 s a cell is done and two are left; after 70 s two are, and one is left.
+    assert capsys.readouterr().err.splitlines() == [
+        "[6/9] cell",
+        "[7/9] cell, 40 s left",
+        "[8/9] cell, 35 s left",
+        "[9/9] cell",
+    ]
