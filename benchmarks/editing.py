@@ -33,6 +33,7 @@ from attnwarp.process import core_count
 from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
 from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
+from benchmarks import command
 
 INSTRUCTION = "make it snow"
 
@@ -114,7 +115,7 @@ def measure(
     result = propagate(fitted.gaussians, views.cameras, images, editor, INSTRUCTION, chosen)
     figures["edit"] = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}
     figures["edit_psnr"] = result.edit_psnr["mean"]
-    stored.write_text(json.dumps(figures, indent=1) + "\n")
+    command.write_figures(stored, figures)
     return figures
 
 
@@ -275,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         text = ratio_table(figures, os.getloadavg()[0])
         if options.out is not None:
-            options.out.write_text(text)
+            command.write_text(options.out, text)
         print(text)
         return
     data = options.data
@@ -296,7 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
             text = table(rows, data, os.getloadavg()[0])
             if options.out is not None:
-                options.out.write_text(text)
+                command.write_text(options.out, text)
     print(text)
 
 
