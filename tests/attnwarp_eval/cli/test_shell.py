@@ -63,15 +63,13 @@ def test_a_closed_pipe_is_no_regression(buffered):
 @pytest.mark.parametrize(("reader", "expected"), [("listens", 1), ("is gone", 141)])
 def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
     from attnwarp_eval.compare import Snapshot, read_snapshot, write_baseline
-    from attnwarp_eval.study import Store, parse_study
-    from attnwarp_eval.study.run import expected as expected_cells
-    from attnwarp_eval.study.run import plan
+    from attnwarp_eval.study import Store, parse_study, run
 
     # A run without a single cell lacks every one of them.
     content = {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}}
     store = Store(tmp_path / "run")
     study = parse_study(content | {"probes": {"depth": ["a"]}})
-    store.write_study(expected_cells(plan(study, store)))
+    store.write_study(run.expected(run.plan(study, store)))
     write_baseline(tmp_path / "baseline.jsonl", Snapshot("my", "", ()))
     assert read_snapshot(store).missing
     command = [*PRINTS[:-2], "compare", str(tmp_path / "baseline.jsonl"), str(store.root)]
