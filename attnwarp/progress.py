@@ -13,6 +13,38 @@ if TYPE_CHECKING:
 LINE_SECONDS = 10.0
 """Seconds between two lines where there is no terminal."""
 
+PACE_SECONDS = 5.0
+"""The time left is not told earlier: the first steps compile and say little of the others."""
+
+
+class Pace:
+    """Tells the time left by the mean pace since the first count, that of a resumed work included.
+
+    Example:
+        >>> from attnwarp.progress import Pace
+        >>> Pace().left(3, 9)  # too early to tell
+        ''
+    """
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def left(self, done: int, total: int) -> str:
+        """The end of a line, such as ", 3 min left"; empty while it cannot be told."""
+        now = time.perf_counter()
+        if self._first is None:
+            self._first = now, done
+        began, before = self._first
+        if now - began < PACE_SECONDS or not before < done < total:
+            return ""
+        return f", {_duration((now - began) / (done - before) * (total - done))} left"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
 
 class Show(Protocol):
     """Shows how work stands."""
@@ -29,7 +61,7 @@ def display(console: Console | None = None, *, title: str) -> Iterator[Show]:
     """A display of progress on stderr, or on another console.
 
     Args:
-        console: of rich; a terminal gets a bar, anything else lines.
+        console: of rich; a terminal gets a bar, anything else lines with the time left.
         title: of the work.
 
     Example:
@@ -73,14 +105,15 @@ def display(console: Console | None = None, *, title: str) -> Iterator[Show]:
 
 def _lines(console: Console, title: str) -> Show:
     last = time.perf_counter()
+    pace = Pace()
 
     def show(done: int, total: int, text: str, line: str | None = None) -> None:
         nonlocal last
-        now = time.perf_counter()
+        now, left = time.perf_counter(), pace.left(done, total)
         if now - last < LINE_SECONDS and done != total:
             return
         last = now
-        whole = f"{title} [{done}/{total}] {text if line is None else line}"
+        whole = f"{title} [{done}/{total}] {text if line is None else line}{left}"
         console.print(whole, markup=False, highlight=False, soft_wrap=True)
 
     return show

@@ -40,5 +40,10 @@ def add_turns(parser: argparse.ArgumentParser, quick: str, rounds: int) -> None:
 def write_figures(path: Path | None, figures: Any) -> None:
     """Write what ``--out`` asks for as JSON; nothing where it was left out."""
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(figures, indent=1) + "\n")
+        write_text(path, json.dumps(figures, indent=1))
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file's text with a newline at its end, in a folder that is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"{text}\n")

@@ -34,6 +34,7 @@ from attnwarp.propagate import PRESETS, PropagateSettings, preset, propagate
 from attnwarp.propagate.command import FitPlan
 from attnwarp.render.threads import set_thread_count
 from attnwarp_eval.cost import peak_memory_mb
+from benchmarks import command
 
 INSTRUCTION = "make it snow"
 
@@ -117,7 +118,7 @@ def measure(
     figures["edit_psnr"] = result.edit_psnr["mean"]
     figures["views"] = [len(result.edited), *images[0].shape[1::-1]]
     figures["peak_mb"] = peak_memory_mb()
-    stored.write_text(json.dumps(figures, indent=1) + "\n")
+    command.write_figures(stored, figures)
     return figures
 
 
@@ -282,7 +283,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         text = ratio_table(figures, os.getloadavg()[0])
         if options.out is not None:
-            options.out.write_text(text)
+            command.write_text(options.out, text)
         print(text)
         return
     data = options.data
@@ -303,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
             text = table(rows, data, os.getloadavg()[0])
             if options.out is not None:
-                options.out.write_text(text)
+                command.write_text(options.out, text)
     print(text)
 
 

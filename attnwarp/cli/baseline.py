@@ -11,13 +11,9 @@ import typer
 from attnwarp.cli.files import read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
-    FormatOption,
-    IgnoreOption,
-    ImagesOption,
     MaxSizeOption,
-    MissingImages,
-    MissingOption,
-    ResizeOption,
+    Reading,
+    reading_options,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
 from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
@@ -32,6 +28,7 @@ class BaselineMethod(StrEnum):
     gaussctrl = "gaussctrl"
 
 
+@reading_options()
 def baseline(
     method: Annotated[BaselineMethod, typer.Argument(help="Of docs/baselines.md.")],
     data: DataArgument,
@@ -55,11 +52,8 @@ def baseline(
     max_size: MaxSizeOption = None,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
-    format: FormatOption = None,
-    images: ImagesOption = None,
-    missing_images: MissingOption = MissingImages.error,
-    resize_cameras: ResizeOption = False,
-    ignore_key: IgnoreOption = None,
+    *,
+    reading: Reading,
 ) -> None:
     """Edit a scene by another method, for comparison with attnwarp edit."""
     with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
@@ -72,15 +66,7 @@ def baseline(
         use_threads(threads)
         from attnwarp.baselines.command import edit_dataset
 
-        dataset = read_views(
-            data,
-            format=format,
-            images=images,
-            missing_images=missing_images,
-            resize_cameras=resize_cameras,
-            ignore_keys=ignore_key or [],
-            points=False,
-        )
+        dataset = read_views(data, reading, points=False)
         result = edit_dataset(
             method.value, dataset, read_splats(ply, None, None), editor, instruction, settings,
             out, budget=budget, max_size=max_size, device=device, threads=threads,

@@ -12,13 +12,9 @@ from attnwarp.cli.options import (
     AntialiasedOption,
     Coordinates,
     DataArgument,
-    FormatOption,
-    IgnoreOption,
-    ImagesOption,
-    MissingImages,
-    MissingOption,
-    ResizeOption,
+    Reading,
     SplatKindOption,
+    reading_options,
 )
 from attnwarp.cli.shell import check_out, clear_errors
 
@@ -67,29 +63,19 @@ def convert(
         typer.echo(f"{out}: {len(splats)} splats")
 
 
+@reading_options()
 def undistort(
     data: DataArgument,
     out: Annotated[Path, typer.Argument(help="Folder for transforms.json and images/.")],
-    format: FormatOption = None,
-    images: ImagesOption = None,
-    missing_images: MissingOption = MissingImages.error,
-    resize_cameras: ResizeOption = False,
-    ignore_key: IgnoreOption = None,
+    *,
+    reading: Reading,
 ) -> None:
     """Resample pictures to pinhole cameras, for lens models that OpenCV has."""
     with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
         check_out(out)
         import attnwarp.io
 
-        dataset = read_views(
-            data,
-            format=format,
-            images=images,
-            missing_images=missing_images,
-            resize_cameras=resize_cameras,
-            ignore_keys=ignore_key or [],
-            distorted="keep",
-        )
+        dataset = read_views(data, reading, distorted="keep")
         count = sum(lens is not None for lens in dataset.lenses)
         result = attnwarp.io.undistort(dataset, out)
         typer.echo(f"{out}: {len(result)} pictures, {count} of them undistorted")

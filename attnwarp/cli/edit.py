@@ -11,15 +11,11 @@ import typer
 from attnwarp.cli.files import read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
-    FormatOption,
-    IgnoreOption,
-    ImagesOption,
     Kind,
     MaxSizeOption,
-    MissingImages,
-    MissingOption,
-    ResizeOption,
+    Reading,
     Store,
+    reading_options,
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, echo, use_threads
 from attnwarp.editing.command import (
@@ -45,6 +41,7 @@ class Preset(StrEnum):
     released_controlnet = "released-controlnet"
 
 
+@reading_options()
 def edit(
     data: DataArgument,
     instruction: InstructionOption,
@@ -106,11 +103,8 @@ def edit(
     store: Annotated[Store, typer.Option(help="Where recorded features are kept.")] = Store.cpu,
     device: DeviceOption = "cpu",
     threads: ThreadsOption = None,
-    format: FormatOption = None,
-    images: ImagesOption = None,
-    missing_images: MissingOption = MissingImages.error,
-    resize_cameras: ResizeOption = False,
-    ignore_key: IgnoreOption = None,
+    *,
+    reading: Reading,
 ) -> None:
     """Edit a scene: one view by an instruction, the others along with it, the splats on all."""
     with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
@@ -129,14 +123,7 @@ def edit(
 
         settings = attnwarp.propagate.settings.preset(preset.value, **changes)
         use_threads(threads)
-        dataset = read_views(
-            data,
-            format=format,
-            images=images,
-            missing_images=missing_images,
-            resize_cameras=resize_cameras,
-            ignore_keys=ignore_key or [],
-        )
+        dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, None, None)
         from attnwarp.propagate.command import FitPlan, edit_dataset
 

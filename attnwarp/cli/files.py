@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from attnwarp.cli.options import Kind
+from attnwarp.cli.options import Kind, Reading
 
 if TYPE_CHECKING:
     from attnwarp.gaussians import Gaussians
     from attnwarp.io import Dataset
 
 
-def read_views(path: Path, **options: Any) -> Dataset:
+def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
     """The data set at ``path``; whoever gives a scene in its place is told how a scene becomes
-    one."""
+    one.
+
+    Args:
+        path: as typed.
+        reading: the options that a person may type.
+        options: the command's own keywords of `attnwarp.io.read_dataset`, which go before those.
+    """
     from attnwarp.io import read_dataset
 
     export = f"attnwarp-eval scenes export {path} DIR"
@@ -28,11 +33,8 @@ def read_views(path: Path, **options: Any) -> Dataset:
         raise FileNotFoundError(
             f"{path}: no such file or folder; for a scene: {export}, then give DIR"
         )
-    options = {
-        name: value.value if isinstance(value, StrEnum) else value
-        for name, value in options.items()
-    }
-    return read_dataset(path, **options)
+    typed = {**vars(reading), "ignore_keys": reading.ignore_keys or ()}
+    return read_dataset(path, **(typed | options))
 
 
 def read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaussians:

@@ -11,14 +11,11 @@ import typer
 from attnwarp.cli.files import read_views, write_image
 from attnwarp.cli.options import (
     DataArgument,
-    FormatOption,
-    IgnoreOption,
-    ImagesOption,
     Kind,
     MaxSizeOption,
-    MissingImages,
-    MissingOption,
-    ResizeOption,
+    Reading,
+    RenderThreadsOption,
+    reading_options,
 )
 from attnwarp.cli.shell import STOPPED, assignments, check_out, clear_errors, echo, use_threads
 from attnwarp.process import asked_to_stop
@@ -32,6 +29,7 @@ OWN_OPTIONS = {
 }
 
 
+@reading_options()
 def fit(
     data: DataArgument,
     out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
@@ -60,9 +58,7 @@ def fit(
     checkpoint_seconds: Annotated[
         float, typer.Option(min=0, help="Seconds between two checkpoints.")
     ] = 30.0,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
-    ] = None,
+    threads: RenderThreadsOption = None,
     restart: Annotated[
         bool, typer.Option("--restart", help="Begin again without the checkpoint.")
     ] = False,
@@ -70,11 +66,8 @@ def fit(
         float | None,
         typer.Option(help="2dgs: third scale in the PLY, for viewers of 3DGS (1e-6)."),
     ] = None,
-    format: FormatOption = None,
-    images: ImagesOption = None,
-    missing_images: MissingOption = MissingImages.error,
-    resize_cameras: ResizeOption = False,
-    ignore_key: IgnoreOption = None,
+    *,
+    reading: Reading,
 ) -> None:
     """Fit splats to posed pictures. Stopped half-way and started again, it goes on where it was."""
     with clear_errors(
@@ -87,13 +80,7 @@ def fit(
         use_threads(threads)
         result = _fit(
             data,
-            {
-                "format": format,
-                "images": images,
-                "missing_images": missing_images,
-                "resize_cameras": resize_cameras,
-                "ignore_keys": ignore_key or [],
-            },
+            reading,
             out,
             kind,
             iterations,
@@ -130,7 +117,7 @@ def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
 
 def _fit(
     data: Path,
-    reading: dict[str, Any],
+    reading: Reading,
     out: Path,
     kind: Kind,
     iterations: int | None,
@@ -160,7 +147,7 @@ def _fit(
     from attnwarp.fit.progress import more_points, progress_display
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
-    dataset = read_views(data, **reading)
+    dataset = read_views(data, reading)
     train, test = attnwarp.fit.hold_out(dataset, every)
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
 
 import typer
 
-from attnwarp import __version__
 from attnwarp.cli.baseline import baseline
 from attnwarp.cli.convert import convert, undistort
 from attnwarp.cli.edit import edit
 from attnwarp.cli.fit import fit
 from attnwarp.cli.inspect import inspect
+from attnwarp.cli.options import program_options
 from attnwarp.cli.render import render
 from attnwarp.cli.shell import CLOSED_PIPE, clear_errors, closed_pipe, fail, file_error
 from attnwarp.editing.command import edit_image
@@ -33,25 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-
-def _print_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"attnwarp {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
-        ),
-    ] = False,
-) -> None:
-    """Options without a command."""
-
-
+app.callback()(program_options)
 app.command()(fit)
 app.command()(edit)
 app.command()(render)

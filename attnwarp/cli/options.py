@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from attnwarp import __version__
 
 
 class Kind(StrEnum):
@@ -56,29 +62,8 @@ MaxSizeOption = Annotated[
 ]
 
 
-FormatOption = Annotated[
-    Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")
-]
-
-
-ImagesOption = Annotated[Path | None, typer.Option(help="Folder of the images of a COLMAP model.")]
-
-
-ResizeOption = Annotated[
-    bool, typer.Option("--resize-cameras", help="Fit cameras to images of another size.")
-]
-
-
-IgnoreOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--ignore-key", metavar="KEY", help="Pass over this key of a transforms.json (mask_path)."
-    ),
-]
-
-
-MissingOption = Annotated[
-    MissingImages, typer.Option(help="none: leave out cameras whose image is not there.")
+RenderThreadsOption = Annotated[
+    int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
 ]
 
 
@@ -94,3 +79,71 @@ AntialiasedOption = Annotated[
         help="Whether the splats were fitted antialiased, whatever the file says.",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a data set is read: the keywords of `attnwarp.io.read_dataset`, each an option."""
+
+    format: Annotated[
+        Format | None, typer.Option(help="What DATA is, where its folder holds both formats.")
+    ] = None
+    images: Annotated[Path | None, typer.Option(help="Folder of the images of a COLMAP model.")] = (
+        None
+    )
+    missing_images: Annotated[
+        MissingImages, typer.Option(help="none: leave out cameras whose image is not there.")
+    ] = MissingImages.error
+    resize_cameras: Annotated[
+        bool, typer.Option("--resize-cameras", help="Fit cameras to images of another size.")
+    ] = False
+    ignore_keys: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ignore-key",
+            metavar="KEY",
+            help="Pass over this key of a transforms.json (mask_path).",
+        ),
+    ] = None
+
+
+def reading_options(*, without: str | None = None) -> Callable[[Callable[..., None]], Any]:
+    """Give a command an option for each field of `Reading`, in place of its argument ``reading``.
+
+    Typer reads a command's options from its signature, so the fields are put there.
+
+    Args:
+        without: a field that is no option of this command and keeps its default.
+    """
+    fields = inspect.signature(Reading, eval_str=True).parameters
+    options = [field for name, field in fields.items() if name != without]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            reading = Reading(**{option.name: values.pop(option.name) for option in options})
+            command(**values, reading=reading)
+
+        signature = inspect.signature(command, eval_str=True)
+        own = [p for p in signature.parameters.values() if p.name != "reading"]
+        run.__signature__ = signature.replace(parameters=[*own, *options])  # type: ignore[attr-defined]
+        return run
+
+    return decorate
+
+
+def _print_version(context: typer.Context, asked: bool) -> None:
+    if asked:
+        typer.echo(f"{context.command.name} {__version__}")
+        raise typer.Exit
+
+
+def program_options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Options without a command, of either program."""

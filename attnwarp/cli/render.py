@@ -12,15 +12,15 @@ import typer
 from attnwarp.cli.files import read_splats, read_views, write_image
 from attnwarp.cli.options import (
     AntialiasedOption,
-    FormatOption,
-    IgnoreOption,
-    ImagesOption,
-    ResizeOption,
+    Reading,
+    RenderThreadsOption,
     SplatKindOption,
+    reading_options,
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
 
 
+@reading_options(without="missing_images")
 def render(
     model: Annotated[Path, typer.Argument(help="Splats: a PLY file.")],
     cameras: Annotated[
@@ -39,18 +39,14 @@ def render(
     depth: Annotated[
         bool, typer.Option("--depth", help="Also NAME.depth.npy: median depth, NaN where none.")
     ] = False,
-    threads: Annotated[
-        int | None, typer.Option(min=1, help="CPU threads; all cores if left out.")
-    ] = None,
+    threads: RenderThreadsOption = None,
     normal: Annotated[
         bool, typer.Option("--normal", help="Also NAME.normal.png: (n + 1) / 2 in world axes.")
     ] = False,
     kind: SplatKindOption = None,
     antialiased: AntialiasedOption = None,
-    format: FormatOption = None,
-    images: ImagesOption = None,
-    resize_cameras: ResizeOption = False,
-    ignore_key: IgnoreOption = None,
+    *,
+    reading: Reading,
 ) -> None:
     """Render splats from every camera of a data set; the images need not be there."""
     with clear_errors(f"stopped; the files in {out} are whole, and the same command renders all"):
@@ -65,15 +61,7 @@ def render(
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased)
-        views = read_views(
-            cameras,
-            format=format,
-            images=images,
-            missing_images="none",
-            resize_cameras=resize_cameras,
-            ignore_keys=ignore_key or [],
-            points=False,
-        ).cameras
+        views = read_views(cameras, reading, missing_images="none", points=False).cameras
         out.mkdir(parents=True, exist_ok=True)
         for camera, name in zip(views, file_stems(views), strict=True):
             if size is not None:

@@ -205,6 +205,7 @@ def render(
     Raises:
         ValueError: an argument out of range or of the wrong shape, or something that backend "cuda"
             computes differently; the message says which and what was expected.
+        TypeError: an argument of another type; the message says which.
         RuntimeError: backend "cuda" without a GPU or without gsplat.
 
     Example:
@@ -341,11 +342,7 @@ def _prepare(
     if background is None:
         behind = torch.zeros(channels, device=device)
     else:
-        behind = (
-            background
-            if isinstance(background, Tensor)
-            else torch.tensor(background, device=device)
-        )
+        behind = _as_tensor(background, channels, device)
         if not behind.is_floating_point() and not behind.requires_grad:
             behind = behind.float()
         check.shape(behind, (channels,), "background")
@@ -371,6 +368,17 @@ def _prepare(
         and (gaussians.antialiased if antialiased is None else bool(antialiased)),
         ndc=(float(ndc[0]), float(ndc[1])),
     )
+
+
+def _as_tensor(background: Tensor | Sequence[float], channels: int, device: torch.device) -> Tensor:
+    if isinstance(background, Tensor):
+        return background
+    try:
+        return torch.tensor(background, device=device)
+    except (TypeError, ValueError, RuntimeError):  # a word, an object; rows of unequal length
+        raise TypeError(
+            f"background: got {background!r}, expected a tensor or a sequence of {channels} numbers"
+        ) from None
 
 
 def _floating(tensor: Tensor, name: str, device: torch.device) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image as PillowImage
+import PIL.Image
 from PIL import ImageDraw
 
 from attnwarp.editing.editor import Image
@@ -30,7 +30,7 @@ SCALE = 2
 
 def sheet(
     answer: Answer, worlds: Worlds, *, size: int, instructions: Sequence[str] = INSTRUCTIONS
-) -> PillowImage.Image:
+) -> PIL.Image.Image:
     """A picture with a row a world: before, then the answer to each instruction.
 
     Args:
@@ -59,21 +59,21 @@ def sheet(
     return _arranged(rows, ["before", *instructions])
 
 
-def _arranged(rows: Sequence[Sequence[Image]], titles: Sequence[str]) -> PillowImage.Image:
+def _arranged(rows: Sequence[Sequence[Image]], titles: Sequence[str]) -> PIL.Image.Image:
     side, head = rows[0][0].shape[0] * SCALE, 14
-    picture = PillowImage.new("RGB", (side * len(titles), head + side * len(rows)), "white")
+    picture = PIL.Image.new("RGB", (side * len(titles), head + side * len(rows)), "white")
     draw = ImageDraw.Draw(picture)
     for column, title in enumerate(titles):
         draw.text((column * side + 3, 1), title, fill="black")
     for y, row in enumerate(rows):
         for x, image in enumerate(row):
-            tile = PillowImage.fromarray(np.rint(255 * image).astype(np.uint8))
-            tile = tile.resize((side, side), PillowImage.Resampling.NEAREST)
+            tile = PIL.Image.fromarray(np.rint(255 * image).astype(np.uint8))
+            tile = tile.resize((side, side), PIL.Image.Resampling.NEAREST)
             picture.paste(tile, (x * side, head + y * side))
     return picture
 
 
-def write_sheet(picture: PillowImage.Image, path: Path) -> Path:
+def write_sheet(picture: PIL.Image.Image, path: Path) -> Path:
     """Write a sheet as PNG; its folder is made if need be."""
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.save(path, optimize=True)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
 
 import typer
 
-from attnwarp import __version__
+from attnwarp.cli.options import program_options
 from attnwarp.cli.shell import CLOSED_PIPE, USAGE, closed_pipe
 from attnwarp.process import resend_lost_interrupts, skip_last_collection
 from attnwarp_eval.cli import (
@@ -43,25 +42,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-
-def _print_version(asked: bool) -> None:
-    if asked:
-        typer.echo(f"attnwarp-eval {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def options(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
-        ),
-    ] = False,
-) -> None:
-    """Options without a command."""
-
-
+app.callback()(program_options)
 for command in (
     run.run,
     run.report,

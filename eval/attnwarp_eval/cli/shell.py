@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from attnwarp.cli.shell import STOPPED, USAGE, closed_pipe
+from attnwarp.progress import Pace
 
 if TYPE_CHECKING:
     import rich.progress
@@ -111,6 +112,7 @@ class Progress:
         self._bar = bar
         self._task = task
         self._lines = lines and not console.is_terminal
+        self._pace = Pace()
 
     def __call__(self, done: int, total: int, step: str) -> None:
         """Show how far the work is.
@@ -122,7 +124,8 @@ class Progress:
         """
         self._bar.update(self._task, description=step, completed=done, total=total or None)
         if self._lines:
-            self.line(f"[{done}/{total}] {step}" if total else step)
+            left = self._pace.left(done, total)
+            self.line(f"[{done}/{total}] {step}{left}" if total else step)
 
     def step(self, text: str) -> None:
         """Name what is at work, without a count."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.document.model import Table
+from attnwarp_eval.experiments.distinct_scenes import distinct_scenes
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.scene.file import load_scene
 
@@ -69,11 +70,15 @@ def measure(
         geometry_size, size: of the square images of depth and ids, and of the pictures.
         spp: samples a pixel of the pictures.
         progress: told of each step of each scene.
+
+    Raises:
+        InputError: a scene that cannot be used, or two scenes of one name.
     """
     from attnwarp_eval.truth import Geometry, appearance
     from attnwarp_eval.truth.llvm import variant
     from attnwarp_eval.truth.mitsuba import forget
 
+    distinct_scenes(names)  # refused before the first is timed
     # What a process pays once (imports, the probe, compiled numba kernels) belongs to no scene.
     warm = load_scene("spheres").with_size(16, 16)
     Geometry(warm).trace(warm.source)

@@ -194,6 +194,17 @@ class Case:
                 error = float(self.measure(level, way))
         except ValueError as problem:  # attnwarp.errors.InputError is one
             refusal = str(problem)
+        return self.judge(level, way, error, refusal)
+
+    def judge(self, level: float, way: Way, error: float, refusal: str) -> Outcome:
+        """An error held against this case's bound.
+
+        Args:
+            level: one of ``levels``.
+            way: one of ``ways``.
+            error: in the bound's unit; NaN where the result is not finite, and where refused.
+            refusal: what was said where the input was refused, else empty.
+        """
         return Outcome(
             level,
             self.is_required(level, way.direction),

@@ -202,8 +202,15 @@ class Study(Part):
                 )
         return [name for name in available if not self.views or name in self.views]
 
-    def pictures_of(self, views: Iterable[str]) -> tuple[str, ...]:
-        """Those of the views that the study wants pictures of, in its own order."""
+    def pictures_of(self, views: Iterable[str], variant: str | None = None) -> tuple[str, ...]:
+        """Those of the views that the study wants pictures of, in its own order.
+
+        Args:
+            views: of a cell.
+            variant: of the cell; None where it has none, as in the calibration.
+        """
+        if variant is not None and variant not in self.pictures.variants:
+            return ()
         available = set(views)
         return tuple(view for view in self.pictures.views if view in available)
 

@@ -5,9 +5,9 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+import tiny_editors
 import torch
 from drawn_lines import drawn_distances
-from tiny_editors import unet as tiny_unet
 
 from attnwarp import Camera
 from attnwarp.baselines.attention import aligned, self_attention
@@ -19,7 +19,7 @@ SIDE = 8  # of the latents; half of it in the lower layers
 
 @pytest.fixture(scope="module")
 def network():
-    net = tiny_unet(8).double().requires_grad_(False)
+    net = tiny_editors.unet(8).double().requires_grad_(False)
     for module in layers(net).values():  # with random weights attention is a faint mean
         for part in (module.to_q, module.to_k, module.to_v, module.to_out[0]):
             part.weight *= 4

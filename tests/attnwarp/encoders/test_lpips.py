@@ -46,11 +46,11 @@ SIZES = ((40, 40), (33, 48))
 
 
 def test_it_is_torchmetrics_network(placed, monkeypatch):
-    from torchmetrics.functional.image import lpips as theirs
+    from torchmetrics.functional.image import lpips
 
     folder, network, name = placed
-    monkeypatch.setattr(theirs, "_get_tv_model_features", lambda net, pretrained=False: network)
-    judge = theirs._LPIPS(pretrained=True, net=name, pnet_rand=False, eval_mode=True)
+    monkeypatch.setattr(lpips, "_get_tv_model_features", lambda net, pretrained=False: network)
+    judge = lpips._LPIPS(pretrained=True, net=name, pnet_rand=False, eval_mode=True)
     encoder = load_encoder(f"lpips:{folder}", "perceptual")
     a, b = pictures(*SIZES), pictures(*SIZES, seed=1)
     got = encoder.distance(a, b)

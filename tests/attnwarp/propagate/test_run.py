@@ -13,6 +13,7 @@ from tiny_baselines import rows_of
 from tiny_editors import nearest_steps
 from tiny_scenes import cameras, pictures, splats
 
+import attnwarp.warp
 from attnwarp import Camera, Gaussians
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import Schedule
@@ -21,7 +22,6 @@ from attnwarp.io import read_image, read_ply
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate.pictures import to_bytes
 from attnwarp.warp import Surface, warp_surfaces
-from attnwarp.warp import preset as warp_preset
 
 QUICK = preset("corrected", stages=2, views_per_stage=2, steps=2, iterations=3)
 
@@ -136,7 +136,7 @@ def test_one_step_is_the_written_out_injection_in_float64(editor, monkeypatch):
     random = np.random.default_rng(0)
     images = [random.random((32, 32, 3)).astype(np.float32) for _ in views]
     settings = replace(
-        QUICK, steps=1, stages=1, iterations=0, a0=0.7, mask=False, warp=warp_preset("corrected", normal_test="none"),
+        QUICK, steps=1, stages=1, iterations=0, a0=0.7, mask=False, warp=attnwarp.warp.preset("corrected", normal_test="none"),
     )  # fmt: skip
     result = propagate(model, views, images, editor, "a bear", settings)
 
@@ -290,7 +290,7 @@ def test_killed_at_20_random_moments_it_gives_the_same_bytes(finished, scene, ed
     ("settings", "words", "message"),
     [
         ({"steps": 3}, "a bear", r"settings\.steps \(2, now 3\)"),
-        ({"warp": warp_preset("corrected", opaque=0.9)}, "a bear", r"settings\.warp\.opaque \(0\.5, now 0\.9\)"),
+        ({"warp": attnwarp.warp.preset("corrected", opaque=0.9)}, "a bear", r"settings\.warp\.opaque \(0\.5, now 0\.9\)"),
         ({}, "a robot", r'instruction \("a bear", now "a robot"\)'),
     ],
 )  # fmt: skip

@@ -5,13 +5,13 @@ from dataclasses import fields, replace
 
 import pytest
 
+import attnwarp.warp
 from attnwarp.propagate import PRESETS, Plan, PropagateSettings, preset
-from attnwarp.warp import PRESETS as WARPS
 
 TABLE = {
     # field: (paper, released, corrected)
     "views_per_stage": (40, 40, None),
-    "warp": (WARPS["paper"], WARPS["released"], WARPS["corrected"]),
+    "warp": tuple(attnwarp.warp.PRESETS[name] for name in ("paper", "released", "corrected")),
     "noise": ("shared", "shared", "shared"),
     "start": (None, (700, 980), None),
     "depth_from": ("current", "current", "frozen"),

@@ -84,6 +84,17 @@ def test_other_types_are_refused() -> None:
         render(gaussians(), camera(), pose=np.eye(4))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("background", ["white", ["1", "1", "1"], [1.0, None, 1.0], object()])
+def test_a_background_that_is_no_numbers_is_named_with_how_many_are_expected(
+    background: Any,
+) -> None:
+    # Four features, so that the number is not that of colours.
+    with pytest.raises(TypeError, match=r"background: got .*expected .* sequence of 4 numbers"):
+        render(gaussians(), camera(), background=background, features=torch.zeros(3, 4))
+    with pytest.raises(TypeError, match="background: got .*, expected a tensor or .* 3 numbers"):
+        render(gaussians(), camera(), background=background)
+
+
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("kind", ["2d", "3d"])
 @pytest.mark.parametrize("size", [(1, 1), (7, 1), (1, 9), (9, 17)])

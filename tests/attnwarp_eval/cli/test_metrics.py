@@ -734,8 +734,8 @@ def test_a_picture_rewritten_during_the_run_is_stored_under_its_new_hash(tmp_pat
 
 
 def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
+    import attnwarp.cli.main
     from attnwarp.camera import Camera
-    from attnwarp.cli.main import app as renderer
     from attnwarp.fit import from_points
     from attnwarp.io import Dataset, write_ply, write_transforms
 
@@ -751,7 +751,7 @@ def test_normals_and_depth_that_render_writes_are_no_views(tmp_path):
     write_transforms(tmp_path / "cameras", Dataset(cameras, [None] * 2))
     for out, more in (("renders", ["--normal", "--depth"]), ("edited", ["--background", "white"])):
         arguments = [tmp_path / "splats.ply", tmp_path / "cameras", "--out", tmp_path / out, *more]
-        done = CliRunner().invoke(renderer, ["render", *map(str, arguments)])
+        done = CliRunner().invoke(attnwarp.cli.main.app, ["render", *map(str, arguments)])
         assert done.exit_code == 0, done.output
     assert (tmp_path / "renders" / "left.normal.png").is_file()
     # A map without its picture is a view like any other.

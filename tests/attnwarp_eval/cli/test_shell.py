@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -59,15 +60,13 @@ def test_a_closed_pipe_is_no_regression(buffered):
 @pytest.mark.parametrize(("reader", "expected"), [("listens", 1), ("is gone", 141)])
 def test_a_regression_is_told_from_a_closed_pipe(reader, expected, tmp_path):
     from attnwarp_eval.compare import Snapshot, read_snapshot, write_baseline
-    from attnwarp_eval.study import Store, parse_study
-    from attnwarp_eval.study.run import expected as expected_cells
-    from attnwarp_eval.study.run import plan
+    from attnwarp_eval.study import Store, parse_study, run
 
     # A run without a single cell lacks every one of them.
     content = {"name": "my", "scenes": ["spheres"], "variants": {"a": {}}}
     store = Store(tmp_path / "run")
     study = parse_study(content | {"probes": {"depth": ["a"]}})
-    store.write_study(expected_cells(plan(study, store)))
+    store.write_study(run.expected(run.plan(study, store)))
     write_baseline(tmp_path / "baseline.jsonl", Snapshot("my", "", ()))
     assert read_snapshot(store).missing
     command = [*PRINTS[:-2], "compare", str(tmp_path / "baseline.jsonl"), str(store.root)]
@@ -100,3 +99,19 @@ def test_a_log_file_gets_each_line_whole(capsys):
         show.line(lost)
         show(1, 18, lost)
     assert capsys.readouterr().err == f"{lost}\n[1/18] {lost}\n"
+
+
+def test_a_log_file_gets_the_time_left_by_the_mean_of_the_cells_so_far(capsys, monkeypatch):
+    seconds = iter((0.0, 20.0, 70.0, 90.0))
+    fake = types.SimpleNamespace(perf_counter=lambda: next(seconds))
+    monkeypatch.setattr("attnwarp.progress.time", fake)
+    with progress(9, done=5, lines=True) as show:
+        for done in (6, 7, 8, 9):
+            show(done, 9, "cell")
+    # After 20 s a cell is done and two are left; after 70 s two are, and one is left.
+    assert capsys.readouterr().err.splitlines() == [
+        "[6/9] cell",
+        "[7/9] cell, 40 s left",
+        "[8/9] cell, 35 s left",
+        "[9/9] cell",
+    ]

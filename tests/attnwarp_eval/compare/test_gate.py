@@ -20,8 +20,7 @@ from attnwarp_eval.compare.pictures import pictures_of_baseline
 from attnwarp_eval.compare.snapshot import definition
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.study import Store, load_study, parse_study
-from attnwarp_eval.study.probes import depth as depth_probe
-from attnwarp_eval.study.probes import warp as warp_probe
+from attnwarp_eval.study.probes import depth, warp
 from attnwarp_eval.study.run import execute, plan
 
 BASELINE = pathlib.Path(__file__).parents[3] / "reports" / "baseline" / "gate.jsonl"
@@ -67,8 +66,8 @@ def half_a_pixel(patch):
         moved = dataclasses.replace(view.correspondence, xy=view.correspondence.xy + 0.5)
         return dataclasses.replace(view, correspondence=moved)
 
-    warp_view = warp_probe.warp_view
-    patch.setattr(warp_probe, "warp_view", shifted)
+    warp_view = warp.warp_view
+    patch.setattr(warp, "warp_view", shifted)
 
 
 def one_percent_in_depth(patch):
@@ -76,8 +75,8 @@ def one_percent_in_depth(patch):
         surface = render_surface(*arguments)
         return dataclasses.replace(surface, depth=1.01 * surface.depth)
 
-    render_surface = depth_probe.render_surface
-    patch.setattr(depth_probe, "render_surface", scaled)
+    render_surface = depth.render_surface
+    patch.setattr(depth, "render_surface", scaled)
 
 
 def a_mask_rule_lost(patch):
@@ -85,8 +84,8 @@ def a_mask_rule_lost(patch):
         without = dataclasses.replace(settings, depth_agreement=False)
         return warp_view(model, source, target, without, **options)
 
-    warp_view = warp_probe.warp_view
-    patch.setattr(warp_probe, "warp_view", lax)
+    warp_view = warp.warp_view
+    patch.setattr(warp, "warp_view", lax)
 
 
 def a_dropped_metric(patch):
@@ -95,8 +94,8 @@ def a_dropped_metric(patch):
         del figures["warp.epe_median"]
         return figures
 
-    warp_figures = warp_probe.warp_figures
-    patch.setattr(warp_probe, "warp_figures", fewer)
+    warp_figures = warp.warp_figures
+    patch.setattr(warp, "warp_figures", fewer)
 
 
 def a_doubled_counter(patch):
@@ -113,8 +112,8 @@ def a_dropped_cell(patch):
             raise MemoryError("planted")
         return compute(self, work)
 
-    compute = warp_probe.Warp.compute
-    patch.setattr(warp_probe.Warp, "compute", fails)
+    compute = warp.Warp.compute
+    patch.setattr(warp.Warp, "compute", fails)
 
 
 FOUND = {

@@ -197,11 +197,12 @@ def test_two_scenes_of_one_name_are_refused_and_one_named_twice_is_one(tmp_path)
     text = (scene_folders()[-1] / "opposed.yaml").read_text()
     other = tmp_path / "opposed.yaml"
     other.write_text(text.replace("bounces: auto", "bounces: 2"))
-    command = ["scenes", "accuracy", "opposed", str(other), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 2 and not (tmp_path / "out").exists()
-    line = f"opposed and {other}: two scenes have the name 'opposed'"
-    assert line in " ".join(result.stderr.split())
+    out = tmp_path / "out"
+    for command in (["accuracy", "--out", str(out)], ["time", "--json"]):
+        result = CliRunner().invoke(app, ["scenes", *command, "opposed", str(other)])
+        assert (result.exit_code, result.stdout) == (2, "") and not out.exists()
+        line = f"opposed and {other}: two scenes have the name 'opposed'"
+        assert line in " ".join(result.stderr.split())
     assert [s.content_hash for s in distinct_scenes(["opposed", "fog", "opposed"])] == [
         load_scene(name).content_hash for name in ("opposed", "fog")
     ]

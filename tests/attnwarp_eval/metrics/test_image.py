@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+import skimage.metrics
 import torch
 from imported_modules import modules_after
-from skimage import metrics as skimage
 from torchmetrics.functional.image import (
     multiscale_structural_similarity_index_measure,
     peak_signal_noise_ratio,
@@ -41,9 +41,9 @@ SIZES = [(11, 11), (12, 31), (40, 52), (64, 64), (177, 200)]
 def test_mse_and_psnr_are_those_of_scikit_image_and_torchmetrics(size):
     image, target = pictures(*size)
     assert metrics.mse(image, target) == pytest.approx(
-        skimage.mean_squared_error(image, target), rel=1e-12
+        skimage.metrics.mean_squared_error(image, target), rel=1e-12
     )
-    expected = skimage.peak_signal_noise_ratio(target, image, data_range=1.0)
+    expected = skimage.metrics.peak_signal_noise_ratio(target, image, data_range=1.0)
     assert metrics.psnr(image, target) == pytest.approx(expected, abs=1e-10)
     other = peak_signal_noise_ratio(tensor(image), tensor(target), data_range=1.0)
     # Its factor 10 / ln 10 is float32: 5e-8 of 17 dB.
@@ -53,7 +53,7 @@ def test_mse_and_psnr_are_those_of_scikit_image_and_torchmetrics(size):
 @pytest.mark.parametrize("size", SIZES)
 def test_ssim_is_that_of_scikit_image_and_torchmetrics(size):
     image, target = pictures(*size)
-    expected, full = skimage.structural_similarity(
+    expected, full = skimage.metrics.structural_similarity(
         image,
         target,
         gaussian_weights=True,
@@ -357,7 +357,7 @@ def test_edit_psnr_of_whole_views_of_one_size_is_that_of_one_stack():
         {k: v[0] for k, v in views.items()}, {k: v[1] for k, v in views.items()}
     )
     stacked = [np.concatenate([v[side] for v in views.values()]) for side in (0, 1)]
-    expected = skimage.peak_signal_noise_ratio(*stacked, data_range=1.0)
+    expected = skimage.metrics.peak_signal_noise_ratio(*stacked, data_range=1.0)
     assert got.pooled == pytest.approx(expected, abs=1e-10)
     # Jensen: decibels averaged are never less.
     assert got.mean_finite > got.pooled

@@ -1,6 +1,6 @@
 """What a page begins with. Oracle: hand-made records whose differences follow by hand."""
 
-import pathlib
+import inspect
 import re
 
 import pytest
@@ -8,7 +8,9 @@ import written_runs
 
 from attnwarp_eval.document.model import Slider
 from attnwarp_eval.report.findings import findings
+from attnwarp_eval.study import pictures
 from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.probes import editing
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.record import PictureFile
 
@@ -122,7 +124,7 @@ def test_an_edit_is_shown_beside_its_counterpart_or_else_beside_the_unedited_vie
 def test_every_content_that_a_finding_looks_for_is_one_that_a_picture_has():
     from attnwarp_eval.report.findings import CONTENTS
 
-    study = pathlib.Path(findings.__code__.co_filename).parents[1] / "study"
-    sources = (study / "pictures.py", study / "probes" / "editing.py")
-    drawn = set(re.findall(r'"([a-z-]+)":', "".join(path.read_text() for path in sources)))
+    # The keys of the dictionaries of pictures, and of nothing else in their modules.
+    drawing = (pictures.of_warp, pictures.of_depth, pictures.of_fit, editing._Measure._draw)
+    drawn = set(re.findall(r'"([a-z-]+)":', "".join(map(inspect.getsource, drawing))))
     assert {content for contents in CONTENTS.values() for content in contents} <= drawn

@@ -5,10 +5,10 @@ import struct
 import warnings
 from pathlib import Path
 
+import matplotlib.path
 import numpy as np
 import pytest
 from damage_files import mutate_bytes, mutate_text, survey
-from matplotlib.path import Path as Outline
 
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES, read_mesh, read_mesh_file
@@ -128,7 +128,7 @@ def test_a_polygon_becomes_triangles_that_fill_it_and_nothing_else(outline, turn
     assert (np.sign(shoelace(outline)) * signed >= -1e-12).all()
     assert signed.sum() == pytest.approx(shoelace(outline), rel=1e-12)
     middles = flat.mean(1)[np.abs(signed) > 1e-9]
-    assert Outline(outline).contains_points(middles).all()
+    assert matplotlib.path.Path(outline).contains_points(middles).all()
 
 
 def test_many_polygons_keep_their_order_and_a_crossed_one_is_left_out(tmp_path):

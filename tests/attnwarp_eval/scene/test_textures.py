@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from skimage import color as skimage_color
+import skimage.color
 
 from attnwarp_eval.colors import to_linear, to_srgb
 from attnwarp_eval.scene.textures import (
@@ -20,7 +20,7 @@ def test_the_srgb_curve_is_the_one_of_the_standard():
     # skimage's rgb2xyz linearises with the curve of IEC 61966-2-1; grey of linear value v has Y =
     # v.
     grey = np.repeat(values[:, None], 3, axis=1)
-    assert np.abs(skimage_color.rgb2xyz(grey)[:, 1] - to_linear(values)).max() < 1e-6
+    assert np.abs(skimage.color.rgb2xyz(grey)[:, 1] - to_linear(values)).max() < 1e-6
     assert np.abs(to_srgb(to_linear(values)) - values).max() < 1e-7
     assert to_srgb(np.float32([0.5])).dtype == np.float32
     assert to_srgb([-1.0, 2.0]).tolist() == pytest.approx([0.0, 1.0], abs=1e-15)

@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 import attnwarp
 import attnwarp_eval
+import attnwarp_eval.study.cluster
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
-from attnwarp_eval.study import cluster as cluster_module
 from attnwarp_eval.study.store import Store
 
 ROOT = pathlib.Path(attnwarp.__file__).parents[1]
@@ -230,7 +230,7 @@ def test_a_cluster_that_closes_badly_does_not_hide_the_interrupt():
         def close(self):
             raise TimeoutError
 
-    with pytest.raises(KeyboardInterrupt), cluster_module._closed(Stuck()):
+    with pytest.raises(KeyboardInterrupt), attnwarp_eval.study.cluster._closed(Stuck()):
         raise KeyboardInterrupt
 
 
@@ -253,11 +253,11 @@ def test_a_scheduler_that_is_none_is_refused_in_one_line(home, monkeypatch, sche
 
 def test_workers_that_start_together_start_with_different_probes_and_get_every_cell_once():
     cells = [
-        cluster_module.Cell({}, scene, "v", probe, 0)
+        attnwarp_eval.study.cluster.Cell({}, scene, "v", probe, 0)
         for scene in "ab"
         for probe in ("depth", "warp")
     ]
-    queue = cluster_module._Queue(cells)
+    queue = attnwarp_eval.study.cluster._Queue(cells)
     first = queue.take(None)
     second = queue.take(None, {first.probe})
     assert (first.title, second.title) == (

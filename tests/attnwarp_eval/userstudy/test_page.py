@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.document.write import LARGEST
-from attnwarp_eval.userstudy import page as page_module
 from attnwarp_eval.userstudy.draw import SCRAMBLED
 
 
@@ -88,7 +87,9 @@ def test_methods_and_questions_can_be_chosen(run, tmp_path):
 
 def test_a_page_of_many_pictures_stays_within_its_size(run, tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
-    monkeypatch.setattr(page_module, "of_views", lambda item, files: [noise(rng) for _ in files])
+    monkeypatch.setattr(
+        "attnwarp_eval.userstudy.page.of_views", lambda item, files: [noise(rng) for _ in files]
+    )
     assert build(run.root, "--out", tmp_path / "a").exit_code == 0
     _, study = read(tmp_path / "a")
     total = sum(len(base64.b64decode(v.partition(",")[2])) for v in study["pictures"].values())

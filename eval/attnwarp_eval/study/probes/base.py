@@ -209,8 +209,7 @@ class Probe(ABC, Generic[E]):
                         **self.common_spec(study, scene, seed),
                         **self.variant_spec(study, variant, seed),
                     }
-                    wanted = label in study.pictures.variants
-                    pictures = study.pictures_of(spec["views"]) if wanted else ()
+                    pictures = study.pictures_of(spec["views"], label)
                     yield Cell(spec, name, label, self.name, seed, (label,), pictures)
 
     def common_spec(self, study: Study, scene: Scene, seed: int) -> Json:

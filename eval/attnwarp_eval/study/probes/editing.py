@@ -291,8 +291,7 @@ class EditingProbe(Probe[EditResult]):
                         "edit": edit,
                         "encoders": encoders,
                     }
-                    pictured = label in study.pictures.variants
-                    views = study.pictures_of(spec["views"]) if pictured else ()
+                    views = study.pictures_of(spec["views"], label)
                     yield Cell(
                         spec, name, label, self.name, seed, (label,),
                         tuple(f"{edit['name']}/{view}" for view in views),

@@ -188,26 +188,14 @@ def read_sweeps(results: Results) -> list[Swept]:
     swept = []
     for _, record in results.finished(Stability.name):
         hard, way, levels = _definition(record.spec)
+        refusals = record.extra.refusals
+        # JSON has no infinity: an error that was infinite is NaN in a record.
         outcomes = [
-            _outcome(hard, way, level, view, record)
+            hard.judge(level, way, view.metrics["stability.error"], refusals.get(view.name, ""))
             for level, view in zip(levels, record.views, strict=True)
         ]
         swept.append(Swept(hard, way, tuple(outcomes)))
     return swept
-
-
-def _outcome(hard: Case, way: Way, level: float, view: View, record: Record[Extra]) -> Outcome:
-    error = view.metrics["stability.error"]
-    refusal = record.extra.refusals.get(view.name, "")
-    return Outcome(
-        level,
-        hard.is_required(level, way.direction),
-        # JSON has no infinity; an error that is not finite and no refusal was one.
-        math.inf if math.isnan(error) and not refusal else error,
-        hard.bounds[way.direction].at(level),
-        refusal,
-        hard.must_refuse(level, way),
-    )
 
 
 def verdict_lines(swept: Sequence[Swept]) -> list[str]:

@@ -112,8 +112,7 @@ class VariabilityProbe(Probe[Varied]):
                     "seeds": list(study.seeds),
                     "edit": edit,
                 }
-                pictured = label in study.pictures.variants
-                views = study.pictures_of(spec["views"]) if pictured else ()
+                views = study.pictures_of(spec["views"], label)
                 yield Cell(
                     spec, name, label, self.name, first, (label,),
                     tuple(f"{edit['name']}/{view}" for view in views),
