@@ -18,6 +18,7 @@ from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probes.editing_sections import abilities
 from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
@@ -214,13 +215,38 @@ OWN_CLAIM = Claim(
 )
 
 
-def edited(method, value):
-    done = Judgement("red", True, 30.0, 10.0, 10.0)
-    extra = EditResult("red", "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
+def edited(name, value=0.0, *, done=True, scene="one", **spec):
+    source = Judgement("red", done, 30.0, 10.0, 10.0)
+    extra = EditResult("red", "paint it red", source, source, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
-        [("red/v0", 15.0, {"embedding.dino_image.render": value})], **extra.to_json()
+        [("red/v0", 15.0, {"embedding.dino_image.render": value})],
+        spec={"method": "propagate", "settings": {}, **spec},
+        **extra.to_json(),
     )
-    return written_runs.outcome("editing", "one", [method], data, method)
+    return written_runs.outcome("editing", scene, [name], data, f"{name}-{scene}")
+
+
+def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():
+    cells = [
+        edited("A", method="dge", done=False),
+        edited("A", method="dge", done=True, scene="two"),
+        edited("alone, short", method="by_view", budget={"seconds": 1.0}),
+        edited("control", method="by_view"),
+        edited("warped", done=False),
+    ]
+    names = ["A", "alone, short", "control", "warped"]
+    run = written_runs.results(
+        study(variants={name: {} for name in names}, probes={"editing": names}, ablations=[]), cells
+    )
+    counts, edits = abilities(run, "editing").tables
+    assert counts.rows == [
+        ["A", "1", "2"], ["alone, short", "1", "1"], ["control", "1", "1"], ["warped", "0", "1"],
+    ]  # fmt: skip
+    assert [row[3] for row in edits.rows] == ["control"]
+    one_method = written_runs.results(
+        study(variants={"warped": {}}, probes={"editing": ["warped"]}, ablations=[]), cells[-1:]
+    )
+    assert len(abilities(one_method, "editing").tables) == 1
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,12 @@ WHOLE = "whole"
 OWN = "each view alone"
 """The method of settings that edits every view by itself: the control."""
 
+FLOOR = "by_view"
+"""The method of a comparison that does so."""
+
+ONE_SOURCE = frozenset({"propagate", "true pictures"})
+"""Methods whose source view is edited alike, whatever happens to the others."""
+
 
 def abilities(results: Results, probe: str) -> Section:
     """What the editor does in the source view, and in every view by itself."""
@@ -94,19 +100,43 @@ def abilities(results: Results, probe: str) -> Section:
         "all views, dB",
         "all views done",
     ]
-    section.tables = [Table(columns, rows)]
+    section.tables = [*_done_by_method(results, probe), Table(columns, rows)]
     return section
 
 
+def _done_by_method(results: Results, probe: str) -> list[Table]:
+    """How many source edits each variant of a comparison does; none for a study of one method."""
+    records = {
+        name: [record for _, _, record in results.records(probe, name)]
+        for name in results.study.variants
+    }
+    methods = {record.spec["method"] for own in records.values() for record in own}
+    if methods <= ONE_SOURCE:
+        return []
+    rows = [
+        [name, str(sum(record.extra.source.done for record in own)), str(len(own))]
+        for name, own in records.items()
+        if own
+    ]
+    return [Table(["variant", "source edits done", "of"], rows, "Each method's own source edits")]
+
+
 def controls(results: Results, probe: str) -> list[str]:
-    """The measured variants that edit each view by itself; the first measured one without any."""
+    """The measured variants that edit each view by itself, as long as they like; the first measured
+    one without any.
+    """
     measured = [
-        (name, records[0][2])
+        (name, records[0][2].spec)
         for name in results.study.variants
         if (records := results.records(probe, name))
     ]
-    alone = [name for name, record in measured if record.spec["settings"].get("method") == OWN]
+    alone = [name for name, spec in measured if _is_alone(spec)]
     return alone or [name for name, _ in measured[:1]]
+
+
+def _is_alone(spec: Mapping[str, Any]) -> bool:
+    itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
+    return itself and "budget" not in spec
 
 
 def _against(judgement: Any) -> str:

@@ -122,7 +122,7 @@ def edited(scene, name):
     extra = EditResult("red", "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
         [("red/v0", 15.0, {ERROR: ERRORS[name], "fidelity.mse.edit_inside": ERRORS[name]})],
-        spec={"settings": {}, "editor": {"sha256": "a"}},
+        spec={"method": "propagate", "settings": {}, "editor": {"sha256": "a"}},
         cost={"seconds": {"whole": BY_CELLS[name], "method: edit": BY_CELLS[name]}},
         **extra.to_json(),
     )
