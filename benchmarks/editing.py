@@ -83,7 +83,8 @@ def measure(
     stored = work / plan.name / "figures.json"
     if stored.exists():
         figures: dict[str, Any] = json.loads(stored.read_text())
-        return figures
+        if "peak_mb" in figures:  # a former version did not measure it
+            return figures
     dataset = read_dataset(data)
     train, test = hold_out(dataset)
     if test is None or dataset.points is None:
@@ -160,7 +161,6 @@ def table(rows: Sequence[dict[str, Any]], data: Path, load: float) -> str:
         "",
         f"{core_count()} threads; load average of the machine at the end"
         f" {load:.1f}. Above the number of threads, all seconds are too long.",
-        "",
     ]
     return "\n".join(lines)
 
@@ -249,7 +249,6 @@ def ratio_table(figures: dict[str, list[dict[str, float]]], load: float) -> str:
         f" {len(figures['propagation'])} rounds; {core_count()} threads; load"
         f" average of the machine at the end {load:.1f}. Above the number of threads, seconds are"
         " too long and ratios noisy.",
-        "",
     ]
     return "\n".join(lines)
 

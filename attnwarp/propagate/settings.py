@@ -307,7 +307,7 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 tunes on everything edited so far, with larger steps of the colours.
 
 ``extended``: ``corrected`` with further sources, an idea beyond the paper. Whether it helps, the
-study ``comparison-quick`` can't tell.
+study ``comparison-six`` can't tell.
 """
 
 

@@ -345,8 +345,8 @@ class EditingProbe(Probe[EditResult]):
         )  # fmt: skip
 
     def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
-        """Whether both are the same method, with one editor, on the same splats and without a
-        budget of one alone; of their settings, the warp's and those that ``wanted`` names count.
+        """Whether method, editor, splats, warp and budget are the same. Of the method's other
+        settings, only those count that ``wanted`` names.
         """
         if variant.part(VariantPart).method != wanted.part(VariantPart).method:
             return False  # the study's options need not fit the other method

@@ -67,7 +67,8 @@ def abilities(results: Results, probe: str) -> Section:
             " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
             " inside the object, dB; in brackets that of the unedited picture."
             " **Agreement between views is judged only where the source's edit is done**; the"
-            " other edits have undefined figures, and stand here by name."
+            " others have undefined figures. The edits of the control stand here by name; a"
+            " comparison counts those of each method."
         ),
     ]
     rows = []
@@ -130,11 +131,12 @@ def controls(results: Results, probe: str) -> list[str]:
         for name in results.study.variants
         if (records := results.records(probe, name))
     ]
-    alone = [name for name, spec in measured if _is_alone(spec)]
+    alone = [name for name, spec in measured if is_alone(spec)]
     return alone or [name for name, _ in measured[:1]]
 
 
-def _is_alone(spec: Mapping[str, Any]) -> bool:
+def is_alone(spec: Mapping[str, Any]) -> bool:
+    """Whether a variant's spec says that it edits each view by itself, and as long as it likes."""
     itself = spec["method"] == FLOOR or spec["settings"].get("method") == OWN
     return itself and "budget" not in spec
 

@@ -23,7 +23,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import InTurn, Layout, Place, Probe, Work
-from attnwarp_eval.study.probes.editing_sections import OWN, PARTS, WHOLE
+from attnwarp_eval.study.probes.editing_sections import PARTS, WHOLE, is_alone
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome, Results
@@ -186,7 +186,7 @@ class EditingTimingProbe(Probe[Rounds]):
         names = timed.turns[0].names
         work = dict(zip(names, record.extra.work, strict=True))
         contestants = zip(names, record.spec["contestants"], strict=True)
-        alone = [name for name, spec in contestants if spec["settings"].get("method") == OWN]
+        alone = [name for name, spec in contestants if is_alone(spec)]
         control = alone[0] if alone else None
         columns = [
             "variant",

@@ -141,7 +141,9 @@ def in_turn(scene, names):
         spec={
             "rounds": len(DRIFT),
             "edit": {"name": "red"},
-            "contestants": [{"settings": alone.get(name, {})} for name in names],
+            "contestants": [
+                {"method": "propagate", "settings": alone.get(name, {})} for name in names
+            ],
         },
         cost={
             "rounds": {stage: rounds(share) for stage, share in shares.items()},
