@@ -15,6 +15,7 @@ the view stands and while it moves; it needs a display.
 
 from __future__ import annotations
 
+import json
 import os
 import statistics
 import subprocess
@@ -38,6 +39,16 @@ SIZE = 592
 
 DISCS, FRAMES = 100_000, 15
 """Of the window whose frames are timed."""
+
+OBSERVER = """
+import json, resource, subprocess, sys
+code = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL)
+usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([code, usage.ru_utime + usage.ru_stime, usage.ru_maxrss]))
+"""
+"""Runs a command and prints its exit code, CPU seconds and peak memory. It is small itself: Linux
+counts what a process held when it started another one as the other one's.
+"""
 
 
 def write_scene(folder: Path, splats: int, size: int) -> None:
@@ -90,20 +101,20 @@ class Contestant:
         words += [str(folder / "scene.ply"), "--data", str(folder), "--size", str(size), "--splats"]
         path = os.pathsep.join([str(self.checkout), str(self.checkout / "eval")])
         start = time.perf_counter()
-        process = subprocess.Popen(
-            [*words, "--screenshot", str(folder / "first.png")],
+        done = subprocess.run(
+            [sys.executable, "-c", OBSERVER, *words, "--screenshot", str(folder / "first.png")],
             cwd=folder,
             env={**os.environ, "PYTHONPATH": path},
-            stdout=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            check=True,
         )
-        _, status, usage = os.wait4(process.pid, 0)
         self.wall.append(time.perf_counter() - start)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            raise SystemExit(f"{self.checkout}: inspect ended with {process.returncode}")
-        self.cpu.append(usage.ru_utime + usage.ru_stime)
+        code, cpu, peak = json.loads(done.stdout)
+        if code:
+            raise SystemExit(f"{self.checkout}: inspect ended with {code}")
+        self.cpu.append(cpu)
         # Linux counts KiB, macOS bytes.
-        self.peak.append(usage.ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20))
+        self.peak.append(peak / (2**30 if sys.platform == "darwin" else 2**20))
 
 
 def measure(

@@ -34,6 +34,7 @@ async def begin(tab):
     await tab.until("document.querySelector('#begin')?.textContent.length > 1")
     await tab.press("Enter", 13)
     await tab.until(shows("trial"))
+    await asyncio.sleep(0.3)  # after a reload, too, a pair rests before it takes a choice
 
 
 def shows(section):
