@@ -1,7 +1,8 @@
 """Masks by words: what is edited, said in words instead of drawn.
 
 ``GroundedSam`` detects boxes with Grounding DINO and outlines them with SAM, both from local
-folders. ``ClipSegmenter`` needs no download: it rates windows of the picture with clip-small.
+folders. ``ClipSegmenter`` needs no download: it rates places of the picture with
+clip-small.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.encoders import TextImageEncoder, load_encoder
-from attnwarp.encoders.base import checked_image
+from attnwarp.encoders import load_encoder
+from attnwarp.encoders.base import PlaceEncoder, checked_image
 from attnwarp.errors import InputError, optional_imports
 
 Image = npt.NDArray[Any]
@@ -23,16 +24,8 @@ Image = npt.NDArray[Any]
 Mask = npt.NDArray[np.bool_]
 """(H, W)."""
 
-BACKGROUNDS = (
-    "grass", "sand", "snow", "a wooden floor", "a tiled floor", "a road", "bare earth", "the sky",
-)  # fmt: skip
-"""What surrounds things; :class:`ClipSegmenter` rates the words against them."""
-
-SHARPNESS = 30.0
-"""Factor of cosines before their softmax: clip-small's own, which training led to 30.4."""
-
 WORKING_SIDE = 256
-"""Larger pictures are rated and cut at this short side in px: windows become 112 px anyway."""
+"""Larger pictures are cut at this short side in px."""
 
 
 @runtime_checkable
@@ -291,22 +284,20 @@ def _checked_words(words: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ClipSegmenter:
-    """Windows rated by a text and image encoder, then cut out along colours by OpenCV's grabCut.
+    """Places rated by a text and image encoder, then cut out along colours by OpenCV's grabCut.
 
-    A window's relevance is the softmax share of the words among backgrounds. A pixel's relevance is
-    the geometric mean over window sizes of its windows' mean. grabCut (Rother, Kolmogorov, Blake
-    2004) starts from the pixels of high relevance. The constants come from 25 training worlds.
-    Its overlap with exact masks (reports/editor/segments.md) is fair for single things on a plain
-    ground and poor, below 0.4, on the bundled scenes. Look at its masks before you use them.
+    A pixel's probability is the mean of what the encoder says of the place around it, over several
+    sizes of the picture. grabCut (Rother, Kolmogorov, Blake 2004) starts from the probable pixels.
+    The constants come from training worlds that the encoder did not learn from. Its overlap with
+    exact masks is in reports/editor/segments.md. Look at its masks before you use them.
 
     Args:
-        encoder: of windows and words; see :func:`attnwarp.encoders.load_encoder`.
-        windows: sides of the square windows as shares of the picture's short side.
-        stride: between windows as a share of the short side.
-        likely: relevance, as a share of its range in the picture, of what is first taken for it.
-        background: share of the range below which a pixel can never become part of the mask.
-        peak: share of the range that is the thing for sure, where a free cut fails.
-        detection: least relevance, in [0, 1], that the best pixel must have.
+        encoder: of places and words; see :func:`attnwarp.encoders.load_encoder`.
+        sides: of the sizes at which the picture is rated, the short side in px.
+        likely: least probability of what is first taken for the thing.
+        background: a pixel less probable than this can never become part of the mask.
+        sure: a pixel at least as probable as this stays in it.
+        detection: least probability, in [0, 1], that the best pixel must have.
 
     Example:
         >>> import numpy as np
@@ -314,18 +305,19 @@ class ClipSegmenter:
         (48, 64)
     """
 
-    encoder: TextImageEncoder
-    windows: Sequence[float] = (0.375, 0.5, 0.75)
-    stride: float = 1 / 12
+    encoder: PlaceEncoder
+    sides: Sequence[int] = (128, 192, 256)
     likely: float = 0.5
-    background: float = 0.05
-    peak: float = 0.95
-    detection: float = 0.15
+    background: float = 0.2
+    sure: float = 0.8
+    detection: float = 0.5
 
     @classmethod
     def bundled(cls) -> ClipSegmenter:
         """With clip-small."""
-        return cls(load_encoder("clip-small", "clip"))
+        encoder = load_encoder("clip-small", "clip")
+        assert isinstance(encoder, PlaceEncoder)
+        return cls(encoder)
 
     def segment(self, image: Image, words: str) -> Mask:
         """See :meth:`Segmenter.segment`."""
@@ -334,14 +326,11 @@ class ClipSegmenter:
         picture: Image = checked_image(image)
         text = _checked_words(words)
         height, width = picture.shape[:2]
-        scale = WORKING_SIDE / min(height, width)
-        if scale < 1:
-            size = (max(1, round(scale * width)), max(1, round(scale * height)))
-            picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-        relevance = self.relevance(picture, text)
-        if relevance.max() < self.detection:
+        picture = _resized(picture, min(WORKING_SIDE, height, width))
+        probability = self.relevance(picture, text)
+        if probability.max() < self.detection:
             raise NoDetectionError(text)
-        mask = self._cut(picture, relevance)
+        mask = self._cut(picture, probability)
         if not mask.any():
             raise NoDetectionError(text)
         if mask.shape != (height, width):
@@ -350,63 +339,49 @@ class ClipSegmenter:
         return mask
 
     def relevance(self, image: Image, words: str) -> npt.NDArray[np.float64]:
-        """(H, W) in (0, 1]: share of the words among backgrounds in the windows around a pixel.
+        """(H, W) in [0, 1]: probability that the words are true of the place of a pixel.
 
         Args:
             image: (H, W, 3) sRGB, floating, in [0, 1].
             words: see :meth:`segment`.
         """
-        picture = checked_image(image)
-        texts = [f"a photo of {name}" for name in (_named(words), *BACKGROUNDS)]
-        directions = _unit(self.encoder.texts(texts))
-        logs = np.zeros(picture.shape[:2])
-        for share in self.windows:
-            # A floor: one size alone shall not veto.
-            logs += np.log(self._means(picture, share, directions) + 1e-3)
-        return np.minimum(np.exp(logs / len(self.windows)), 1.0)
-
-    def _means(
-        self, picture: Image, share: float, directions: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.float64]:
-        """(H, W) mean relevance of the windows of one size, which count most at their centres."""
-        short = min(picture.shape[:2])
-        side = max(1, round(share * short))
-        step = max(1.0, self.stride * short)
-        rows, columns = (_starts(length, side, step) for length in picture.shape[:2])
-        corners = [(y, x) for y in rows for x in columns]
-        embeddings = _unit(
-            self.encoder.images([picture[y : y + side, x : x + side] for y, x in corners])
-        )
-        scores = SHARPNESS * embeddings @ directions.T
-        shares = np.exp(scores - scores.max(axis=1, keepdims=True))
-        relevances = shares[:, 0] / shares.sum(axis=1)
-        bump = np.exp(-0.5 * ((np.arange(side) + 0.5 - side / 2) / (side / 4)) ** 2)
-        weight = np.outer(bump, bump)
-        total, weights = np.zeros(picture.shape[:2]), np.zeros(picture.shape[:2])
-        for (y, x), relevance in zip(corners, relevances, strict=True):
-            total[y : y + side, x : x + side] += weight * relevance
-            weights[y : y + side, x : x + side] += weight
-        return total / weights
-
-    def _cut(self, picture: Image, relevance: npt.NDArray[np.float64]) -> Mask:
-        """(H, W) the pixels of high relevance, moved to borders of colour."""
         import cv2
 
-        low, high = relevance.min(), relevance.max()
-        # Where all windows are alike, all of them show it.
-        if high - low < 1e-6:
-            return np.ones(relevance.shape, dtype=bool)
-        share = (relevance - low) / (high - low)
-        labels = np.full(relevance.shape, cv2.GC_PR_BGD, np.uint8)
-        labels[share >= self.likely] = cv2.GC_PR_FGD
-        labels[share < self.background] = cv2.GC_BGD
-        pixels = np.rint(255 * picture).astype(np.uint8)
-        mask = _grab_cut(pixels, labels)
-        if not mask.any() or share[mask].mean() < share.mean():
-            # Free labels may all turn to background, or change sides; the peak's then stay.
-            labels[share >= self.peak] = cv2.GC_FGD
-            mask = _grab_cut(pixels, labels)
-        return mask
+        picture: Image = checked_image(image)
+        text = _checked_words(words).removesuffix(".")
+        height, width = picture.shape[:2]
+        total = np.zeros((height, width))
+        for side in self.sides:
+            shown = self.encoder.shown(_resized(picture, side), [f"a photo of {text}"])[..., 0]
+            total += cv2.resize(shown, (width, height), interpolation=cv2.INTER_LINEAR)
+        return total / len(self.sides)
+
+    def _cut(self, picture: Image, probability: npt.NDArray[np.float64]) -> Mask:
+        """(H, W) the probable pixels, moved to borders of colour."""
+        import cv2
+
+        labels = np.full(probability.shape, cv2.GC_PR_BGD, np.uint8)
+        labels[probability >= self.likely] = cv2.GC_PR_FGD
+        labels[probability < self.background] = cv2.GC_BGD
+        labels[probability >= self.sure] = cv2.GC_FGD
+        likely = probability >= self.likely
+        # grabCut needs colours of both.
+        if likely.all() or not likely.any():
+            return likely
+        return _grab_cut(np.rint(255 * picture).astype(np.uint8), labels)
+
+
+def _resized(picture: Image, short: int) -> Image:
+    """The picture with a short side of that many px."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    scale = short / min(height, width)
+    if scale == 1:
+        return picture
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.clip(cv2.resize(picture, size, interpolation=way), 0, 1)
 
 
 def _grab_cut(pixels: npt.NDArray[np.uint8], labels: npt.NDArray[np.uint8]) -> Mask:
@@ -418,21 +393,3 @@ def _grab_cut(pixels: npt.NDArray[np.uint8], labels: npt.NDArray[np.uint8]) -> M
     cv2.setRNGSeed(0)  # of its k-means
     cv2.grabCut(pixels, result, (0, 0, 0, 0), *models, 5, cv2.GC_INIT_WITH_MASK)
     return np.isin(result, (cv2.GC_FGD, cv2.GC_PR_FGD))
-
-
-def _named(words: str) -> str:
-    """Words with an article, as the encoder's captions have them."""
-    text = _checked_words(words).removesuffix(".")
-    if text.split()[0].lower() in ("a", "an", "the"):
-        return text
-    return f"{'an' if text[0].lower() in 'aeiou' else 'a'} {text}"
-
-
-def _starts(length: int, side: int, step: float) -> list[int]:
-    """First pixels of windows that cover a length evenly."""
-    count = max(1, int(np.ceil((length - side) / step)) + 1)
-    return sorted({round(start) for start in np.linspace(0, length - side, count)})
-
-
-def _unit(rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    return rows / np.linalg.norm(rows, axis=-1, keepdims=True)

@@ -19,6 +19,7 @@ from attnwarp.encoders.base import (
     ImageEncoder,
     Kind,
     PerceptualDistance,
+    PlaceEncoder,
     TextImageEncoder,
     TokenEncoder,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "ImageEncoder",
     "Kind",
     "PerceptualDistance",
+    "PlaceEncoder",
     "TextImageEncoder",
     "TokenEncoder",
     "available",

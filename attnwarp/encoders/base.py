@@ -104,6 +104,33 @@ class TextImageEncoder(ImageEncoder, Protocol):
 
 
 @runtime_checkable
+class PlaceEncoder(Protocol):
+    """What each place of a picture shows, by words.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.encoders import load_encoder
+        >>> encoder = load_encoder("clip-small")
+        >>> isinstance(encoder, PlaceEncoder)
+        True
+        >>> encoder.shown(np.zeros((64, 96, 3)), ["a red sphere", "the sky"]).shape
+        (8, 12, 2)
+    """
+
+    def shown(self, image: Image, texts: Sequence[str]) -> npt.NDArray[np.float64]:
+        """(h, w, T) float64 in [0, 1]: with which probability each text is true of each place.
+
+        Args:
+            image: (H, W, 3) sRGB, floating, in [0, 1].
+            texts: T of them, none or all of which may be true of a place.
+
+        Raises:
+            ValueError: a picture of another shape, dtype or range.
+        """
+        ...
+
+
+@runtime_checkable
 class TokenEncoder(ImageEncoder, Protocol):
     """Pictures to embeddings and to grids of patch embeddings, as DINO.
 

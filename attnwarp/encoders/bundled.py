@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch.nn import functional
 
 from attnwarp.encoders._weights import full_float32, sha256_of
 from attnwarp.encoders.base import (
@@ -22,7 +23,7 @@ from attnwarp.encoders.base import (
     checked_texts,
 )
 from attnwarp.encoders.nets import ClipSmall, DinoSmall, PerceptualSmall
-from attnwarp.encoders.preprocess import Preprocessing
+from attnwarp.encoders.preprocess import Preprocessing, resize
 from attnwarp.errors import InputError, optional_imports
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -104,7 +105,9 @@ class _OfSquares:
 
 
 class BundledClip(_OfSquares):
-    """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`."""
+    """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`, and a
+    :class:`~attnwarp.encoders.base.PlaceEncoder`.
+    """
 
     def __init__(self, name: str, folder: Path) -> None:
         with optional_imports():
@@ -156,6 +159,22 @@ class BundledClip(_OfSquares):
                 [code.ids for code in self.tokenizer.encode_batch(checked)], dtype=torch.int64
             )
             return self.net.texts(codes).double().numpy()
+
+    def shown(self, image: Image, texts: Sequence[str]) -> Array:
+        """(h, w, T) float64 probabilities, see :class:`~attnwarp.encoders.base.PlaceEncoder`.
+
+        A place has 8 x 8 px. The picture is resized to multiples of 32 px, and seen in a mirror too.
+        """
+        (picture,) = checked_images([image])
+        height, width = (max(1, round(side / 32)) * 32 for side in picture.shape[:2])
+        pixels = torch.from_numpy(resize(picture, (height, width)).transpose(2, 0, 1)).contiguous()
+        words = functional.normalize(torch.from_numpy(self.texts(texts)), dim=-1)
+        with full_float32():
+            there, mirrored = self.net.places(torch.stack([pixels, pixels.flip(-1)])).double()
+        places = functional.normalize(there, dim=0), functional.normalize(mirrored, dim=0).flip(-1)
+        patches = self.net.patches
+        cosines = torch.einsum("dhw,td->hwt", 0.5 * (places[0] + places[1]), words)
+        return torch.sigmoid(patches.scale.double().exp() * cosines + patches.bias.double()).numpy()
 
 
 class BundledDino(_OfSquares):

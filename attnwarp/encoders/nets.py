@@ -85,6 +85,36 @@ class Pool(nn.Module):
         return self.norm(torch.cat([x.mean((2, 3)), x.amax((2, 3))], dim=1))
 
 
+class Patches(nn.Module):
+    """A vector for each place, from all stages but the first: what is there, in the space of texts.
+
+    Args:
+        widths: channels of the stages, each of which has half of the size of the one before.
+        dim: of the vectors.
+        hidden: channels in between.
+    """
+
+    def __init__(self, widths: Sequence[int], dim: int, hidden: int = 128) -> None:
+        super().__init__()
+        self.inputs = nn.ModuleList(nn.Conv2d(width, hidden, 1) for width in widths)
+        self.norm = nn.BatchNorm2d(hidden)
+        self.mix = nn.Conv2d(hidden, hidden, 3, padding=1)
+        self.project = nn.Conv2d(hidden, dim, 1)
+        # A place shows what a text says with probability sigmoid(exp(scale) cosine + bias).
+        self.scale = nn.Parameter(torch.tensor(2.3))
+        self.bias = nn.Parameter(torch.tensor(-4.0))
+
+    def forward(self, stages: Sequence[Tensor]) -> Tensor:
+        """Outputs of the stages, (N, C_k, h / 2^k, w / 2^k) -> (N, dim, h, w)."""
+        size = stages[0].shape[-2:]
+        total = self.inputs[0](stages[0])
+        for layer, x in zip(list(self.inputs)[1:], stages[1:], strict=True):
+            total = total + functional.interpolate(
+                layer(x), size, mode="bilinear", align_corners=False
+            )
+        return self.project(functional.relu(self.mix(functional.relu(self.norm(total)))))
+
+
 class Block(nn.Module):
     """A transformer block, normalised first."""
 
@@ -161,6 +191,7 @@ class ClipSmall(nn.Module):
         super().__init__()
         self.vision = Stages((32, 64, 128, 224), (1, 1, 2, 2))
         self.pool = Pool(224, dim)
+        self.patches = Patches((64, 128, 224), dim)
         self.text = TextTower(vocabulary, 128, 3, 4, self.length, dim)
         # exp of it multiplies the cosine, as in the paper, which starts at 1 / 0.07.
         self.scale = nn.Parameter(torch.tensor(2.66))
@@ -172,6 +203,10 @@ class ClipSmall(nn.Module):
     def texts(self, tokens: Tensor) -> Tensor:
         """(N, L) tokens -> (N, dim)."""
         return self.text(tokens)
+
+    def places(self, x: Tensor) -> Tensor:
+        """(N, 3, H, W) in [0, 1], sides multiples of 32 -> (N, dim, H / 8, W / 8)."""
+        return self.patches(self.vision(x)[1:])
 
 
 class DinoSmall(nn.Module):

@@ -83,7 +83,9 @@ def assess(
 
     import training.assess
     from attnwarp.encoders.bundled import load
+    from training import part_pictures
     from training.cards import card
+    from training.part_assess import part_figures, scene_figure
 
     torch.set_num_threads(threads)
     encoder: Any = load(name, weights)
@@ -92,6 +94,8 @@ def assess(
     def figures() -> list[dict[str, Any]]:
         if name == "clip-small":
             results = training.assess.clip_figures(encoder, sets)
+            results += part_figures(encoder, part_pictures.load(data, "parts-test"))
+            results.append(scene_figure(encoder)[0])
         elif name == "dino-small":
             results = training.assess.dino_figures(encoder, sets)
         else:
@@ -138,7 +142,8 @@ def _recipe(name: str) -> Any:
 
     if name not in NAMES:
         raise typer.BadParameter(f"got {name!r}, expected one of {', '.join(NAMES)}")
-    return importlib.import_module(f"training.{name.removesuffix('-small')}")
+    modules = {"clip-small": "clip_parts", "dino-small": "dino", "perceptual-small": "perceptual"}
+    return importlib.import_module(f"training.{modules[name]}")
 
 
 def _seconds(encoder: Any, rounds: int = 7) -> float:
@@ -164,6 +169,8 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
 
     import torch
 
+    from training import part_pictures
+    from training.assemblies import KINDS
     from training.common import minutes
     from training.data import SPLITS
     from training.perceptual import TRAIN_PHOTOS
@@ -183,13 +190,16 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
     }  # fmt: skip
     checkpoints = [
         out / f"{name}.pt",
-        *([out / f"{name}-naming.pt"] if name == "clip-small" else []),
+        *([out / f"{name}-{stage}.pt" for stage in ("naming", "contrast") if name == "clip-small"]),
     ]
     facts["minutes"] = minutes(*checkpoints)
     if name == "clip-small":
         facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}
         facts["pictures"] += f", {SPLITS['train-rendered'].worlds} by Mitsuba"
         facts["warm_epochs"] = importlib.import_module("training.naming").EPOCHS
+        split = part_pictures.PART_SPLITS["parts-train"]
+        facts["parts"] = split.worlds * part_pictures.VIEWS * part_pictures.LOOKS
+        facts["kinds"], facts["part_words"] = len(KINDS), len(part_pictures.PARTS)
     if name == "perceptual-small":
         facts["pictures"] = f"{6 * SPLITS['train'].worlds // 7} by ray casting"
         facts["photos"] = (

@@ -180,13 +180,16 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
     return path
 
 
-def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
-    """Render the missing files of a split; all of them are returned in order."""
+def make(
+    folder: Path, name: str, workers: int = 2, *, worlds: int | None = None
+) -> list[Path]:
+    """Render the missing files of a split's first ``worlds`` (all if left out); they are returned in order."""
     from rich.progress import Progress
 
     split = SPLITS[name]
     folder.mkdir(parents=True, exist_ok=True)
-    starts = range(split.first, split.first + split.worlds, split.shard)
+    count = split.worlds if worlds is None else min(worlds, split.worlds)
+    starts = range(split.first, split.first + count, split.shard)
     files = [folder / f"{name}-v{DATA_PROTOCOL}-{start}.npz" for start in starts]
     missing = [
         (path, start) for path, start in zip(files, starts, strict=True) if not path.exists()
@@ -204,10 +207,10 @@ def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
     return files
 
 
-def load(folder: Path, name: str, workers: int = 2) -> Pictures:
-    """The pictures of a split, rendered where they are missing."""
+def load(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> Pictures:
+    """The pictures of a split's first ``worlds`` (all if left out), rendered where they are missing."""
     columns: dict[str, list[npt.NDArray]] = {}
-    for path in make(folder, name, workers):
+    for path in make(folder, name, workers, worlds=worlds):
         with np.load(path) as stored:
             for key in stored.files:
                 columns.setdefault(key, []).append(stored[key])

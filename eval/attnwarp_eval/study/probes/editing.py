@@ -422,7 +422,11 @@ class EditingProbe(Probe[EditResult]):
         """What the editor can do, budgets, figures by yaw, time by part."""
         if not results.finished(self.name):
             return
-        yield Place.INSTRUMENT, editing_sections.abilities(results, self.name)
+        abilities = editing_sections.abilities(results, self.name)
+        spec = results.finished(self.name)[0][1].spec
+        if "encoders" in spec:
+            abilities.text.append(sensitivity.encoders_named(results, spec))
+        yield Place.INSTRUMENT, abilities
         part = results.study.part(StudyPart).editing
         if (section := editing_sections.budgets(results, self.name)) is not None:
             yield Place.RESULT, section

@@ -566,7 +566,7 @@ def _flaws(
             " edits and blur are alike in all views, the source included: a metric of consistency"
             " should be blind to them."
         ),
-        "Encoders: " + _encoders(results, spec) + ".",
+        encoders_named(results, spec),
     ]
     if len(records) < len(results.study.scenes):
         text.insert(0, f"**Measured on {len(records)} of {len(results.study.scenes)} scenes.**")
@@ -597,13 +597,14 @@ def _flaws(
     )
 
 
-def _encoders(results: Results, spec: Mapping[str, Any]) -> str:
+def encoders_named(results: Results, spec: Mapping[str, Any]) -> str:
+    """A sentence with the encoders of a cell and the first digits of their weights' SHA-256."""
     names = results.study.part(StudyPart).encoders
     encoders = [
         f"{kind} `{names[kind]}` ({identity['weights_sha256'][:12]})"
         for kind, identity in spec["encoders"].items()
     ]
-    return ", ".join(encoders) or "none, so what needs one is left out"
+    return f"Encoders: {', '.join(encoders) or 'none, so what needs one is left out'}."
 
 
 def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:

@@ -1,6 +1,7 @@
 """Oracles: methods that give the true pictures of planned answers, whose figures follow from the plan; exact masks."""
 
 import dataclasses
+import hashlib
 import itertools
 import json
 import math
@@ -15,6 +16,7 @@ from PIL import Image
 from torch_threads import on_one_thread
 
 from attnwarp.baselines import Budget
+from attnwarp.encoders.bundled import WEIGHTS
 from attnwarp_eval.compare.snapshot import read_snapshot
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
@@ -120,7 +122,8 @@ def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_na
     folder, tmp_path, monkeypatch
 ):
     monkeypatch.setitem(EDITING_METHODS, "true pictures", planned([None, "red", "red", "red"]))
-    study, store = load(folder), Store(tmp_path / "run")
+    study = load(folder, encoders={"dino": "dino-small"})
+    store = Store(tmp_path / "run")
     summary = execute(plan(study, store), store)
     assert summary.complete, summary.failures
     cell = next(c for c in plan(study, store).cells if c.probe == "editing")
@@ -133,6 +136,8 @@ def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_na
     row = next(line for line in report.splitlines() if "Paint the ball" in line)
     assert "some_colour" in row
     assert "**no**" in row
+    weights = hashlib.sha256((WEIGHTS / "dino-small.safetensors").read_bytes()).hexdigest()
+    assert f"Encoders: dino `dino-small` ({weights[:12]})." in report
 
 
 def test_each_method_stands_beside_its_own_edit_of_the_source(tmp_path):
