@@ -148,20 +148,17 @@ def _scattered(text: str, rng: np.random.Generator) -> str:
 
 
 def contrast(
-    model: ClipSmall, i: torch.Tensor, texts: torch.Tensor, truth: torch.Tensor
+    model: ClipSmall, i: torch.Tensor, t: torch.Tensor, truth: torch.Tensor
 ) -> torch.Tensor:
     """Symmetric contrast of N pictures and 2 N texts, the first N of which are theirs.
 
     Args:
-        model: the two towers.
+        model: for its scale.
         i: (N, D) unit embeddings of the pictures.
-        texts: (2 N, L) tokens.
+        t: (2 N, D) unit embeddings of the texts.
         truth: (N, 2 N) bool, which texts are true of which pictures.
     """
     n = len(i)
-    with torch.autocast("cpu", torch.bfloat16):
-        t = model.texts(texts)
-    t = functional.normalize(t.float(), dim=-1)
     logits = model.scale.clamp(max=4.6).exp() * i @ t.T
     diagonal = torch.arange(n)
     also_true = truth.clone()
@@ -294,10 +291,10 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
                 features = model.pool.features(model.vision(images)[-1])
                 embedded = model.pool.project(features)
                 guessed = heads(features, attributes)
+                sentences = model.texts(tokens(tokenizer, texts))
             embedded = functional.normalize(embedded.float(), dim=-1)
-            apart = contrast(
-                model, embedded[torch.from_numpy(whole)], tokens(tokenizer, texts), truth
-            )
+            sentences = functional.normalize(sentences.float(), dim=-1)
+            apart = contrast(model, embedded[torch.from_numpy(whole)], sentences, truth)
             named = naming_loss(model, embedded, attributes, tokenizer, rng)
             loss = apart + named + guessed
             optimizer.zero_grad(set_to_none=True)
