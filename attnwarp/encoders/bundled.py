@@ -163,7 +163,8 @@ class BundledClip(_OfSquares):
     def shown(self, image: Image, texts: Sequence[str]) -> Array:
         """(h, w, T) float64 probabilities, see :class:`~attnwarp.encoders.base.PlaceEncoder`.
 
-        A place has 8 x 8 px. The picture is resized to multiples of 32 px, and seen in a mirror too.
+        A place has 8 x 8 px. The picture is resized to multiples of 32 px. Its mirror image counts
+        as much.
         """
         (picture,) = checked_images([image])
         height, width = (max(1, round(side / 32)) * 32 for side in picture.shape[:2])

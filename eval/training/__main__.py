@@ -186,7 +186,7 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
     facts = {
         "dim": encoder.about.dim, "size": millions(net), "torch": torch.__version__.partition("+")[0], "epochs": recipe.EPOCHS, "seed": recipe.SEED,
         "pictures": f"{cast} by ray casting", "objects": len(OBJECTS),
-        "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "",
+        "colors": len(COLORS), "finishes": len(FINISHES), "grounds": len(GROUNDS), "times": len(TIMES), "photos": "", "more": "",
     }  # fmt: skip
     checkpoints = [
         out / f"{name}.pt",
@@ -198,7 +198,8 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
         facts["pictures"] += f", {SPLITS['train-rendered'].worlds} by Mitsuba"
         facts["warm_epochs"] = importlib.import_module("training.naming").EPOCHS
         split = part_pictures.PART_SPLITS["parts-train"]
-        facts["parts"] = split.worlds * part_pictures.VIEWS * part_pictures.LOOKS
+        count = split.worlds * part_pictures.VIEWS * part_pictures.LOOKS
+        facts["more"] = f", {count} of things with parts (`training/assemblies.py`)"
         facts["kinds"], facts["part_words"] = len(KINDS), len(part_pictures.PARTS)
     if name == "perceptual-small":
         facts["pictures"] = f"{6 * SPLITS['train'].worlds // 7} by ray casting"

@@ -26,7 +26,17 @@ from training.common import Run, channels_last, groups, placed_crops, rate, sett
 from training.data import load as load_pictures
 from training.part_captions import caption_of, part_words, true_of, with_article, wrong
 from training.part_pictures import GROUND, OTHER, PARTS, SHARD, SKY, PartPictures
-from training.worlds import COLORS, FINISHES, GROUNDS, HOURS, PLACES, STATUES, TIMES, captioned, sentence
+from training.worlds import (
+    COLORS,
+    FINISHES,
+    GROUNDS,
+    HOURS,
+    PLACES,
+    STATUES,
+    TIMES,
+    captioned,
+    sentence,
+)
 
 SEED = 7
 EPOCHS = 60
@@ -55,7 +65,17 @@ FOCUS = 2.0
 DENSE = 1.0
 GROUND_NOUNS = {"grass": ("grass", "lawn"), "sand": ("sand",), "snow": ("snow",), "boards": ("wooden floor", "wooden boards"),
                 "tiles": ("tiled floor", "tiles"), "road": ("road", "asphalt"), "earth": ("bare earth", "soil")}  # fmt: skip
-MASS = ("grass", "sand", "snow", "asphalt", "bare earth", "soil", "tiles", "wooden boards", "the sky")
+MASS = (
+    "grass",
+    "sand",
+    "snow",
+    "asphalt",
+    "bare earth",
+    "soil",
+    "tiles",
+    "wooden boards",
+    "the sky",
+)
 """Words that take no article, or have one."""
 BARE = 0.3
 """Share of nouns that are said without their article."""
@@ -147,13 +167,18 @@ def places(ids: npt.NDArray[np.uint8], theta: Tensor, side: int) -> npt.NDArray[
     """(N, side, side) of (N, S, S) in the crops that ``theta`` places; :data:`OTHER` outside of the picture."""
     grid = functional.affine_grid(theta, [len(ids), 1, side, side], align_corners=False)
     x = torch.from_numpy(ids[:, None].astype(np.float32) + 1)
-    sampled = functional.grid_sample(x, grid, mode="nearest", padding_mode="zeros", align_corners=False)[:, 0].numpy()
+    sampled = functional.grid_sample(
+        x, grid, mode="nearest", padding_mode="zeros", align_corners=False
+    )[:, 0].numpy()
     return np.where(sampled == 0, OTHER, sampled - 1).astype(np.uint8)
 
 
 def shares_of(ids: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
     """(N, P) share of each crop that every part covers."""
-    return np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]) / ids[0].size
+    return (
+        np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids])
+        / ids[0].size
+    )
 
 
 def surface_choices() -> list[tuple[int, int, int]]:
@@ -165,7 +190,9 @@ def surface_choices() -> list[tuple[int, int, int]]:
 def surface_number(surfaces: Ints) -> Ints:
     """(...,) index into :func:`surface_choices` of (..., 3); -1 for patterns and where there is none."""
     finish, color = surfaces[..., 0], surfaces[..., 1]
-    result = np.where(np.isin(finish, [FINISHES.index("plain"), FINISHES.index("shiny")]), color, -1)
+    result = np.where(
+        np.isin(finish, [FINISHES.index("plain"), FINISHES.index("shiny")]), color, -1
+    )
     for k, name in enumerate(STATUES):
         result = np.where(finish == FINISHES.index(name), len(COLORS) + k, result)
     return result
@@ -199,7 +226,9 @@ def part_losses(
         bare = rng.uniform() < BARE
         for surface in choices:
             words = part_words(int(p), surface, rng)
-            texts.append(f"a photo of {words.removeprefix('a ').removeprefix('an ') if bare else words}")
+            texts.append(
+                f"a photo of {words.removeprefix('a ').removeprefix('an ') if bare else words}"
+            )
     units = _texts(model, tokenizer, texts).view(len(asked), len(choices), -1)
     scale, place_scale = model.scale.clamp(max=4.6).exp(), model.patches.scale.exp()
     total, count = torch.zeros(()), 0
@@ -209,13 +238,25 @@ def part_losses(
         mask = torch.from_numpy((ids[rows] == p).astype(np.float32))[..., None]
         mean = (dense[rows] * mask).sum((1, 2)) / mask.sum((1, 2))
         mean = functional.normalize(mean, dim=-1)
-        total = total + functional.cross_entropy(place_scale * mean @ units[k].T, target, reduction="sum")
-        total = total + functional.cross_entropy(scale * pooled[rows] @ units[k].T, target, reduction="sum")
+        total = total + functional.cross_entropy(
+            place_scale * mean @ units[k].T, target, reduction="sum"
+        )
+        total = total + functional.cross_entropy(
+            scale * pooled[rows] @ units[k].T, target, reduction="sum"
+        )
         count += 2 * len(rows)
     return total / count
 
 
-def whole_losses(model: ClipSmall, pooled: Tensor, kind: Ints, ground: Ints, time: Ints, tokenizer: Tokenizer, rng: np.random.Generator) -> Tensor:
+def whole_losses(
+    model: ClipSmall,
+    pooled: Tensor,
+    kind: Ints,
+    ground: Ints,
+    time: Ints,
+    tokenizer: Tokenizer,
+    rng: np.random.Generator,
+) -> Tensor:
     """What a picture shows, on which ground and at what time, each by its words alone."""
     columns = [
         (kind, [f"a photo of {with_article(_one(WHOLE_NOUNS[k], rng))}" for k in KINDS]),
@@ -226,7 +267,9 @@ def whole_losses(model: ClipSmall, pooled: Tensor, kind: Ints, ground: Ints, tim
     logits = model.scale.clamp(max=4.6).exp() * pooled @ words.T
     total, start = torch.zeros(()), 0
     for target, texts in columns:
-        total = total + functional.cross_entropy(logits[:, start : start + len(texts)], torch.from_numpy(target))
+        total = total + functional.cross_entropy(
+            logits[:, start : start + len(texts)], torch.from_numpy(target)
+        )
         start += len(texts)
     return total / len(columns)
 
@@ -242,7 +285,9 @@ def _one(choices: Sequence[str], rng: np.random.Generator) -> str:
 
 def recipe() -> dict[str, Any]:
     """Settings and data that a checkpoint depends on, those of the stages before included."""
-    own = settings(globals()) | {"parts": {"protocol": part_pictures.PARTS_PROTOCOL, "looks": part_pictures.LOOKS}}
+    own = settings(globals()) | {
+        "parts": {"protocol": part_pictures.PARTS_PROTOCOL, "looks": part_pictures.LOOKS}
+    }
     own["data"] = {**own["data"], **OLD_WORLDS}
     return own | {"captions": settings(vars(part_captions)), "contrast": settings(vars(clip))}
 
@@ -258,7 +303,8 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     model.load_state_dict(torch.load(before, weights_only=True)["model"])
     towers = [*groups(model.vision, 0.05), *groups(model.pool, 0.05), *groups(model.text, 0.05)]
     optimizer = torch.optim.AdamW(
-        [*towers, *groups(model.patches, 0.05), {"params": [model.scale], "weight_decay": 0.0}], betas=(0.9, 0.98)
+        [*towers, *groups(model.patches, 0.05), {"params": [model.scale], "weight_decay": 0.0}],
+        betas=(0.9, 0.98),
     )
     peaks = [PEAK * VISION] * len(towers) + [PEAK] * (len(optimizer.param_groups) - len(towers))
     worlds = int(pictures.world.max()) + 1 - KEPT
@@ -287,7 +333,9 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         return dict(zip(names, sums / STEPS, strict=True))
 
     checkpoint = out / "clip-small.pt"
-    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, recipe(), steps=STEPS).train(epoch)
+    Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, recipe(), steps=STEPS).train(
+        epoch
+    )
     return checkpoint
 
 
@@ -308,7 +356,9 @@ def batch_losses(
     dense = functional.normalize(dense.permute(0, 2, 3, 1), dim=-1)
     new, single = pooled[: len(rows)], pooled[len(rows) :]
 
-    captions = [caption_of(pictures, int(row), share, rng) for row, share in zip(rows, shares, strict=True)]
+    captions = [
+        caption_of(pictures, int(row), share, rng) for row, share in zip(rows, shares, strict=True)
+    ]
     captions += [wrong(c, rng) for c in captions]
     texts = [part_captions.sentence(c, rng, fillers=True) for c in captions]
     truth = torch.from_numpy(true_of(captions, pictures, rows))

@@ -180,9 +180,7 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
     return path
 
 
-def make(
-    folder: Path, name: str, workers: int = 2, *, worlds: int | None = None
-) -> list[Path]:
+def make(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> list[Path]:
     """Render the missing files of a split's first ``worlds`` (all if left out); they are returned in order."""
     from rich.progress import Progress
 

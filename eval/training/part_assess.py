@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders.base import TextImageEncoder
-from training.assess import Figure, as_float, figure
 from training.assemblies import KINDS, WHOLE_NOUNS
+from training.assess import Figure, as_float, figure
 from training.clip_parts import surface_choices, surface_number
 from training.part_captions import (
     Caption,
@@ -51,7 +51,12 @@ def _wholes(encoder: TextImageEncoder, images: Array, pictures: PartPictures) ->
         _unit(encoder.texts([f"a photo of {with_article(n)}" for n in WHOLE_NOUNS[k]])).mean(axis=0) for k in KINDS
     ])  # fmt: skip
     guess = (images @ _unit(words).T).argmax(axis=1)
-    return figure("name the thing with parts, new shapes", guess == pictures.kind, pictures.world, chance=1 / len(KINDS))
+    return figure(
+        "name the thing with parts, new shapes",
+        guess == pictures.kind,
+        pictures.world,
+        chance=1 / len(KINDS),
+    )
 
 
 def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
@@ -69,7 +74,9 @@ def _surfaces(encoder: TextImageEncoder, images: Array, pictures: PartPictures) 
             guess = int((words[int(p)] @ images[row]).argmax())
             right.append(guess == numbers[row, p])
             worlds.append(int(pictures.world[row]))
-    return figure("name a part's colour or material, new shapes", right, worlds, chance=1 / len(choices))
+    return figure(
+        "name a part's colour or material, new shapes", right, worlds, chance=1 / len(choices)
+    )
 
 
 def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures) -> Figure:
@@ -85,7 +92,10 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
             after = before + look
             old, new = pictures.surfaces[before], pictures.surfaces[after]
             (p,) = np.flatnonzero((old != new).any(axis=1))
-            if shares[p] < LEAST_SHARE or not (pictures.images[before] != pictures.images[after]).any():
+            if (
+                shares[p] < LEAST_SHARE
+                or not (pictures.images[before] != pictures.images[after]).any()
+            ):
                 continue
             kind = int(pictures.kind[before])
             seen = np.flatnonzero(shares >= LEAST_SHARE)
@@ -94,22 +104,33 @@ def _directions(encoder: TextImageEncoder, images: Array, pictures: PartPictures
                 other = draw_look(0, rng, pairs="any")
                 q = int(p) if rng.uniform() < 0.5 else int(rng.choice(seen))
                 edit = (q, said((other.finish, other.color, other.second), rng))
-                false = not true_of([Caption(kind, None, (edit,))], pictures, np.array([before, after])).any()
+                false = not true_of(
+                    [Caption(kind, None, (edit,))], pictures, np.array([before, after])
+                ).any()
                 if false and edit not in edits:
                     edits.append(edit)
             seed = int(rng.integers(2**31))
             pairs = [
-                [sentence(Caption(kind, None, ((q, s),)), np.random.default_rng(seed)) for s in (said(old[q], rng), surface)]
+                [
+                    sentence(Caption(kind, None, ((q, s),)), np.random.default_rng(seed))
+                    for s in (said(old[q], rng), surface)
+                ]
                 for q, surface in edits
             ]
-            texts = _unit(encoder.texts([t for pair in pairs for t in pair])).reshape(len(edits), 2, -1)
+            texts = _unit(encoder.texts([t for pair in pairs for t in pair])).reshape(
+                len(edits), 2, -1
+            )
             likeness = _unit(texts[:, 1] - texts[:, 0]) @ _unit(images[after] - images[before])
             right.append(bool(likeness[0] > likeness[1:].max()))  # a tie is no find
             worlds.append(int(pictures.world[before]))
-    return figure("the edit of a part among 8, by directional similarity", right, worlds, chance=1 / 8)
+    return figure(
+        "the edit of a part among 8, by directional similarity", right, worlds, chance=1 / 8
+    )
 
 
-def scene_figure(encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES) -> tuple[Figure, dict[str, float]]:
+def scene_figure(
+    encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES
+) -> tuple[Figure, dict[str, float]]:
     """Which of a scene's own edits was made, by directional similarity; and the share of each scene.
 
     Each answer of an ambiguous edit is an edit of its own. Their true pictures are the package's.
@@ -120,7 +141,10 @@ def scene_figure(encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES) -
     right, names, chance = [], [], []
     for name in scenes:
         of = world(name, SCENE_SIZE)
-        views = tuple(list(of.targets)[k] for k in np.linspace(0, len(of.targets) - 1, SCENE_VIEWS).round().astype(int))
+        views = tuple(
+            list(of.targets)[k]
+            for k in np.linspace(0, len(of.targets) - 1, SCENE_VIEWS).round().astype(int)
+        )
         sources, targets, pictures = [], [], []
         for edit in of.scene.spec.edits:
             truth = edit_truth(name, SCENE_SIZE, SCENE_SAMPLES, edit.name, views)
@@ -128,7 +152,9 @@ def scene_figure(encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES) -
             for answer, shown in truth.answers.items():
                 sources.append(edit.source)
                 targets.append(words[answer])
-                pictures.append([(truth.originals[v], shown[v], truth.union[v].mean()) for v in views])
+                pictures.append(
+                    [(truth.originals[v], shown[v], truth.union[v].mean()) for v in views]
+                )
         away = _unit(_unit(encoder.texts(targets)) - _unit(encoder.texts(sources)))
         for k, row in enumerate(pictures):
             for before, after, share in row:
@@ -138,7 +164,9 @@ def scene_figure(encoder: TextImageEncoder, *, scenes: Sequence[str] = SCENES) -
                 right.append(int((away @ change[0]).argmax()) == k)
                 names.append(name)
                 chance.append(1 / len(pictures))
-    shares = {s: float(np.mean([r for r, n in zip(right, names, strict=True) if n == s])) for s in scenes}
+    shares = {
+        s: float(np.mean([r for r, n in zip(right, names, strict=True) if n == s])) for s in scenes
+    }
     what = "the edit among a scene's own, by directional similarity"
     return figure(what, right, names, chance=float(np.mean(chance)), asked=0.85), shares
 

@@ -41,7 +41,11 @@ PLURAL = ("trousers", "pants", "jeans", "shoes", "boots", "clothes", "leaves", "
           "mushroom caps", "toadstools", "stems", "walls", "windows", "wheels", "tyres", "apples", "bananas", "lips", "eyes")  # fmt: skip
 UNCOUNTED = ("hair", "foliage", "skin", "fur", "wood", "bark", "cloth", "fruit")
 
-SOME_HUES = {"yellow hair": ("blond",), "yellow beard": ("blond",), "orange leaves": ("orange autumn",)}
+SOME_HUES = {
+    "yellow hair": ("blond",),
+    "yellow beard": ("blond",),
+    "orange leaves": ("orange autumn",),
+}
 """Words for a colour that only some parts have, beside the usual ones."""
 
 
@@ -72,7 +76,9 @@ def said(surface: Sequence[int], rng: np.random.Generator) -> Surface:
     return finish, color, second
 
 
-def caption_of(pictures: PartPictures, row: int, shares: npt.NDArray[np.float64], rng: np.random.Generator) -> Caption:
+def caption_of(
+    pictures: PartPictures, row: int, shares: npt.NDArray[np.float64], rng: np.random.Generator
+) -> Caption:
     """A caption that is true of a picture.
 
     Args:
@@ -104,7 +110,11 @@ def caption_of(pictures: PartPictures, row: int, shares: npt.NDArray[np.float64]
 def wrong(caption: Caption, rng: np.random.Generator) -> Caption:
     """The caption with one thing changed; of two parts, at times their surfaces are exchanged."""
     ways = ["kind"] if caption.kind >= 0 else []
-    ways += ["ground"] * (caption.ground >= 0) + ["time"] * (caption.time >= 0) + ["whole"] * 2 * (caption.whole is not None)
+    ways += (
+        ["ground"] * (caption.ground >= 0)
+        + ["time"] * (caption.time >= 0)
+        + ["whole"] * 2 * (caption.whole is not None)
+    )
     ways += ["part"] * 3 * bool(caption.parts) + ["swap"] * 2 * (len(caption.parts) == 2)
     while True:
         changed = _changed(caption, ways[int(rng.integers(len(ways)))], rng)
@@ -147,7 +157,9 @@ def matches(surface: Surface, shown: npt.NDArray[np.int64]) -> npt.NDArray[np.bo
     return (shown[..., 0] == finish) & (same | swapped)
 
 
-def true_of(captions: Sequence[Caption], pictures: PartPictures, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+def true_of(
+    captions: Sequence[Caption], pictures: PartPictures, rows: npt.NDArray[np.int64]
+) -> npt.NDArray[np.bool_]:
     """(N pictures, M captions) whether each caption is true of each picture.
 
     A part that has several names ("shirt", "jacket") counts by what it is called.
@@ -165,7 +177,11 @@ def true_of(captions: Sequence[Caption], pictures: PartPictures, rows: npt.NDArr
         if caption.whole is not None:
             result[:, m] &= (matches(caption.whole, surfaces) | ~own).all(axis=1)
         for part, surface in caption.parts:
-            called = [q for q in range(len(PARTS)) if set(PART_NOUNS[PARTS[q]]) & set(PART_NOUNS[PARTS[part]])]
+            called = [
+                q
+                for q in range(len(PARTS))
+                if set(PART_NOUNS[PARTS[q]]) & set(PART_NOUNS[PARTS[part]])
+            ]
             result[:, m] &= (own[:, called] & matches(surface, surfaces[:, called])).any(axis=1)
     return result
 
@@ -217,17 +233,30 @@ def sentence(caption: Caption, rng: np.random.Generator, *, fillers: bool = Fals
             worn = PARTS[caption.parts[0][0]] in WORN
             joined = " and ".join(named)
             if rng.uniform() < 0.15:
-                described = f"{joined} of {described}" if rng.uniform() < 0.5 else f"{joined} beside {described}"
+                described = (
+                    f"{joined} of {described}"
+                    if rng.uniform() < 0.5
+                    else f"{joined} beside {described}"
+                )
             else:
-                described = f"{described} {'in' if worn and rng.uniform() < 0.7 else 'with'} {joined}"
+                described = (
+                    f"{described} {'in' if worn and rng.uniform() < 0.7 else 'with'} {joined}"
+                )
     return " ".join(" ".join([_one(OPENINGS, rng), described, *tail]).split())
 
 
 def _whole(caption: Caption, rng: np.random.Generator, fillers: bool) -> str:
     noun = _one(WHOLE_NOUNS[KINDS[caption.kind]], rng)
     adjective = surface_text(caption.whole, rng) if caption.whole is not None else ""
-    if caption.whole is not None and caption.whole[0] >= 0 and FINISHES[caption.whole[0]] in STATUES and rng.uniform() < 0.5:
-        return f"{with_article(_one(('statue', 'sculpture'), rng), adjective)} of {with_article(noun)}"
+    if (
+        caption.whole is not None
+        and caption.whole[0] >= 0
+        and FINISHES[caption.whole[0]] in STATUES
+        and rng.uniform() < 0.5
+    ):
+        return (
+            f"{with_article(_one(('statue', 'sculpture'), rng), adjective)} of {with_article(noun)}"
+        )
     if fillers and rng.uniform() < 0.25:
         adjective = f"{_one(FILLERS, rng)} {adjective}".strip()
     return with_article(noun, adjective)
@@ -235,4 +264,3 @@ def _whole(caption: Caption, rng: np.random.Generator, fillers: bool) -> str:
 
 def _one(choices: Sequence[str], rng: np.random.Generator) -> str:
     return choices[int(rng.integers(len(choices)))]
-

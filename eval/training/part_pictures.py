@@ -115,7 +115,10 @@ class PartPictures:
 def part_world(index: int, split: PartSplit) -> DressedAssembly:
     """The world of that number; kinds come in turn."""
     drawn = draw_assembly(split.first + index, index % len(KINDS), new_shapes=split.test)
-    fields = {name: getattr(drawn, name) for name in ("thing", "instance", "seed", "views", "bare", "part")}
+    fields = {
+        name: getattr(drawn, name)
+        for name in ("thing", "instance", "seed", "views", "bare", "part")
+    }
     return DressedAssembly(**fields)
 
 
@@ -145,7 +148,15 @@ def dresses(world: Assembly) -> list[Dress]:
 
     def dress(parts: list[Look], surroundings: Look) -> Dress:
         first = parts[0]
-        return Dress(first.finish, first.color, first.second, surroundings.ground, surroundings.time, surroundings.seed, tuple(parts))
+        return Dress(
+            first.finish,
+            first.color,
+            first.second,
+            surroundings.ground,
+            surroundings.time,
+            surroundings.seed,
+            tuple(parts),
+        )
 
     around, parts = draw_look(0, rng, pairs="any"), clothed(0.6)
     looks = [dress(parts, around)]
@@ -185,7 +196,11 @@ def render_part_world(index: int, split: PartSplit) -> dict[str, Any]:
         table = np.full(256, OTHER, dtype=np.uint8)
         table[: len(numbers)] = numbers
         table[len(numbers)] = GROUND
-        ids.append(np.where(hits.object_id < 0, SKY, table[np.clip(hits.object_id, 0, 255)]).astype(np.uint8))
+        ids.append(
+            np.where(hits.object_id < 0, SKY, table[np.clip(hits.object_id, 0, 255)]).astype(
+                np.uint8
+            )
+        )
     surfaces = np.full((LOOKS, len(PARTS), 3), -2)
     for k, look in enumerate(looks):
         surfaces[k, numbers] = [words_of(part) for part in look.parts]
@@ -197,7 +212,7 @@ def render_part_world(index: int, split: PartSplit) -> dict[str, Any]:
 
 def _make_shard(path: Path, split: PartSplit, start: int) -> Path:
     rows = [render_part_world(k, split) for k in range(start, start + SHARD)]
-    arrays = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+    arrays: dict[str, Any] = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     write_atomically(path, lambda stream: np.savez(stream, **arrays))
     return path
 
@@ -213,8 +228,12 @@ def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
     missing = [pair for pair in zip(files, starts, strict=True) if not pair[0].exists()]
     if missing:
         with Progress() as bar, ProcessPoolExecutor(workers) as pool:
-            task = bar.add_task(f"pictures: {name}", total=len(files), completed=len(files) - len(missing))
-            for finished in as_completed([pool.submit(_make_shard, path, split, start) for path, start in missing]):
+            task = bar.add_task(
+                f"pictures: {name}", total=len(files), completed=len(files) - len(missing)
+            )
+            for finished in as_completed(
+                [pool.submit(_make_shard, path, split, start) for path, start in missing]
+            ):
                 finished.result()
                 bar.advance(task)
     return files
@@ -237,7 +256,9 @@ def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
     worlds = len(table["kind"])
     world, view, look = (v.ravel() for v in np.indices((worlds, VIEWS, LOOKS)))
     ids = table["ids"].reshape(-1, SIZE, SIZE)
-    shares = np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]) / SIZE**2
+    shares = (
+        np.stack([np.bincount(one.ravel(), minlength=256)[: len(PARTS)] for one in ids]) / SIZE**2
+    )
     return PartPictures(
         images=table["images"].reshape(-1, SIZE, SIZE, 3),
         surfaces=table["surfaces"][world, look],
@@ -251,4 +272,3 @@ def load(folder: Path, name: str, workers: int = 2) -> PartPictures:
         ids=ids,
         shares=shares,
     )
-

@@ -124,18 +124,31 @@ def small(monkeypatch, tmp_path):
     """The recipe on a few pictures of noise; the second stage is an untrained network."""
     rng = np.random.default_rng(4)
     zeros = np.zeros(12, np.int64)
-    attributes = np.stack([np.arange(12) % len(OBJECTS), zeros, zeros, zeros - 1, zeros, zeros], axis=1)
-    singles = Pictures(rng.integers(256, size=(12, 32, 32, 3), dtype=np.uint8), attributes, zeros, zeros, zeros)
+    attributes = np.stack(
+        [np.arange(12) % len(OBJECTS), zeros, zeros, zeros - 1, zeros, zeros], axis=1
+    )
+    singles = Pictures(
+        rng.integers(256, size=(12, 32, 32, 3), dtype=np.uint8), attributes, zeros, zeros, zeros
+    )
     monkeypatch.setattr(part_pictures, "load", lambda *_: drawn(5))
     monkeypatch.setattr(clip_parts, "load_pictures", lambda *_, **__: singles)
-    for name, value in {"STEPS": 1, "UNITS": 1, "SINGLE": 4, "CROP": 32, "KEPT": 1, "NOUNS_EACH": 1}.items():
+    for name, value in {
+        "STEPS": 1,
+        "UNITS": 1,
+        "SINGLE": 4,
+        "CROP": 32,
+        "KEPT": 1,
+        "NOUNS_EACH": 1,
+    }.items():
         monkeypatch.setattr(clip_parts, name, value)
 
     def second_stage(_, out):
         tokenizer = clip.make_tokenizer(300)
         tokenizer.save(str(out / "clip-small.tokenizer.json"))
         torch.manual_seed(0)
-        torch.save({"model": ClipSmall(tokenizer.get_vocab_size()).state_dict()}, out / clip.CHECKPOINT)
+        torch.save(
+            {"model": ClipSmall(tokenizer.get_vocab_size()).state_dict()}, out / clip.CHECKPOINT
+        )
         return out / clip.CHECKPOINT
 
     monkeypatch.setattr(clip, "train", second_stage)
@@ -158,9 +171,14 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(small, m
         clip_parts.train(small, small / "halves", epochs=2)
     monkeypatch.setattr(clip_parts, "rate", original)
     clip_parts.train(small, small / "halves", epochs=2)
-    one, other = (torch.load(small / n / "clip-small.pt", weights_only=True)["model"] for n in ("whole", "halves"))
+    one, other = (
+        torch.load(small / n / "clip-small.pt", weights_only=True)["model"]
+        for n in ("whole", "halves")
+    )
     assert all(torch.equal(value, other[key]) for key, value in one.items())
     start = torch.load(small / "whole" / clip.CHECKPOINT, weights_only=True)["model"]
-    changed = {key.split(".")[0] for key, value in one.items() if not torch.equal(value, start[key])}
+    changed = {
+        key.split(".")[0] for key, value in one.items() if not torch.equal(value, start[key])
+    }
     assert changed >= {"vision", "pool", "text", "patches", "scale"}
     assert all(torch.isfinite(value.float()).all() for value in one.values())

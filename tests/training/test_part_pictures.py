@@ -86,7 +86,9 @@ def test_looks_differ_as_they_say_and_keep_colours_back(index):
 
 
 def test_seeds_and_shapes_of_tests_are_not_those_of_any_training():
-    spans = [range(s.first, s.first + s.worlds) for s in (*PART_SPLITS.values(), *PAIR_SPLITS.values())]
+    spans = [
+        range(s.first, s.first + s.worlds) for s in (*PART_SPLITS.values(), *PAIR_SPLITS.values())
+    ]
     for k, one in enumerate(spans):
         for other in spans[k + 1 :]:
             assert one[-1] < other[0] or other[-1] < one[0]
@@ -146,7 +148,11 @@ def drawn(count, seed=0):
             one, two = (int(c) for c in rng.choice(len(COLORS), 2, replace=False))
             name = FINISHES[finish]
             colored = name in ("plain", "shiny") or name in TWO_COLORED
-            surfaces[row, part] = (finish, one if colored else -1, two if name in TWO_COLORED else -1)
+            surfaces[row, part] = (
+                finish,
+                one if colored else -1,
+                two if name in TWO_COLORED else -1,
+            )
     zeros = np.zeros(count, dtype=np.int64)
     return PartPictures(
         np.zeros((count, 2, 2, 3), np.uint8), surfaces, rng.integers(len(KINDS), size=count), rng.integers(len(GROUNDS), size=count),
@@ -165,7 +171,11 @@ def says(caption, kind, ground, time, surfaces):
         return finish == said[0] and {color, second} == {said[1], said[2]}
 
     shown = {PARTS[p]: s for p, s in enumerate(surfaces) if s[0] >= 0}
-    if caption.kind not in (-1, kind) or caption.ground not in (-1, ground) or caption.time not in (-1, time):
+    if (
+        caption.kind not in (-1, kind)
+        or caption.ground not in (-1, ground)
+        or caption.time not in (-1, time)
+    ):
         return False
     if caption.whole is not None and not all(is_like(caption.whole, s) for s in shown.values()):
         return False
