@@ -39,7 +39,7 @@ from training.worlds import (
 )
 
 SEED = 7
-EPOCHS = 60
+EPOCHS = 36
 STEPS = 50
 """Steps in an epoch."""
 UNITS = 10
@@ -50,6 +50,10 @@ CROP = 112
 SCALE = (0.42, 1.0)
 SINGLE_SCALE = (0.6, 0.95)
 PEAK = 1e-3
+COSINE = 60
+"""Epochs of the half cosine by which the learning rate falls; a shorter training ends before it does."""
+COOLING = 16
+"""Last epochs, in which the rate falls linearly beside that."""
 VISION = 0.5
 """Share of the learning rate for the towers, which have learned much already."""
 NOUNS_EACH = 10
@@ -319,7 +323,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         sums = np.zeros(5)
         for step in range(STEPS):
             for group, peak in zip(optimizer.param_groups, peaks, strict=True):
-                group["lr"] = rate(number * STEPS + step, epochs * STEPS, peak, 100)
+                group["lr"] = learning_rate(number * STEPS + step, epochs * STEPS, peak)
             rows = (rng.choice(units, UNITS, replace=False)[:, None] + looks).ravel()
             chosen = [flat[k] for k in rng.choice(len(flat), SINGLE, replace=False)]
             losses = batch_losses(model, pictures, rows, singles, chosen, tokenizer, rng)
@@ -337,6 +341,12 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         epoch
     )
     return checkpoint
+
+
+def learning_rate(step: int, total: int, peak: float) -> float:
+    """The cosine of :data:`COSINE` epochs, times the share of the last :data:`COOLING` that is left."""
+    left = (total - step) / (COOLING * STEPS)
+    return rate(step, COSINE * STEPS, peak, 100) * max(0.01, min(1.0, left))
 
 
 def batch_losses(

@@ -159,17 +159,17 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(small, m
     for name in ("whole", "halves"):
         (small / name).mkdir()
     clip_parts.train(small, small / "whole", epochs=2)
-    original = clip_parts.rate
+    original = clip_parts.learning_rate
 
     def stop(step, *more):
         if step == 1:
             raise KeyboardInterrupt
         return original(step, *more)
 
-    monkeypatch.setattr(clip_parts, "rate", stop)
+    monkeypatch.setattr(clip_parts, "learning_rate", stop)
     with pytest.raises(KeyboardInterrupt):
         clip_parts.train(small, small / "halves", epochs=2)
-    monkeypatch.setattr(clip_parts, "rate", original)
+    monkeypatch.setattr(clip_parts, "learning_rate", original)
     clip_parts.train(small, small / "halves", epochs=2)
     one, other = (
         torch.load(small / n / "clip-small.pt", weights_only=True)["model"]

@@ -1,5 +1,6 @@
 """Masks by words; oracles are transformers' own processors, and exact masks of a ray-cast world."""
 
+import dataclasses
 import shutil
 
 import cv2
@@ -17,7 +18,9 @@ from attnwarp.editing.segment import (
     segments_of,
 )
 from attnwarp.errors import InputError
+from training.assemblies import KINDS
 from training.editing_pairs import PAIR_SPLITS, THING, edit_looks, edit_world, shown_things
+from training.part_pictures import PARTS, PartSplit, render_part_world
 from training.render import pictures
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (50, 70, 3), dtype=np.uint8)
@@ -128,6 +131,35 @@ def test_the_bundled_segmenter_cuts_a_held_out_snowman_out(clip):
     assert (mask & exact).sum() / (mask | exact).sum() > 0.9
     large = cv2.resize(image, (512, 512), interpolation=cv2.INTER_NEAREST)
     assert clip.segment(large, "snowman").shape == (512, 512)
+
+
+def test_the_bundled_segmenter_cuts_a_part_of_a_held_out_person_out(clip):
+    row = render_part_world(KINDS.index("person"), PartSplit(92_000_000, 17, test=True))
+    image, exact = row["images"][0, 0], row["ids"][0] == PARTS.index("jacket")
+    mask = clip.segment(image.astype(np.float32) / 255, "jacket")
+    assert (mask & exact).sum() / (mask | exact).sum() > 0.5
+
+
+def test_a_segmenter_follows_the_probabilities_of_its_encoder():
+    """Oracle: two halves of one colour each, of which an encoder that is made by hand says which it is."""
+
+    class Halves:
+        def shown(self, image, texts):
+            assert texts == ["a photo of ball"]
+            height, width = image.shape[0] // 8, image.shape[1] // 8
+            probability = np.full((height, width, 1), 0.1)
+            probability[:, : width // 2] = 0.9
+            return probability
+
+    image = np.full((96, 128, 3), 0.2)
+    image[:, 64:] = 0.8
+    segmenter = ClipSegmenter(Halves())
+    relevance = segmenter.relevance(image, "ball")
+    assert relevance.shape == (96, 128)
+    assert relevance[:, :48] == pytest.approx(0.9) and relevance[:, 80:] == pytest.approx(0.1)
+    assert (segmenter.segment(image, "ball") == (image[..., 0] < 0.5)).all()
+    with pytest.raises(NoDetectionError):
+        dataclasses.replace(segmenter, detection=0.95).segment(image, "ball")
 
 
 def test_nothing_in_an_empty_picture_is_an_error(clip):

@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 
 from attnwarp.encoders import load_encoder
-from attnwarp.encoders.base import PerceptualDistance, TextImageEncoder, TokenEncoder
+from attnwarp.encoders.base import (
+    PerceptualDistance,
+    PlaceEncoder,
+    TextImageEncoder,
+    TokenEncoder,
+)
 from attnwarp.encoders.bundled import WEIGHTS, load
 from attnwarp.errors import InputError
 from training import assess
+from training.assemblies import KINDS
 from training.data import Pictures, Split, looks_of, render_world
+from training.part_pictures import PARTS, PartSplit, render_part_world
 
 NAMES = ("clip-small", "dino-small", "perceptual-small")
 
@@ -85,6 +92,7 @@ def test_the_card_says_which_asked_figures_are_missed_and_the_control_is_below(n
 
 def test_they_are_what_the_door_promises(clip, dino, perceptual):
     assert isinstance(clip, TextImageEncoder)
+    assert isinstance(clip, PlaceEncoder)
     assert isinstance(dino, TokenEncoder)
     assert isinstance(perceptual, PerceptualDistance)
     for encoder, name in zip((clip, dino, perceptual), NAMES, strict=True):
@@ -145,6 +153,35 @@ def test_things_colours_and_times_are_named(clip, worlds):
         assert figures[what].value > 5 * figures[what].chance, what
     assert figures["the edit among 8, by directional similarity"].value > 0.8
     assert figures["the same name for two views of a thing"].value > 0.8
+
+
+def test_places_of_the_mirror_image_are_mirrored_and_follow_the_picture(clip):
+    picture = np.random.default_rng(2).uniform(size=(64, 96, 3)).astype(np.float32)
+    words = ["a photo of grass", "the sky", "a red ball"]
+    shown = clip.shown(picture, words)
+    assert shown.shape == (8, 12, 3)
+    assert ((shown >= 0) & (shown <= 1)).all()
+    mirrored = clip.shown(np.ascontiguousarray(picture[:, ::-1]), words)
+    assert np.allclose(mirrored[:, ::-1], shown, atol=1e-5)
+    # A text's probability does not depend on the texts beside it.
+    assert np.allclose(clip.shown(picture, words[1:])[..., 0], shown[..., 1], atol=1e-6)
+    assert clip.shown(picture[:50, :70], words).shape == (8, 8, 3)
+    with pytest.raises(ValueError, match="got shape"):
+        clip.shown(picture[0], words)
+
+
+@pytest.mark.parametrize(("kind", "part"), [("person", "jacket"), ("house", "roof")])
+def test_places_of_a_part_are_told_from_the_others(clip, kind, part):
+    """Oracle: the pixels that rays of a world hit, whose shape no recipe has seen."""
+    row = render_part_world(KINDS.index(kind), PartSplit(92_000_000, 17, test=True))
+    on_part = (row["ids"][0] == PARTS.index(part)).reshape(20, 8, 20, 8).mean(axis=(1, 3))
+    values = []
+    for image in row["images"][0]:
+        shown = clip.shown(image.astype(np.float32) / 255, [f"a photo of a {part}"])[..., 0]
+        inside, outside = shown[on_part == 1], shown[on_part == 0]
+        values.append((inside[:, None] > outside).mean())
+    assert (on_part == 1).sum() >= 4
+    assert np.mean(values) > 0.9
 
 
 def test_unknown_words_do_not_drown_the_known_ones(clip):
