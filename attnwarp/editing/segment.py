@@ -307,10 +307,10 @@ class ClipSegmenter:
 
     encoder: PlaceEncoder
     sides: Sequence[int] = (128, 192, 256)
-    likely: float = 0.5
-    background: float = 0.2
-    sure: float = 0.8
-    detection: float = 0.5
+    likely: float = 0.3
+    background: float = 0.1
+    sure: float = 0.6
+    detection: float = 0.3
 
     @classmethod
     def bundled(cls) -> ClipSegmenter:

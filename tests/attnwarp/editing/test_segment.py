@@ -133,11 +133,20 @@ def test_the_bundled_segmenter_cuts_a_held_out_snowman_out(clip):
     assert clip.segment(large, "snowman").shape == (512, 512)
 
 
-def test_the_bundled_segmenter_cuts_a_part_of_a_held_out_person_out(clip):
-    row = render_part_world(KINDS.index("person"), PartSplit(92_000_000, 17, test=True))
-    image, exact = row["images"][0, 0], row["ids"][0] == PARTS.index("jacket")
-    mask = clip.segment(image.astype(np.float32) / 255, "jacket")
-    assert (mask & exact).sum() / (mask | exact).sum() > 0.5
+def test_the_bundled_segmenter_cuts_parts_of_held_out_things_out(clip):
+    """Oracle: the pixels that rays hit. A third of the parts may be missed, as the report has it."""
+    overlaps = []
+    for kind, part in (("house", "roof"), ("mushroom", "cap")):
+        row = render_part_world(KINDS.index(kind), PartSplit(92_000_000, 17, test=True))
+        for view in range(2):
+            exact = row["ids"][view] == PARTS.index(part)
+            for image in row["images"][view]:
+                try:
+                    mask = clip.segment(image.astype(np.float32) / 255, part)
+                except NoDetectionError:
+                    mask = np.zeros_like(exact)
+                overlaps.append((mask & exact).sum() / (mask | exact).sum())
+    assert np.mean(overlaps) > 0.5
 
 
 def test_a_segmenter_follows_the_probabilities_of_its_encoder():
