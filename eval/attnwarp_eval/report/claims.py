@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, Literal
@@ -10,7 +10,7 @@ from typing import Any, Literal
 import yaml
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import spread
+from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.statistics.intervals import (
     ByView,
     Interval,
@@ -119,6 +119,23 @@ class JudgedClaim:
     agreement: tuple[int, int]
     here: Here
     verdict: Verdict
+    p: float
+    """Of the contrast, adjusted over the claims."""
+
+
+Comparison = tuple[str, str, frozenset[str]]
+"""A probe, a metric and two variants."""
+
+
+def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, float]:
+    """The adjusted p-value of each comparison of two variants, over all views, that a claim makes:
+    a table that shows such a comparison has the claim's verdict.
+    """
+    return {
+        (one.claim.probe, one.metric, frozenset(one.sides)): one.p
+        for one in judged
+        if one.claim.yaw is None
+    }
 
 
 def load_claims() -> list[Claim]:
@@ -177,6 +194,7 @@ def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
             agreement(m.a, m.b, claim.sign),
             _here(claim, m),
             _in_general(claim, contrast, p),
+            p,
         )
         for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views
@@ -251,6 +269,7 @@ def claims(results: Results) -> Section:
                 finding.verdict,
                 f"{agree} of {views}",
                 contrast,
+                number(finding.p),
                 sides,
                 finding.metric,
             ]
@@ -260,7 +279,7 @@ def claims(results: Results) -> Section:
         if editors and finding is own[-1]:
             here, verdict = together(own, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
-            rows.append([text, here, verdict, "–", "–", "–", finding.metric])
+            rows.append([text, here, verdict, "–", "–", "–", "–", finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
@@ -270,7 +289,8 @@ def claims(results: Results) -> Section:
             "A claim that does not hold on these scenes is a result, not an error. **Here** speaks"
             " of these scenes alone: `seen` when the difference has the expected sign in every"
             " scene, with the views that agree beside it. **In general** speaks of scenes like"
-            " these, of which a few were drawn, and says `can't tell` when so few cannot settle it."
+            " these, of which a few were drawn, and says `can't tell` when so few cannot settle it;"
+            " its p-values are adjusted over the claims of this table."
         ),
     ]
     columns = [
@@ -279,6 +299,7 @@ def claims(results: Results) -> Section:
         "in general",
         "views that agree",
         "difference",
+        "adjusted p",
         "measured",
         "metric",
     ]

@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 import written_runs
+from scipy import stats
 
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
@@ -116,6 +117,43 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     assert row[6] == "3, 6"
 
 
+def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_part_in_their_family():
+    """Oracle: scipy's t test of the scenes' differences, adjusted by hand (Benjamini, Hochberg)."""
+    recall, precision = "occlusion.recall", "occlusion.precision"
+    # Mean differences of the three scenes. A claim speaks of SLIP alone.
+    differences = {
+        SLIP: [0.50, 0.51, 0.49],
+        recall: [-0.30, -0.30, -0.34],
+        precision: [-0.10, -0.20, -0.12],
+    }
+    cells = [
+        written_runs.outcome(
+            "warp",
+            scene,
+            [variant],
+            written_runs.record(
+                [("v0", 0.0, {m: 0.6 + factor * v[i] for m, v in differences.items()})],
+                cost={"seconds": {"steady": 0.1}, "counters": {}},
+            ),
+        )
+        for variant, factor in (("good", 0), ("slipped", 1))
+        for i, scene in enumerate(SCENES)
+    ]
+    run = written_runs.results(study(), cells)
+    p = {metric: stats.ttest_1samp(values, 0).pvalue for metric, values in differences.items()}
+    (claim,) = judge(run, load_claims())
+    (section,) = ablations(run)
+    rows = {row[1]: row for row in section.tables[-1].rows}
+    # One claim, so its p-value is not multiplied; with the table's two others it would be by 3/1.
+    assert rows[SLIP][5] == f"{number(p[SLIP])} †" == f"{number(claim.p)} †"
+    assert (rows[SLIP][3], claim.verdict) == ("worse", "holds")
+    # The smaller of the table's two tests is doubled, the larger stays.
+    assert p[recall] < p[precision]
+    assert rows[recall][5] == number(2 * p[recall])
+    assert rows[precision][5] == number(max(p[precision], 2 * p[recall]))
+    assert any(text.startswith("† in the table") for text in section.text)
+
+
 def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
     (section,) = ablations(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
     assert section.text == ["**Not measured:** good."]
@@ -183,7 +221,9 @@ def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
     assert sides == [(name, {"editor": {"name": name}}) for name in ("small", "small-plain")]
 
     def finding(here, verdict):
-        return JudgedClaim(claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict)
+        return JudgedClaim(
+            claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict, 0.01
+        )
 
     holds, fails = finding("seen", "holds"), finding("not seen", "does not hold")
     assert together([holds, holds], claim.editors) == ("seen", "holds")
