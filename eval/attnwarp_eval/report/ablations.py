@@ -21,7 +21,6 @@ from attnwarp_eval.study.probes.base import mean_values
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
 
-
 CLAIMED = "†"
 """Stands beside the p-value of a comparison that a claim makes."""
 

@@ -16,6 +16,7 @@ from attnwarp_eval.statistics.intervals import (
     Interval,
     agreement,
     benjamini_hochberg,
+    common,
     interval,
     paired,
 )
@@ -91,7 +92,9 @@ class Claim:
             zero = {scene: dict.fromkeys(views, 0.0) for scene, views in first.items()}
             return Measured(metric, {a: _interval(first)}, zero, first)
         second = results.views(self.probe, b, metric, self.yaw)
-        return Measured(metric, {a: _interval(first), b: _interval(second)}, first, second)
+        # Over the views that both have: only there is the difference of the means the claim's.
+        sides = dict(zip((a, b), map(_interval, common([first, second])), strict=True))
+        return Measured(metric, sides, first, second)
 
 
 @dataclass(frozen=True)
@@ -290,7 +293,8 @@ def claims(results: Results) -> Section:
             " of these scenes alone: `seen` when the difference has the expected sign in every"
             " scene, with the views that agree beside it. **In general** speaks of scenes like"
             " these, of which a few were drawn, and says `can't tell` when so few cannot settle it;"
-            " its p-values are adjusted over the claims of this table."
+            " its p-values are adjusted over the claims of this table. **Measured** are means; those of"
+            " two variants are over the views that both have, so that the difference is theirs."
         ),
     ]
     columns = [

@@ -353,6 +353,20 @@ def test_an_undefined_scene_neither_agrees_nor_disagrees():
     assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
 
 
+def test_the_means_beside_a_claims_difference_are_over_the_views_that_both_sides_have():
+    run = results(
+        {
+            "good": [[0.1, 9.0], [0.1, 0.3], [0.1, 0.1]],
+            "slipped": [[0.6, None], [0.5, 0.7], [None, None]],
+        }
+    )
+    (finding,) = judge(run, [SLIP_CLAIM])
+    # Scene one without its second view, two whole, three left out; 9.0 would turn the order round.
+    means = {name: side.mean for name, side in finding.sides.items()}
+    assert means == pytest.approx({"good": (0.1 + 0.2) / 2, "slipped": (0.6 + 0.6) / 2})
+    assert finding.contrast.mean == pytest.approx(means["slipped"] - means["good"])
+
+
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
     other = {**written_runs.ENVIRONMENT, "git": {"sha": "b" * 40, "dirty": True}}
     changed = written_runs.outcome("warp", "one", ["good"], record([0.1], other))
