@@ -26,7 +26,7 @@ from attnwarp_eval.study.study import parse_variant
 
 Verdict = Literal["holds", "does not hold", "can't tell", "depends on the editor"]
 
-Here = Literal["seen", "mixed", "not seen", "depends on the editor"]
+Here = Literal["seen", "seen where defined", "mixed", "not seen", "depends on the editor"]
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
             m.sides,
             contrast,
             agreement(m.a, m.b, claim.sign),
-            _here(claim, m),
+            _here(claim, m, len(results.study.scenes)),
             _in_general(claim, contrast, p),
             p,
         )
@@ -217,11 +217,18 @@ def together(findings: Sequence[JudgedClaim], editors: Sequence[str]) -> tuple[H
     return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"
 
 
-def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not seen"]:
-    """Whether the mean difference has the expected sign in every scene that has one."""
-    scenes = [paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b]
-    signs = [difference.mean * claim.sign > 0 for difference in scenes if difference.views]
-    return "seen" if all(signs) else "mixed" if any(signs) else "not seen"
+def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
+    """Whether the mean difference has the expected sign in every scene.
+
+    ``scenes``: how many the study has. One without values cannot show what is expected.
+    """
+    differences = [
+        paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b
+    ]
+    signs = [one.mean * claim.sign > 0 for one in differences if one.views]
+    if not all(signs):
+        return "mixed" if any(signs) else "not seen"
+    return "seen" if len(signs) == scenes else "seen where defined"
 
 
 def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
@@ -259,7 +266,7 @@ def claims(results: Results) -> Section:
     """The section of the report."""
     declared = {claim.id: claim for claim in load_claims()}
     findings = judge(results, list(declared.values()))
-    rows = []
+    rows, scenes = [], len(results.study.scenes)
     for finding in findings:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
@@ -270,6 +277,7 @@ def claims(results: Results) -> Section:
                 claim.text,
                 finding.here,
                 finding.verdict,
+                f"{finding.contrast.scenes} of {scenes}",
                 f"{agree} of {views}",
                 contrast,
                 number(finding.p),
@@ -282,25 +290,30 @@ def claims(results: Results) -> Section:
         if editors and finding is own[-1]:
             here, verdict = together(own, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
-            rows.append([text, here, verdict, "–", "–", "–", "–", finding.metric])
+            rows.append([text, here, verdict, *["–"] * 5, finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
         return section
     section.text = [
+        "A claim that does not hold on these scenes is a result, not an error.",
         (
-            "A claim that does not hold on these scenes is a result, not an error. **Here** speaks"
-            " of these scenes alone: `seen` when the difference has the expected sign in every"
-            " scene, with the views that agree beside it. **In general** speaks of scenes like"
-            " these, of which a few were drawn, and says `can't tell` when so few cannot settle it;"
-            " its p-values are adjusted over the claims of this table. **Measured** are means; those of"
-            " two variants are over the views that both have, so that the difference is theirs."
+            "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign"
+            " in every scene of the study. `seen where defined`: in every scene that has values,"
+            " and some have none. `not seen`: in no scene.\n"
+            "- **In general** speaks of scenes like these, of which a few were drawn. It says"
+            " `can't tell` when so few cannot settle it. p-values are adjusted over the claims.\n"
+            "- **Scenes**: those in which the difference is defined. **Views that agree** have the"
+            " expected sign.\n"
+            "- **Measured** are means. Those of two variants are over the views that both have, so"
+            " that the difference is theirs."
         ),
     ]
     columns = [
         "claim",
         "here",
         "in general",
+        "scenes",
         "views that agree",
         "difference",
         "adjusted p",

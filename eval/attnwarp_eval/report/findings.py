@@ -97,14 +97,16 @@ def _clearest(judged_claims: Sequence[JudgedClaim]) -> list[JudgedClaim]:
 
 def _claim(results: Results, judged: JudgedClaim) -> Finding:
     first, second = list(judged.sides)
-    outcome = {"seen": "seen here", "not seen": "not seen here"}[judged.here]
+    scenes = f"{judged.contrast.scenes} of {len(results.study.scenes)} scenes"
+    seen = {"seen": "seen here", "seen where defined": f"seen here in {scenes}"}
+    outcome = seen.get(judged.here, "not seen here")
     if judged.verdict != "can't tell":
         outcome += f", {judged.verdict} in general"
     return Finding(
         f"{judged.claim.text}: {outcome}.",
         _value(results, judged.claim.probe, judged.metric, judged.contrast),
         f"`{judged.metric}`: {second} against {first}",
-        "holds" if judged.here == "seen" else "fails",
+        "holds" if judged.here in seen else "fails",
         _pair(results, judged.claim.probe, first, second, judged.metric),
     )
 

@@ -12,7 +12,7 @@ from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
-from attnwarp_eval.report.claims import Claim, JudgedClaim, judge, load_claims, together
+from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.edit_truth import Judgement
@@ -345,11 +345,20 @@ def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
         assert probe(claim.probe).metric(claim.metric.replace("{layer}", "64")), claim.id
 
 
-def test_an_undefined_scene_neither_agrees_nor_disagrees():
+def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_scene():
     (finding,) = judge(
         results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM]
     )
-    assert (finding.here, finding.agreement, finding.contrast.scenes) == ("seen", (2, 2), 2)
+    here = "seen where defined"
+    assert (finding.here, finding.agreement, finding.contrast.scenes) == (here, (2, 2), 2)
+    missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
+    assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
+    (table,) = claims(missing).tables
+    assert {row[table.columns.index("scenes")] for row in table.rows} == {"2 of 3"}
+    (finding,) = judge(
+        results({"good": [[0.9], [None], [0.9]], "slipped": [[0.6]] * 3}), [SLIP_CLAIM]
+    )
+    assert finding.here == "not seen"
     assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
 
 
