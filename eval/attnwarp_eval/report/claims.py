@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
+from statistics import fmean
 from typing import Any, Literal
 
 import yaml
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import (
     ByView,
     Interval,
@@ -124,6 +126,8 @@ class JudgedClaim:
     verdict: Verdict
     p: float
     """Of the contrast, adjusted over the claims."""
+    below_floor: tuple[str, ...] = ()
+    """Scenes in which both sides disagree less than true views do."""
 
 
 Comparison = tuple[str, str, frozenset[str]]
@@ -198,6 +202,7 @@ def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
             _here(claim, m, len(results.study.scenes)),
             _in_general(claim, contrast, p),
             p,
+            _below_floor(m),
         )
         for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views
@@ -231,6 +236,13 @@ def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
     return "seen" if len(signs) == scenes else "seen where defined"
 
 
+def _below_floor(measured: Measured) -> tuple[str, ...]:
+    if not measured.metric.startswith(ABOVE_FLOOR):
+        return ()
+    a, b = common([measured.a, measured.b])
+    return tuple(s for s in a if max(fmean(a[s].values()), fmean(b[s].values())) < 0)
+
+
 def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
     if not contrast.bounded or not adjusted_p <= 0.05:
         return "can't tell"
@@ -262,6 +274,12 @@ def variant_like(
     return None
 
 
+def _scenes(finding: JudgedClaim, scenes: int) -> str:
+    below = ", ".join(finding.below_floor)
+    text = f"{finding.contrast.scenes} of {scenes}"
+    return f"{text}; below the floor: {below}" if below else text
+
+
 def claims(results: Results) -> Section:
     """The section of the report."""
     declared = {claim.id: claim for claim in load_claims()}
@@ -277,7 +295,7 @@ def claims(results: Results) -> Section:
                 claim.text,
                 finding.here,
                 finding.verdict,
-                f"{finding.contrast.scenes} of {scenes}",
+                _scenes(finding, scenes),
                 f"{agree} of {views}",
                 contrast,
                 number(finding.p),
@@ -309,6 +327,10 @@ def claims(results: Results) -> Section:
             " that the difference is theirs."
         ),
     ]
+    if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
+        section.text.append(
+            f"{BELOW_FLOOR} The column of scenes names those in which both sides are."
+        )
     columns = [
         "claim",
         "here",

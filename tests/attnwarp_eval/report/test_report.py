@@ -255,15 +255,40 @@ OWN_CLAIM = Claim(
 )
 
 
-def edited(name, value=0.0, *, done=True, scene="one", **spec):
+def edited(
+    name, value=0.0, *, done=True, scene="one", metric="embedding.dino_image.render", **spec
+):
     source = Judgement("red", done, 30.0, 10.0, 10.0)
     extra = EditResult("red", "paint it red", source, source, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
-        [("red/v0", 15.0, {"embedding.dino_image.render": value})],
+        [("red/v0", 15.0, {metric: value})],
         spec={"method": "propagate", "settings": {}, **spec},
         **extra.to_json(),
     )
     return written_runs.outcome("editing", scene, [name], data, f"{name}-{scene}")
+
+
+def test_a_claim_names_the_scenes_in_which_both_sides_are_below_the_floor_and_says_what_it_means():
+    metric = "multiview.delta_e_above.edit_inside"
+    values = {
+        "alone": {"one": -1.0, "two": 2.0, "three": 4.0},
+        "mine": {"one": -2.0, "two": -1.0, "three": 1.0},
+    }
+    cells = [
+        edited(name, value, metric=metric, scene=scene)
+        for name, own in values.items()
+        for scene, value in own.items()
+    ]
+    names = {name: METHODS[name] for name in values}
+    run = written_runs.results(
+        study(variants=names, probes={"editing": list(names)}, ablations=[]), cells
+    )
+    claim = dataclasses.replace(
+        OWN_CLAIM, metric=metric, a=METHODS["alone"], b=METHODS["mine"], expect="lower"
+    )
+    (finding,) = judge(run, [claim])
+    # In scene two only one side is.
+    assert (finding.here, finding.below_floor) == ("seen", ("one",))
 
 
 def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():

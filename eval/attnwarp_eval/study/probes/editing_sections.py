@@ -13,6 +13,7 @@ from typing import Any
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics.multiview import BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import Interval, interval
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import timed_in_turn
@@ -193,6 +194,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
             "Means over the scenes whose source edit was done, with 95 % intervals over scenes from"
             f" {FEWEST} scenes on."
         ),
+        BELOW_FLOOR,
     ]
     for name in measured:
         scenes = dict.fromkeys(scene for scene, _, _ in results.records(probe, name))
@@ -215,7 +217,10 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
             rows.append([name, *(number(value) for value in means), spread(interval(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
-    text = ["A dash: the editor did none of the scene's edits in its source view, or one answer."]
+    text = [
+        "A dash: the editor did none of the scene's edits in its source view, or one answer.",
+        BELOW_FLOOR,
+    ]
     return Section("Edited views by scene", text, tables)
 
 
