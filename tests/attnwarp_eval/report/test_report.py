@@ -19,7 +19,7 @@ from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.editing import EditResult
-from attnwarp_eval.study.probes.editing_sections import abilities
+from attnwarp_eval.study.probes.editing_sections import abilities, by_scene
 from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
@@ -289,6 +289,47 @@ def test_a_claim_names_the_scenes_in_which_both_sides_are_below_the_floor_and_sa
     (finding,) = judge(run, [claim])
     # In scene two only one side is.
     assert (finding.here, finding.below_floor) == ("seen", ("one",))
+
+
+def test_a_scene_without_a_part_of_the_controls_disagreement_says_why():
+    metric = "multiview.delta_e_above.edit_inside"
+    values = {
+        "alone": {"one": 4.0, "two": -1.0, "three": None, "four": 3.0, "five": 2.0},
+        "mine": {"one": 1.0, "two": -2.0, "three": 1.0, "four": None, "five": None},
+    }
+    undone = {("alone", "three"), ("mine", "four")}
+    cells = [
+        edited(
+            name,
+            value,
+            metric=metric,
+            scene=scene,
+            done=(name, scene) not in undone,
+            editor={"sha256": "e"},
+            method={"alone": "by_view", "mine": "propagate"}[name],
+        )
+        for name, own in values.items()
+        for scene, value in own.items()
+    ]
+    names = list(values)
+    content = study(
+        scenes=list(values["mine"]),
+        variants={name: {} for name in names},
+        probes={"editing": names},
+        ablations=[],
+    )
+    section = by_scene(written_runs.results(content, cells), "editing", names)
+    assert section.tables[0].rows == [
+        [
+            "mine",
+            "alone",
+            "0.250",  # 1 / 4
+            "below the floor",
+            "control's source edit not done",
+            "source edit not done",
+            "no view in common",
+        ]
+    ]
 
 
 def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():

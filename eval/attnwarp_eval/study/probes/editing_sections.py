@@ -14,7 +14,7 @@ from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.statistics.intervals import Interval, common, interval
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import timed_in_turn
 from attnwarp_eval.study.record import PictureFile
@@ -218,8 +218,16 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
     text = [
-        "A dash: the editor did none of the scene's edits in its source view, or one answer.",
+        (
+            "A dash: no view has the figure. Agreement needs a source edit that is done, a view"
+            " that was edited, and a surface of the object in both views. The share of views with"
+            " the source's answer needs an edit with several answers besides."
+        ),
         BELOW_FLOOR,
+        (
+            "A part of the control's disagreement is over the views that both have. A control at or"
+            " below its floor has no parts, and the cell says so."
+        ),
     ]
     return Section("Edited views by scene", text, tables)
 
@@ -235,20 +243,34 @@ def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
         base = control.get(results.records(probe, name)[0][2].spec["editor"]["sha256"], "")
         if base in ("", name):
             continue
-        own, other = (results.views(probe, each, DISAGREEMENT) for each in (name, base))
-        ratios = [
-            _ratio(own.get(scene, {}), other.get(scene, {})) for scene in results.study.scenes
-        ]
-        rows.append([name, base, *(number(ratio) for ratio in ratios)])
+        shared = common([results.views(probe, each, DISAGREEMENT) for each in (name, base)])
+        parts = [_part(results, probe, (name, base), shared, s) for s in results.study.scenes]
+        rows.append([name, base, *parts])
     title = "Disagreement with the source above its floor, as a part of the control's"
     return Table(["variant", "control", *results.study.scenes], rows, title)
 
 
-def _ratio(own: Mapping[str, float], other: Mapping[str, float]) -> float:
-    """Of the sums over the views that both have."""
-    shared = [v for v in own if v in other and math.isfinite(own[v]) and math.isfinite(other[v])]
-    below = sum(other[view] for view in shared)
-    return sum(own[view] for view in shared) / below if below > 0 else math.nan
+def _part(
+    results: Results,
+    probe: str,
+    names: tuple[str, str],
+    shared: Sequence[Mapping[str, Mapping[str, float]]],
+    scene: str,
+) -> str:
+    """The ratio of a variant's sum over the shared views to its control's, or why there is none.
+
+    Args:
+        names: of the variant and its control.
+        shared: what both have in the views that they share, by scene.
+    """
+    if scene in shared[0]:
+        own, control = (sum(table[scene].values()) for table in shared)
+        return number(own / control) if control > 0 else "below the floor"
+    for name, whose in zip(names, ("", "control's "), strict=True):
+        records = [record for where, _, record in results.records(probe, name) if where == scene]
+        if not any(record.extra.source.done for record in records):
+            return f"{whose}source edit not done"
+    return "no view in common"
 
 
 def side_by_side(results: Results, probe: str) -> Section | None:
