@@ -499,6 +499,42 @@ def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     assert {row[3] for row in section.tables[0].rows} == {"one pass"}
 
 
+def test_a_front_holds_variants_against_each_other_over_the_views_that_all_of_them_have(tmp_path):
+    """Oracle: a reading view by view. Over their own views, "fast" would be better than "slow"."""
+    values = {
+        "slow": [[1.0, 5.0, 9.0], [2.0, 6.0, None], [3.0, 7.0, 11.0]],
+        "fast": [[2.0, None, None], [3.0, 7.0, None], [4.0, None, None]],
+        # 3 of the 8 views that "slow" has: too few.
+        "rare": [[0.1, None, None], [None, 0.1, 0.1], [None, None, None]],
+    }
+    names = list(values)
+    front = [{"title": "Cost", "metric": SLIP, "variants": names}]
+    run = results(
+        values, variants={n: {} for n in names}, probes={"warp": names}, ablations=[], fronts=front
+    )
+    means = {}
+    for name in ("slow", "fast"):
+        scenes = []
+        for i in range(3):
+            both = [j for j in range(3) if None not in (values["slow"][i][j], values["fast"][i][j])]
+            scenes.append(sum(values[name][i][j] for j in both) / len(both))
+        means[name] = sum(scenes) / len(scenes)
+    assert means == pytest.approx({"slow": 8 / 3, "fast": 11 / 3})
+    (section,) = fronts(run, Layout(tmp_path))
+    rows = {row[0]: row for row in section.tables[0].rows}
+    for name, mean in means.items():
+        assert rows[name][1].startswith(f"{number(mean)} ± ")
+    assert rows["rare"][1].endswith("own views")
+    # Equally slow here, so only the better of the two is on the front.
+    assert {name: row[-1] for name, row in rows.items()} == {
+        "slow": "yes",
+        "fast": "no",
+        "rare": "–",
+    }
+    (text,) = [text for text in section.text if text.startswith("Cost: ")]
+    assert "over the 4 of 9 views" in text and text.endswith("with most: rare.")
+
+
 def test_text_of_a_page_is_escaped_before_it_is_set():
     assert (
         inline("a < b `c<d` **e** `#ff0000`")

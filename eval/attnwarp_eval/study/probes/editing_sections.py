@@ -389,15 +389,14 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     ]
     columns = ["seconds at most", "variant", "where chosen", "elsewhere", "best elsewhere"]
     for metric in metrics:
+        shared = results.shared(probe, list(seconds), metric)
+        section.text += shared.text(metric)
         rows, last = [], ""
         for limit in sorted(seconds.values()):
             scores = {
-                name: (
-                    _on(results, probe, name, metric, chosen_on),
-                    _on(results, probe, name, metric, checked_on),
-                )
+                name: (shared.mean(name, chosen_on).mean, shared.mean(name, checked_on).mean)
                 for name, taken in seconds.items()
-                if taken <= limit
+                if taken <= limit and name not in shared.apart
             }
             defined = {name: pair for name, pair in scores.items() if math.isfinite(pair[0])}
             best = min(defined, key=lambda name: defined[name][0], default="")
@@ -469,11 +468,6 @@ def budgets(results: Results, probe: str) -> Section | None:
         )
     timed = (columns[1], columns[5])
     return Section("Methods with a budget", text, [Table(columns, rows, timed=timed)])
-
-
-def _on(results: Results, probe: str, name: str, metric: str, scenes: Sequence[str]) -> float:
-    table = results.views(probe, name, metric)
-    return interval({s: list(table[s].values()) for s in scenes if s in table}).mean
 
 
 def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], dict[str, float]]:
