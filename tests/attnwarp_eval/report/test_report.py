@@ -404,6 +404,16 @@ def test_each_comparison_that_ships_has_both_sides_of_the_claims_about_methods(n
         assert alike == labels
 
 
+def test_what_is_claimed_of_methods_edited_views_is_claimed_of_what_a_person_gets_too():
+    def sides(metric):
+        own = [c for c in load_claims() if c.settings == "own" and c.metric == metric]
+        return [(c.a, c.b, c.expect) for c in own]
+
+    edited_views = sides("multiview.delta_e_above.edit_inside")
+    assert len(edited_views) == 5
+    assert sides("multiview.delta_e_above.render_inside") == edited_views
+
+
 def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
     declared = load_claims()
     assert len({claim.id for claim in declared}) == len(declared)
