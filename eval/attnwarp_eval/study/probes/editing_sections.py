@@ -336,23 +336,33 @@ def parts_of_time(results: Results, probe: str) -> Section:
         own = _seconds(results, probe, name)
         shared = [cell for cell in own if cell in base and _editing(base[cell]) > 0]
         ratios = [_editing(own[cell]) / _editing(base[cell]) for cell in shared]
-        counts = [record.cost.counters.get("network_rows", 0) for _, _, record in records]
-        means = [_mean(row[part] for row in own.values()) for part in PARTS]
-        whole = _mean(sum(row.values()) for row in own.values())
+        means = [
+            _over_scenes((scene, row[part]) for (scene, *_), row in own.items()) for part in PARTS
+        ]
+        whole = _over_scenes((scene, sum(row.values())) for (scene, *_), row in own.items())
+        counts = _over_scenes(
+            (scene, record.cost.counters.get("network_rows", 0)) for scene, _, record in records
+        )
         rows.append(
             [
                 name,
                 *(number(value) for value in means),
                 number(whole),
                 number(statistics.median(ratios) if ratios else None),
-                number(_mean(counts)),
+                number(counts),
             ]
         )
+    better = (
+        "Where it differs from the table of seconds taken in turn, believe that one."
+        if timed_in_turn(results, WHOLE) is not None
+        else "This run has no seconds taken in turn, which would be the ones to believe."
+    )
     text = [
         (
-            "Seconds of one edited scene, each cell at another time: for orientation. The ratio is"
-            " the median over scenes, edits and seeds of source, warps and edited views together"
-            f" against {control!r}, tuning apart."
+            "Own seconds of the cells, as means over scenes: they show how the time of an edit"
+            " divides. Each cell ran at another time, beside whatever else the machine did."
+            f" {better} The ratio is the median over scenes, edits and seeds of source, warps and"
+            f" edited views together against {control!r}, tuning apart."
         ),
     ]
     timed = tuple(columns[1:-1])
@@ -366,15 +376,13 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     measured = [name for name in names if results.records(probe, name)]
     timed = timed_in_turn(results, WHOLE)
     if timed is None:
-        seconds = {
-            name: _mean(sum(row.values()) for row in _seconds(results, probe, name).values())
-            for name in measured
-        }
-        origin = "Seconds are means over cells, each at another time: for orientation."
+        seconds = {name: _mean(results.seconds(probe, name, WHOLE).values()) for name in measured}
+        origin = "Seconds are those of the fronts: of one pass, for orientation."
     else:
         seconds = {name: timed.seconds(name).mean for name in measured if name in timed.names}
         origin = (
-            f"Seconds were taken in turn in one process: {', '.join(t.of for t in timed.turns)}."
+            "Seconds are those of the fronts, taken in turn in one process:"
+            f" {', '.join(t.of for t in timed.turns)}."
         )
         if rest := [name for name in measured if name not in seconds]:
             origin += f" Not timed in turn, so left out: {', '.join(rest)}."
@@ -426,36 +434,40 @@ def budgets(results: Results, probe: str) -> Section | None:
     ]
     rows, cut, untuned = [], [], []
     for name in results.study.variants:
-        records = [record for _, _, record in results.records(probe, name) if record.extra.budget]
-        if not records:
+        cells = [
+            (scene, record)
+            for scene, _, record in results.records(probe, name)
+            if record.extra.budget
+        ]
+        if not cells:
             continue
+        records = [record for _, record in cells]
         spent = [record.extra.budget for record in records]
         ended = [value.cut for value in spent if value.cut is not None]
         if ended:
             by = " and ".join(sorted({limit.replace("_", " ") for limit in ended}))
             cut.append(f"{name} ({len(ended)} of {len(spent)}, by {by})")
-        counters = [record.cost.counters for record in records]
-        idle = sum(own["iterations"] == 0 for own in counters)
+        idle = sum(record.cost.counters["iterations"] == 0 for record in records)
         if idle:
             untuned.append(f"{name} ({idle} of {len(spent)})")
         rows.append(
             [
                 name,
-                number(_mean(value.seconds for value in spent if value.seconds is not None)),
+                number(_limit(cells, "seconds")),
                 spent[0].seconds_of or "–",
-                number(_mean(v.network_rows for v in spent if v.network_rows is not None)),
+                number(_limit(cells, "network_rows")),
                 f"{len(ended)} of {len(spent)}",
-                number(_mean(record.cost.seconds["whole"] or 0.0 for record in records)),
-                number(_mean(own["network_rows"] for own in counters)),
-                number(_mean(record.extra.edited for record in records)),
-                number(_mean(own["iterations"] for own in counters)),
+                number(_over_scenes((s, r.cost.seconds["whole"] or 0.0) for s, r in cells)),
+                number(_over_scenes((s, r.cost.counters["network_rows"]) for s, r in cells)),
+                number(_over_scenes((s, r.extra.edited) for s, r in cells)),
+                number(_over_scenes((s, r.cost.counters["iterations"]) for s, r in cells)),
             ]
         )
     if not rows:
         return None
     text = [
         (
-            "Means over scenes, edits and seeds. Nothing begins beyond a budget, so a method may"
+            "Means over scenes. Nothing begins beyond a budget, so a method may"
             " take a little longer. **A budget in seconds makes a result depend on the machine and"
             " on what else runs there; no comparison of two runs reads these figures.**"
         ),
@@ -470,6 +482,12 @@ def budgets(results: Results, probe: str) -> Section | None:
     return Section("Methods with a budget", text, [Table(columns, rows, timed=timed)])
 
 
+def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
+    """Mean over scenes of one limit of the cells' budgets, NaN without any."""
+    limits = [(scene, getattr(record.extra.budget, name)) for scene, record in cells]
+    return _over_scenes((scene, limit) for scene, limit in limits if limit is not None)
+
+
 def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], dict[str, float]]:
     """Seconds by part of each cell, by (scene, seed, edit)."""
     return {
@@ -478,6 +496,14 @@ def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], d
         }
         for scene, seed, record in results.records(probe, name)
     }
+
+
+def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
+    """Mean over scenes of the means over their cells: (scene, value) each."""
+    by_scene: dict[str, list[float]] = {}
+    for scene, value in values:
+        by_scene.setdefault(scene, []).append(value)
+    return interval(by_scene).mean
 
 
 def _editing(seconds: Mapping[str, float]) -> float:
