@@ -2,7 +2,10 @@
 hand."""
 
 import dataclasses
+import math
+import re
 
+import numpy as np
 import pytest
 import written_runs
 from scipy import stats
@@ -15,7 +18,7 @@ from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.editing import EditResult
@@ -353,6 +356,33 @@ def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_
         study(variants={"warped": {}}, probes={"editing": ["warped"]}, ablations=[]), cells[-1:]
     )
     assert len(abilities(one_method, "editing").tables) == 1
+
+
+def test_the_numbers_of_an_edit_decide_whether_it_is_done():
+    """Oracle: the rule that the section states, read from its cells."""
+    answer = {"view": np.full((4, 4, 3), 0.5)}
+    unedited = {"view": np.full((4, 4, 3), 0.3)}
+    inside = {"view": np.ones((4, 4), bool)}
+    truth = EditTruth(unedited, {"red": answer}, {"red": inside}, inside)
+    # Near the answer; nearer to the unedited picture; farther from the answer than that one is.
+    expected = {0.45: "yes", 0.35: "**no**", 0.9: "**no**"}
+    judged = {value: truth.judge({"view": np.full((4, 4, 3), value)}) for value in expected}
+    for value, judgement in judged.items():
+        extra = EditResult("red", "paint it red", judgement, judgement, {}, {}, 30.0, 2, 0.0)
+        data = written_runs.record(
+            [], spec={"method": "by_view", "settings": {}}, **extra.to_json()
+        )
+        cell = written_runs.outcome("editing", "one", ["control"], data, "a")
+        content = study(variants={"control": {}}, probes={"editing": ["control"]}, ablations=[])
+        section = abilities(written_runs.results(content, [cell]), "editing")
+        row = dict(zip(section.tables[-1].columns, section.tables[-1].rows[0], strict=True))
+        psnr, *limits = map(float, re.findall(r"[\d.]+", row["source, dB"]))
+        decibels = [
+            -20 * math.log10(abs(a - b)) for a, b in ((value, 0.5), (0.3, 0.5), (value, 0.3))
+        ]
+        assert [psnr, *limits] == pytest.approx(decibels, rel=5e-3)
+        assert row["source done"] == expected[value]
+        assert (psnr > max(limits)) == (row["source done"] == "yes")
 
 
 @pytest.mark.parametrize(

@@ -65,8 +65,9 @@ def abilities(results: Results, probe: str) -> Section:
     section.text = [
         (
             "An edit counts as done where the picture, inside the edited object, is nearer to a"
-            " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
-            " inside the object, dB; in brackets that of the unedited picture."
+            " right answer than to the unedited picture, and than the unedited picture is. So its"
+            " PSNR to that answer, in dB inside the object, must exceed both numbers in brackets:"
+            " that of the unedited picture to the answer, and its own to the unedited picture."
             " **Agreement between views is judged only where the source's edit is done**; the"
             " others have undefined figures. The edits of the control stand here by name; a"
             " comparison counts those of each method."
@@ -143,7 +144,8 @@ def is_alone(spec: Mapping[str, Any]) -> bool:
 
 
 def _against(judgement: Any) -> str:
-    return f"{number(judgement.psnr)} ({number(judgement.unedited)})"
+    limits = f"{number(judgement.unedited)}, {number(judgement.unchanged)}"
+    return f"{number(judgement.psnr)} ({limits})"
 
 
 def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -> Section:
