@@ -141,7 +141,8 @@ def contrasts(
 def _table(compared: Sequence[Contrast], baseline: str) -> Table:
     rows = []
     for contrast in compared:
-        difference, judged = contrast.difference, contrast.verdict or "–"
+        difference = contrast.difference
+        judged: str = contrast.verdict or "–"
         if difference.views == 0:
             judged = "not measured"
         elif difference.mean == difference.low == difference.high == 0:
