@@ -61,7 +61,7 @@ class Shared:
         Args:
             title: of the table.
         """
-        if self.views == self.of:
+        if self.views == self.of and not self.apart:
             return []
         text = f"{title}: over the {self.views} of {self.of} views in which all have a value."
         if self.apart:
