@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.files import check_seen, read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
     Kind,
@@ -29,6 +30,10 @@ from attnwarp.editing.command import (
     WhereOption,
     check_segmenter,
 )
+from attnwarp.errors import InputWarning
+
+NO_FEATURES = 0.001
+"""Share of the targets' pixels below which each view was, in effect, edited alone."""
 
 
 class Preset(StrEnum):
@@ -125,6 +130,8 @@ def edit(
         use_threads(threads)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, None, None)
+        if ply is not None and splats is not None:
+            check_seen(ply, splats, dataset.cameras)
         from attnwarp.propagate.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
@@ -137,11 +144,19 @@ def edit(
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         views = len(result.edited)
-        carried = (
-            f"; {result.counters['injected']:.0%} of the targets' pixels got features of the source"
-            if settings.method == "warp" and views > 1
-            else ""
-        )
+        carried = ""
+        if settings.method == "warp" and views > 1:
+            share = result.counters["injected"]
+            carried = f"; {share:.0%} of the targets' pixels got features of the source"
+            if share < NO_FEATURES:
+                model = "the fitted splats do" if ply is None else f"{ply} does"
+                warnings.warn(
+                    "each view was edited alone, as none got features of the source: perhaps"
+                    f" {model} not fit the photographs, or no other view sees what --source sees,"
+                    f" or masks leave nothing; {out / 'masks'} shows where features went",
+                    InputWarning,
+                    stacklevel=1,
+                )
         typer.echo(
             f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in {seconds:.0f} s"
             f"{carried}"

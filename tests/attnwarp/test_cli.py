@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -313,6 +314,19 @@ def test_render_needs_no_points(data, tmp_path):
         "render", tmp_path / "m.ply", alone, "--out", tmp_path / "out", "--size", "16"
     )
     assert done.exit_code == 0, done.stderr
+
+
+def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
+    for name, shift, expected in (("there.ply", 0.0, 0), ("far.ply", 50.0, 1)):
+        splat = one_splat()
+        write_ply(tmp_path / name, replace(splat, means=splat.means + torch.tensor([0, 0, shift])))
+        out = tmp_path / name.removesuffix(".ply")
+        done = in_process("render", tmp_path / name, data, "--out", out)
+        assert done.exit_code == 0, done.stderr
+        pictures = [cv2.imread(str(path)) for path in out.glob("*.png")]
+        assert len(pictures) == 9 and any(picture.any() for picture in pictures) == (not expected)
+        said = f"warning: {tmp_path / name}: no view shows any of its splats; check"
+        assert done.stderr.count(said) == expected
 
 
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
