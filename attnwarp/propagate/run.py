@@ -31,6 +31,7 @@ from attnwarp.propagate.pictures import (
     Image,
     Mask,
     Principal,
+    check_source_picture,
     composite,
     edit_size,
     enlarged,
@@ -139,8 +140,8 @@ def propagate(
         settings: every choice of the method, see :class:`PropagateSettings`.
         source: number of the source view.
         source_picture: (h, w, 3) the source view edited elsewhere, such as by hand. It is resized
-            to the editor's size, and its features are recorded while its own noise is replayed
-            (edit-friendly inversion).
+            to the editor's size, so it has the view's aspect ratio. Its features are recorded while its
+            own noise is replayed (edit-friendly inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
         warps: the warp from the source to a target, by their numbers, such as one from exact depth;
@@ -183,7 +184,11 @@ def propagate(
         near = near_of(cameras)
         images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
     scene = Scene.checked(cameras, images, segments)
-    by_hand = None if source_picture is None else _by_hand(source_picture)
+    by_hand = None
+    if source_picture is not None:
+        by_hand = _by_hand(source_picture)
+        h, w, _ = by_hand.shape
+        check_source_picture((h, w), cameras[source], "source_picture")
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
             gaussians, scene, editor, instruction, settings, source, by_hand, warps,
