@@ -50,10 +50,10 @@ def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy:
 
     Example:
         >>> from attnwarp import check
-        >>> check.same_aspect((12, 21), (100, 165), "m", "transpose it")  # an eighth
-        >>> check.same_aspect((21, 12), (100, 165), "m", "transpose it")
+        >>> check.same_aspect((12, 21), (100, 165), "m", "crop")  # an eighth
+        >>> check.same_aspect((21, 12), (100, 165), "m", "crop")
         Traceback (most recent call last):
-        ValueError: m: got 21 x 12 (height x width), expected the aspect ratio of 100 x 165; transpose it
+        ValueError: m: got 21 x 12 (height x width), expected the aspect ratio of 100 x 165; crop
     """
     (h, w), (H, W) = size, full
     if abs(h * W - w * H) > max(H + W, h + w):

@@ -140,8 +140,8 @@ def propagate(
         settings: every choice of the method, see :class:`PropagateSettings`.
         source: number of the source view.
         source_picture: (h, w, 3) the source view edited elsewhere, such as by hand. It is resized
-            to the editor's size, so it has the view's aspect ratio. Its features are recorded while its
-            own noise is replayed (edit-friendly inversion).
+            to the editor's size, so it has the view's aspect ratio. Its features are
+            recorded while its own noise is replayed (edit-friendly inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
         warps: the warp from the source to a target, by their numbers, such as one from exact depth;
