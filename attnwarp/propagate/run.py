@@ -476,15 +476,18 @@ class _Run:
         if self.warps is not None:
             return self._masked(self.warps(source, target))
         before = self.frozen if s.depth_from == "frozen" else model
-        segments = self.scene.segments
+        reads: dict[str, Any] = {}
+        if s.warp.photometric is not None:
+            reads["source_image"] = self.scene.pictures[source]
+            reads["target_image"] = self.scene.pictures[target]
+        if s.warp.segment and self.scene.segments is not None:
+            reads["target_segment"] = self.scene.segments[target]
         warp = warp_view(
             before,
             self.scene.cameras[source],
             self.scene.cameras[target],
             s.warp,
-            source_image=self.scene.pictures[source],
-            target_image=self.scene.pictures[target],
-            target_segment=None if segments is None else torch.from_numpy(segments[target]),
+            **reads,
             source_surface=self._surface(source, before),
             backend=self.backend,
         )

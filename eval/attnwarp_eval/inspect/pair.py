@@ -184,14 +184,18 @@ class Pair:
             own = replace(self.surfaces[0], image=source_image)
             seen = replace(self.surfaces[1], image=target_image)
             return warp_surfaces(source, target, seen, own, self.settings)
+        reads = (
+            {}
+            if self.settings.photometric is None
+            else {"source_image": source_image, "target_image": target_image}
+        )
         return warp_view(
             self.model,
             source,
             target,
             self.settings,
             source_surface=self.surfaces[0],
-            source_image=source_image,
-            target_image=target_image,
+            **reads,
         )
 
     @cached_property

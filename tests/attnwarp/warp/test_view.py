@@ -213,7 +213,8 @@ def test_every_rule_can_be_varied_alone():
         ({"normal_test": "source_incidence"}, "source_incidence"),
         ({"segment": True}, "segment"),
     ):
-        view = run(dataclasses.replace(bare, **change), target_segment=segment)
+        edited = segment if rule == "segment" else None
+        view = run(dataclasses.replace(bare, **change), target_segment=edited)
         assert list(view.rules) == ["defined", "in_bounds", rule]
         assert view.mask.any() == (rule != "segment")
 
@@ -256,12 +257,61 @@ def test_a_mistaken_argument_is_named_with_what_was_expected():
     ):
         with pytest.raises(TypeError, match=message):
             warp_view(**{"gaussians": disc, "source": camera, "target": camera, **change})
+    wall = Surface(np.full((8, 8), 2.0))
+    for change, message in (
+        ({"settings": "corrected"}, "settings: got str, expected WarpSettings, such as PRESETS"),
+        ({"target_surface": wall.depth}, "target_surface: got ndarray, expected Surface, such as"),
+        ({"source_surface": wall.depth}, "source_surface: got ndarray, expected Surface, such as"),
+    ):
+        given = {"source": camera, "target": camera, "target_surface": wall, **change}
+        with pytest.raises(TypeError, match=message):
+            warp_surfaces(**given)
     view = warp_view(disc, camera, camera)
     for size in (64, (4,), (4, 4, 4)):
         with pytest.raises(ValueError, match=r"size: got .*, expected \(height, width\)"):
             view.at(size)
     with pytest.raises(TypeError, match="features: got ndarray, expected torch.Tensor"):
         view.at((4, 4)).warp(np.zeros((3, 4, 4), np.float32))
+
+
+def test_what_no_rule_reads_is_refused_with_the_setting_that_would_read_it():
+    disc, camera = shell(50), orbit(0, size=8)
+    for change, message in (
+        ({"source_image": np.zeros((8, 8, 3))}, "source_image: the settings have photometric=None"),
+        ({"target_image": np.zeros((8, 8, 3))}, "target_image: the settings have photometric=None"),
+        ({"target_segment": np.ones((8, 8), bool)}, "target_segment: the settings have segment=F"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            warp_view(disc, camera, camera, **change)
+    wall = Surface(np.full((8, 8), 2.0))
+    with pytest.raises(ValueError, match="target_segment: the settings have segment=False"):
+        warp_surfaces(camera, camera, wall, target_segment=np.ones((8, 8), bool))
+
+
+def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an_array():
+    disc, source, target = shell(50), orbit(0, size=8), orbit(0, size=12, width=16)
+    settings = preset("corrected", photometric=0.2, segment=True)
+    first, second = np.zeros((8, 8, 3)), np.full((12, 16, 3), 0.5)
+    for change, message in (
+        ({"source_image": np.zeros((3, 8, 8))}, r"source_image: got 3 x 8 .* \(H, W, C\)"),
+        ({"source_image": np.zeros((12, 16, 3))}, "source_image: got 12 x 16 .* of 8 x 8; its"),
+        ({"target_image": np.zeros((3, 12, 16))}, r"shape \(3, 12, 16\), expected \(12, 16, C\)"),
+        ({"target_image": np.zeros((12, 16, 4))}, "target_image: got 4 channels, expected 3 as in"),
+        (
+            {"target_image": 255 * second},
+            r"target_image: got values in \[128, 128\], expected sRGB",
+        ),
+        ({"source_image": first - 1}, r"source_image: got values in \[-1, -1\], expected sRGB"),
+        ({"target_segment": np.ones((8, 8))}, r"target_segment: got shape \(8, 8\), expected \(12"),
+    ):
+        given = {"source_image": first, "target_image": second, **change}
+        with pytest.raises(ValueError, match=message):
+            warp_view(disc, source, target, settings, **given)
+    segment = np.zeros((12, 16), bool)
+    segment[:, 8:] = True
+    segment.setflags(write=False)
+    view = warp_view(disc, source, target, settings, target_segment=segment)
+    assert np.array_equal(view.rules["segment"], segment)
 
 
 def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():
