@@ -471,6 +471,23 @@ def test_convert_says_what_it_cannot_do(tmp_path, arguments, message):
     assert done.exit_code == 2 and message in done.stderr
 
 
+def test_what_is_read_is_not_written_over_by_its_name_or_a_link(data, tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, spread("3d"))
+    before = path.read_bytes()
+    (tmp_path / "soft.ply").symlink_to(path)
+    os.link(path, tmp_path / "hard.ply")
+    for name in ("a.ply", "./a.ply", "soft.ply", "hard.ply"):
+        done = in_process("convert", path, f"{tmp_path}/{name}", "--sh-degree", 0)
+        assert done.exit_code == 2 and "is the file to convert; choose another" in done.stderr
+    assert path.read_bytes() == before
+    frames = (data / "transforms.json").read_bytes()
+    for named in (data, data / "transforms.json"):
+        done = in_process("undistort", named, data)
+        assert done.exit_code == 2 and "is the folder to undistort; choose" in done.stderr
+    assert (data / "transforms.json").read_bytes() == frames
+
+
 def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):
     done = in_process("fit", data, "--out", tmp_path, "--iterations", 1, "--third-scale", "1e-5")
     assert done.exit_code == 0, done.stderr
