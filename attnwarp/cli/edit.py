@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,14 +35,8 @@ NO_FEATURES = 0.001
 """Share of the targets' pixels below which each view was, in effect, edited alone."""
 
 
-class Preset(StrEnum):
-    """What a person may type for the choices of an edit."""
-
-    corrected = "corrected"
-    extended = "extended"
-    paper = "paper"
-    released = "released"
-    released_controlnet = "released-controlnet"
+PRESETS = ("corrected", "extended", "paper", "released", "released-controlnet")
+"""What a person may type for the choices of an edit; named here as ``--help`` imports no torch."""
 
 
 @reading_options()
@@ -56,12 +49,12 @@ def edit(
     ] = None,
     editor: EditorOption = "small-plain",
     preset: Annotated[
-        Preset,
+        str,
         typer.Option(
             metavar="NAME",
-            help=f"The method's choices: {', '.join(Preset)} (see editing-a-scene.md).",
+            help=f"The method's choices: {', '.join(PRESETS)} (see editing-a-scene.md).",
         ),
-    ] = Preset.corrected,
+    ] = "corrected",
     source: Annotated[
         str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
     ] = None,
@@ -126,7 +119,7 @@ def edit(
 
         import attnwarp.propagate.settings
 
-        settings = attnwarp.propagate.settings.preset(preset.value, **changes)
+        settings = attnwarp.propagate.settings.preset(preset, **changes)
         use_threads(threads)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, None, None)

@@ -152,7 +152,8 @@ def propagate(
         checkpoint_seconds: between two checkpoints of tuning.
         backend: of :func:`attnwarp.render.render`.
         watch: told how the edit stands, :func:`attnwarp.propagate.progress.progress_display`.
-        announce: told the memory of the recording before it is made.
+        announce: told what the views or the editor leave of the settings, and the memory of the
+            recording before it is made.
 
     Raises:
         ValueError: an argument of another size or type; the message names it.
@@ -238,6 +239,8 @@ class _Run:
         if self.folder.has("times.json"):
             self.seconds = dict(self.folder.read_json("times.json"))
         self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
+        if announce is not None:
+            self._announce_changes(announce, source, multiple)
         self.tuning = Tuning(
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
@@ -263,6 +266,21 @@ class _Run:
                 },
             }
         )
+
+    def _announce_changes(
+        self, announce: Callable[[str], None], source: int, multiple: int
+    ) -> None:
+        asked, longest = self.settings, max(self.sizes[source])
+        if asked.size is not None and longest != asked.size:
+            announce(
+                f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
+                f" of {multiple}"
+            )
+        if len(self.plan.stages) < asked.stages:
+            announce(
+                f"stages: {len(self.plan.stages)} in place of {asked.stages}, as"
+                f" {len(self.scene.cameras)} views leave no more to edit"
+            )
 
     def go(self) -> Propagation:
         self._write_segments()

@@ -208,6 +208,8 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
     ("more", "message"),
     [
         (("--source", "v9"), "--source: got 'v9', expected a view's name or a number below 5"),
+        (("--preset", "corected"), "expected one of 'paper', "),
+        (("--preset", "corected"), "; did you mean 'corrected'?"),
         (("--editor", "smal"), "editor 'smal': neither bundled"),
         (("--set", "opaqe=1"), "setting: got 'opaqe', expected one of"),
         (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
@@ -250,6 +252,18 @@ def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, t
     assert not (tmp_path / "out").exists()
 
 
+def test_stages_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
+    """Oracle: the manifest and the pictures that the edit leaves."""
+    more = ("--ply", place / "splats.ply", "--stages", 9, "--views-per-stage", 2, "--size", 31)
+    result = run(place, tmp_path, *more)
+    assert result.exit_code == 0, result.output
+    stages = json.loads((tmp_path / "manifest.json").read_text())["stages"]
+    longest = max(read_image(tmp_path / "source.png").shape)
+    assert (len(stages), longest) == (2, 32)
+    assert "stages: 2 in place of 9, as 5 views leave no more to edit\n" in result.stderr
+    assert "size: 32 px in place of 31, as this editor's sides are multiples of" in result.stderr
+
+
 def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     """Oracle: the masks leave no pixel of a view but the source's to be edited."""
     white = np.full((32, 32, 3), 255, np.uint8)
@@ -266,6 +280,7 @@ def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
     assert f"perhaps {place / 'splats.ply'} does not fit the photographs" in result.stderr
     result = run(place, tmp_path / "all", *ply)
     assert result.exit_code == 0 and "edited alone" not in result.stderr
+    assert "in place of" not in result.stderr
 
 
 def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):
