@@ -38,9 +38,9 @@ class Camera:
         name: a label for people; it takes no part in any computation.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a size that is no whole number, a focal
-            length that is not positive, a last row that is not [0, 0, 0, 1] ([0, 0, 1] for K), a rotation that is not
-            orthonormal to 1e-5 or mirrors.
+        ValueError: a wrong shape, a value that is not finite, a size that is no whole number, a
+            focal length that is not positive, a last row that is not [0, 0, 0, 1] ([0, 0, 1] for
+            K), a rotation that is not orthonormal to 1e-5 or mirrors.
 
     Example:
         >>> from attnwarp import Camera

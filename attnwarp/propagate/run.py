@@ -508,6 +508,7 @@ class _Run:
             **reads,
             source_surface=self._surface(source, before),
             backend=self.backend,
+            warn_empty=False,
         )
         return self._masked(warp)
 

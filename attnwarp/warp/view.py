@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp.correspondence import (
     Correspondence,
@@ -137,6 +139,7 @@ def warp_surfaces(
     *,
     target_segment: Array | None = None,
     backend: Backend = "auto",
+    warn_empty: bool = True,
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or
     exact.
@@ -154,6 +157,8 @@ def warp_surfaces(
         backend: "auto" computes with kernels (:mod:`attnwarp.warp.cpu`), "reference" with the
             definition in torch. Positions agree to 1e-6 px, masks but for a pixel within rounding
             of a rule's threshold.
+        warn_empty: warn where no pixel of the target has a position in the source. A loop over
+            views, some of which see nothing, turns it off.
 
     Raises:
         ValueError: a rule needs something that is not given, or what is given is read by no rule;
@@ -190,9 +195,12 @@ def warp_surfaces(
         correspondence, rules, mask = cpu.correspond_and_mask(
             source, target, target_surface, source_surface, settings, segment
         )
-        return WarpedView(
+        view = WarpedView(
             settings, correspondence, mask, rules, target_surface, source_surface, backend
         )
+        if warn_empty:
+            _warn_if_empty(view)
+        return view
     correspondence = correspond(
         source,
         target,
@@ -239,9 +247,12 @@ def warp_surfaces(
     if segment is not None:
         rules["segment"] = segment
     mask = torch.stack(list(rules.values())).all(dim=0)
-    return WarpedView(
+    view = WarpedView(
         settings, correspondence, mask, rules, target_surface, source_surface, backend
     )
+    if warn_empty:
+        _warn_if_empty(view)
+    return view
 
 
 def warp_view(
@@ -256,6 +267,7 @@ def warp_view(
     source_surface: Surface | None = None,
     backend: str = "auto",
     warp_backend: Backend = "auto",
+    warn_empty: bool = True,
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from splats.
 
@@ -275,7 +287,7 @@ def warp_view(
         source_surface: the source's render if it is at hand, :func:`render_surface`; one source
             serves many targets.
         backend: of the renderer, as in :func:`attnwarp.render.render`.
-        warp_backend: of the warp, as in :func:`warp_surfaces`.
+        warp_backend, warn_empty: of the warp, as in :func:`warp_surfaces`.
 
     Raises:
         ValueError, TypeError: as in :func:`warp_surfaces`.
@@ -317,7 +329,7 @@ def warp_view(
         source_surface = render_surface(gaussians, source, settings, backend=backend)
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
-    return warp_surfaces(
+    view = warp_surfaces(
         source,
         target,
         seen,
@@ -325,7 +337,12 @@ def warp_view(
         settings,
         target_segment=target_segment,
         backend=warp_backend,
+        warn_empty=False,
     )
+    # Where a filter left splats out, it may be what emptied the view.
+    if warn_empty and filtered is gaussians:
+        _warn_if_empty(view)
+    return view
 
 
 def render_surface(
@@ -399,6 +416,20 @@ def _check_pictures(
                 f"{name}: got values in [{image.min():.3g}, {image.max():.3g}], expected sRGB in"
                 " [0, 1]; divide 8 bits by 255"
             )
+
+
+def _warn_if_empty(view: WarpedView) -> None:
+    if view.rules["defined"].any():
+        return
+    surface = torch.isfinite(view.correspondence.target_depth).any()
+    reason = "every point lies behind the source" if surface else "the target sees no surface"
+    warnings.warn(
+        f"no pixel of the target has a position in the source: {reason}; check world_to_camera of"
+        " both: from world to camera, not camera-to-world; OpenCV axes (x right, y down, z"
+        " forward), not OpenGL's",
+        InputWarning,
+        stacklevel=3,
+    )
 
 
 def _checked_segment(

@@ -183,7 +183,7 @@ class Pair:
         if self.model is None or self.settings.gaussian_filter == "none":
             own = replace(self.surfaces[0], image=source_image)
             seen = replace(self.surfaces[1], image=target_image)
-            return warp_surfaces(source, target, seen, own, self.settings)
+            return warp_surfaces(source, target, seen, own, self.settings, warn_empty=False)
         reads = (
             {}
             if self.settings.photometric is None
@@ -196,6 +196,7 @@ class Pair:
             self.settings,
             source_surface=self.surfaces[0],
             **reads,
+            warn_empty=False,
         )
 
     @cached_property

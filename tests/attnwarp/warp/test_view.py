@@ -92,9 +92,8 @@ def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():
         view = warp_surfaces(source, target, Surface(depth), None, settings)
         assert view.mask.sum() > 1000
         assert (view.correspondence.z[view.mask] < 0).all()
-        tested = warp_surfaces(
-            source, target, Surface(depth), None, dataclasses.replace(settings, in_front=True)
-        )
+        strict = dataclasses.replace(settings, in_front=True)
+        tested = warp_surfaces(source, target, Surface(depth), None, strict, warn_empty=False)
         assert not tested.mask.any()
         assert not in_front(tested.correspondence)[view.mask].any()
 
@@ -286,6 +285,34 @@ def test_what_no_rule_reads_is_refused_with_the_setting_that_would_read_it():
     wall = Surface(np.full((8, 8), 2.0))
     with pytest.raises(ValueError, match="target_segment: the settings have segment=False"):
         warp_surfaces(camera, camera, wall, target_segment=np.ones((8, 8), bool))
+
+
+def test_a_view_without_a_position_says_what_to_check_and_why():
+    """Oracle: poses in the other conventions, made by hand from one in OpenCV's."""
+    disc = Gaussians(
+        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.3),
+        torch.ones(1), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    given = {"width": 16, "height": 16, "fov_y": 40, "up": (0, 1, 0)}
+    right = Camera.look_at((0.5, 0, -3), (0, 0, 0), **given)
+    opengl = np.diag([1.0, -1, -1, 1]) @ right.world_to_camera
+    backwards = np.linalg.inv(right.world_to_camera)
+    remedy = "; check world_to_camera of both: from world to camera, not camera-to-world; OpenCV"
+    wall = Surface(np.full((16, 16), 2.0))
+    assert warp_view(disc, right, right).mask.any()
+    for pose in (opengl, backwards):
+        wrong = Camera(right.K, pose, 16, 16)
+        with pytest.warns(UserWarning, match=f"the target sees no surface{remedy}") as issued:
+            view = warp_view(disc, wrong, wrong)
+        assert [warning.filename for warning in issued] == [__file__]
+        assert not view.mask.any()
+        warp_view(disc, wrong, wrong, warn_empty=False)  # a warning would be an error here
+    ahead, behind = (Camera(right.K, np.diag(d), 16, 16) for d in ([1.0] * 4, [1.0, -1, -1, 1]))
+    settings = preset("corrected", depth_agreement=False, normal_test="none")
+    for backend in ("auto", "reference"):
+        with pytest.warns(UserWarning, match=f"every point lies behind the source{remedy}") as got:
+            warp_surfaces(behind, ahead, wall, None, settings, backend=backend)
+        assert [warning.filename for warning in got] == [__file__]
 
 
 def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an_array():
