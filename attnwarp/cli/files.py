@@ -18,6 +18,9 @@ COVERED = 0.002
 """Share of a picture, 8 pixels of 64 x 64, below which splats leave nothing to edit in it."""
 
 
+LOOK_SIZE = 256
+"""Longest side in px of the renders that look for splats: a photograph's own takes its seconds."""
+
 UNSEEN = (
     "check that the splats and the cameras are of one scene, in the same coordinates and the same"
     " units"
@@ -86,7 +89,9 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     near = near_of(cameras)
     with torch.no_grad():
         for camera in cameras:
-            if float(render(splats, camera, near=near).alpha.mean()) >= COVERED:
+            factor = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
+            w, h = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+            if float(render(splats, camera.resize(w, h), near=near).alpha.mean()) >= COVERED:
                 return
     raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
 
