@@ -184,11 +184,9 @@ class Pair:
             own = replace(self.surfaces[0], image=source_image)
             seen = replace(self.surfaces[1], image=target_image)
             return warp_surfaces(source, target, seen, own, self.settings, warn_empty=False)
-        reads = (
-            {}
-            if self.settings.photometric is None
-            else {"source_image": source_image, "target_image": target_image}
-        )
+        reads: dict[str, Any] = {}
+        if self.settings.photometric is not None:
+            reads = {"source_image": source_image, "target_image": target_image}
         return warp_view(
             self.model,
             source,
