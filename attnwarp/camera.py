@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -37,9 +38,9 @@ class Camera:
         name: a label for people; it takes no part in any computation.
 
     Raises:
-        ValueError: a wrong shape, a value that is not finite, a focal length that is not positive,
-            a last row that is not [0, 0, 0, 1] ([0, 0, 1] for K), a rotation that is not
-            orthonormal to 1e-5 or mirrors.
+        ValueError: a wrong shape, a value that is not finite, a size that is no whole number, a
+            focal length that is not positive, a last row that is not [0, 0, 0, 1] ([0, 0, 1] for
+            K), a rotation that is not orthonormal to 1e-5 or mirrors.
 
     Example:
         >>> from attnwarp import Camera
@@ -64,6 +65,10 @@ class Camera:
         check.shape(pose, (4, 4), "world_to_camera")
         check.finite(K, "K")
         check.finite(pose, "world_to_camera")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, Real) or not float(value).is_integer():
+                raise ValueError(f"{name}: got {value!r}, expected a whole number of pixels")
         if self.width < 1 or self.height < 1:
             raise ValueError(
                 f"width, height: got {self.width} x {self.height}, expected at least 1 x 1"

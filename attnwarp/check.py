@@ -37,6 +37,32 @@ def shape(
         raise ValueError(f"{name}: got shape {actual}, expected ({wanted})")
 
 
+def same_aspect(size: tuple[int, int], full: tuple[int, int], name: str, remedy: str) -> None:
+    """Raise ValueError unless a picture of ``full`` can have been resized to ``size``.
+
+    Each side of the smaller may be rounded in its own way, by less than a pixel.
+
+    Args:
+        size: (h, w) that came.
+        full: (H, W) of the picture.
+        name: of the argument.
+        remedy: the end of the message.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.same_aspect((12, 21), (100, 165), "m", "crop")  # an eighth
+        >>> check.same_aspect((21, 12), (100, 165), "m", "crop")
+        Traceback (most recent call last):
+        ValueError: m: got 21 x 12 (height x width), expected the aspect ratio of 100 x 165; crop
+    """
+    (h, w), (H, W) = size, full
+    if abs(h * W - w * H) > max(H + W, h + w):
+        raise ValueError(
+            f"{name}: got {h} x {w} (height x width), expected the aspect ratio of {H} x {W};"
+            f" {remedy}"
+        )
+
+
 def finite(value: torch.Tensor | np.ndarray, name: str) -> None:
     """Raise ValueError naming the first row of ``value`` that holds a NaN or an infinity."""
     # torch is not imported for the question: what checks arrays alone should be there at once.

@@ -42,6 +42,7 @@ class Gaussians:
         ValueError: a wrong shape, a value that is not finite, a zero quaternion, a scale that is
             not positive, an opacity outside [0, 1]; the message names the argument and the first
             bad row.
+        TypeError: an array in place of a tensor.
 
     Example:
         >>> import torch
@@ -69,6 +70,8 @@ class Gaussians:
 
     def __post_init__(self) -> None:
         check.one_of(self.kind, ("2d", "3d"), "kind")
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            check.instance(getattr(self, name), torch.Tensor, name, "torch.Tensor")
         n = self.means.shape[0] if self.means.ndim else 0
         check.shape(self.means, ("N", 3), "means")
         check.shape(self.quats, (n, 4), "quats")

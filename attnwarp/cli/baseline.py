@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.files import check_seen, read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
     MaxSizeOption,
@@ -67,9 +67,11 @@ def baseline(
         from attnwarp.baselines.command import edit_dataset
 
         dataset = read_views(data, reading, points=False)
+        splats = read_splats(ply, None, None)
+        check_seen(ply, splats, dataset.cameras)
         result = edit_dataset(
-            method.value, dataset, read_splats(ply, None, None), editor, instruction, settings,
-            out, budget=budget, max_size=max_size, device=device, threads=threads,
+            method.value, dataset, splats, editor, instruction, settings, out,
+            budget=budget, max_size=max_size, device=device, threads=threads,
         )  # fmt: skip
         ended = f", cut short by its {result.cut.replace('_', ' ')}" if result.cut else ""
         typer.echo(

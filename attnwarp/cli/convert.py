@@ -45,7 +45,9 @@ def convert(
         if suffix not in (".ply", ".splat"):
             raise ValueError(f"OUT: got {out}, expected a name ending in .ply or .splat")
         from attnwarp.io import THIRD_SCALE, write_ply, write_splat
+        from attnwarp.io.file import check_other
 
+        check_other(out, source, "the file to convert")
         splats = read_splats(source, kind, antialiased)
         if third_scale is not None and splats.kind == "3d":
             raise ValueError(f"--third-scale: {source} holds 3DGS, which has three scales")
@@ -74,7 +76,9 @@ def undistort(
     with clear_errors(f"stopped; the pictures in {out} are whole, and the same command makes all"):
         check_out(out)
         import attnwarp.io
+        from attnwarp.io.file import check_other
 
+        check_other(out, data if data.is_dir() else data.parent, "the folder to undistort")
         dataset = read_views(data, reading, distorted="keep")
         count = sum(lens is not None for lens in dataset.lenses)
         result = attnwarp.io.undistort(dataset, out)

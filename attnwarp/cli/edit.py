@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import read_splats, read_views
+from attnwarp.cli.files import check_seen, read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
     Kind,
@@ -29,16 +29,14 @@ from attnwarp.editing.command import (
     WhereOption,
     check_segmenter,
 )
+from attnwarp.errors import InputWarning
+
+NO_FEATURES = 0.001
+"""Share of the targets' pixels below which each view was, in effect, edited alone."""
 
 
-class Preset(StrEnum):
-    """What a person may type for the choices of an edit."""
-
-    corrected = "corrected"
-    extended = "extended"
-    paper = "paper"
-    released = "released"
-    released_controlnet = "released-controlnet"
+PRESETS = ("corrected", "extended", "paper", "released", "released-controlnet")
+"""What a person may type for the choices of an edit; named here as ``--help`` imports no torch."""
 
 
 @reading_options()
@@ -51,12 +49,12 @@ def edit(
     ] = None,
     editor: EditorOption = "small-plain",
     preset: Annotated[
-        Preset,
+        str,
         typer.Option(
             metavar="NAME",
-            help=f"The method's choices: {', '.join(Preset)} (see editing-a-scene.md).",
+            help=f"The method's choices: {', '.join(PRESETS)} (see editing-a-scene.md).",
         ),
-    ] = Preset.corrected,
+    ] = "corrected",
     source: Annotated[
         str | None, typer.Option(metavar="VIEW", help="Name or number; the first if left out.")
     ] = None,
@@ -121,10 +119,12 @@ def edit(
 
         import attnwarp.propagate.settings
 
-        settings = attnwarp.propagate.settings.preset(preset.value, **changes)
+        settings = attnwarp.propagate.settings.preset(preset, **changes)
         use_threads(threads)
         dataset = read_views(data, reading)
         splats = None if ply is None else read_splats(ply, None, None)
+        if ply is not None and splats is not None:
+            check_seen(ply, splats, dataset.cameras)
         from attnwarp.propagate.command import FitPlan, edit_dataset
 
         result, page = edit_dataset(
@@ -137,11 +137,19 @@ def edit(
         )  # fmt: skip
         seconds = sum(result.seconds.values())
         views = len(result.edited)
-        carried = (
-            f"; {result.counters['injected']:.0%} of the targets' pixels got features of the source"
-            if settings.method == "warp" and views > 1
-            else ""
-        )
+        carried = ""
+        if settings.method == "warp" and views > 1:
+            share = result.counters["injected"]
+            carried = f"; {share:.0%} of the targets' pixels got features of the source"
+            if share < NO_FEATURES:
+                model = "the fitted splats do" if ply is None else f"{ply} does"
+                warnings.warn(
+                    "each view was edited alone, as none got features of the source: perhaps"
+                    f" {model} not fit the photographs, or no other view sees what --source sees,"
+                    f" or masks leave nothing; {out / 'masks'} shows where features went",
+                    InputWarning,
+                    stacklevel=1,
+                )
         typer.echo(
             f"{out / 'edited.ply'}: {views} edited view{'s' * (views > 1)} in {seconds:.0f} s"
             f"{carried}"

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from attnwarp.cli.options import Kind, Reading
+from attnwarp.errors import InputError
 
 if TYPE_CHECKING:
+    from attnwarp.camera import Camera
     from attnwarp.gaussians import Gaussians
     from attnwarp.io import Dataset
+
+COVERED = 0.002
+"""Share of a picture, 8 pixels of 64 x 64, below which splats leave nothing to edit in it."""
+
+
+LOOK_SIZE = 256
+"""Longest side in px of the renders that look for splats: a photograph's own takes its seconds."""
+
+UNSEEN = (
+    "check that the splats and the cameras are of one scene, in the same coordinates and the same"
+    " units"
+)
+"""What a person checks where cameras do not see splats."""
 
 
 def read_views(path: Path, reading: Reading, **options: Any) -> Dataset:
@@ -52,6 +68,32 @@ def read_splats(path: Path, kind: Kind | None, antialiased: bool | None) -> Gaus
         kind=None if kind is None else "2d" if kind is Kind.two else "3d",
         antialiased=antialiased,
     )
+
+
+def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None:
+    """Refuse splats that no camera sees, before an edit spends minutes on them.
+
+    Args:
+        path: of the splats, for the message.
+        splats: of the scene.
+        cameras: of the data set; the first that sees splats ends the search.
+
+    Raises:
+        InputError: the splats cover less than :data:`COVERED` of every view.
+    """
+    import torch
+
+    from attnwarp.propagate.scene import near_of
+    from attnwarp.render import render
+
+    near = near_of(cameras)
+    with torch.no_grad():
+        for camera in cameras:
+            factor = min(1.0, LOOK_SIZE / max(camera.width, camera.height))
+            w, h = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+            if float(render(splats, camera.resize(w, h), near=near).alpha.mean()) >= COVERED:
+                return
+    raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
 
 
 def write_image(path: Path, rgb: Any) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import io
+import warnings
 from pathlib import Path
 from typing import Annotated, BinaryIO
 
 import typer
 
-from attnwarp.cli.files import read_splats, read_views, write_image
+from attnwarp.cli.files import UNSEEN, read_splats, read_views, write_image
 from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
@@ -18,6 +19,7 @@ from attnwarp.cli.options import (
     reading_options,
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
+from attnwarp.errors import InputWarning
 
 
 @reading_options(without="missing_images")
@@ -63,6 +65,7 @@ def render(
         splats = read_splats(model, kind, antialiased)
         views = read_views(cameras, reading, missing_images="none", points=False).cameras
         out.mkdir(parents=True, exist_ok=True)
+        seen = False
         for camera, name in zip(views, file_stems(views), strict=True):
             if size is not None:
                 factor = size / max(camera.width, camera.height)
@@ -70,6 +73,7 @@ def render(
                     max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
                 )
             view = attnwarp.render.render(splats, camera, background=behind, near=near)
+            seen = seen or bool(view.alpha.any())
             write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
             if depth:
                 buffer = io.BytesIO()
@@ -79,6 +83,10 @@ def render(
                 )
             if normal:
                 write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
+        if not seen:
+            warnings.warn(
+                f"{model}: no view shows any of its splats; {UNSEEN}", InputWarning, stacklevel=1
+            )
         typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
 
 

@@ -77,13 +77,15 @@ def edit_image(
     if mask_out is not None and words is None:
         raise ValueError("--mask: needs --where, which makes the mask")
     check_segmenter(segmenter, words)
+    from attnwarp.io.file import check_other
+
     for path in (out, sheet, mask_out):
         if path is not None and path.suffix.lower() != ".png":
             raise ValueError(f"{path}: expected a name that ends in .png")
         if path is not None and path.is_dir():
             raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
-        if path is not None and path.exists() and picture.exists() and path.samefile(picture):
-            raise ValueError(f"{path}: is the picture to edit; choose another name for the result")
+        if path is not None:
+            check_other(path, picture, "the picture to edit")
     image = _read(picture)
 
     import numpy as np

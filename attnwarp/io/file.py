@@ -53,6 +53,21 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def check_other(out: Path, source: Path, what: str) -> None:
+    """Refuse to write over what is read.
+
+    Args:
+        out: where a result goes.
+        source: what it is made from.
+        what: the source is, for the message.
+
+    Raises:
+        InputError: both are one file or folder, under one name or two, or by a link.
+    """
+    if out.exists() and source.exists() and out.samefile(source):
+        raise InputError(f"{out}: is {what}; choose another name for the result")
+
+
 def existing_file(path: str | os.PathLike[str]) -> Path:
     """``path`` as a Path.
 

@@ -476,7 +476,7 @@ def _splits(
                 path,
                 f"{len(lost)} of {len(listed)} names are those of no frame: "
                 f"{', '.join(map(brief, lost[:3]))}{suggest(lost[0], names)}; name frames by their"
-                " file_path",
+                f" file_path; where frames were removed, remove their names too, or all of {key}",
                 field=key,
             )
         for i in (i for indices in members for i in indices):

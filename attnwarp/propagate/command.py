@@ -21,6 +21,7 @@ from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.process import asked_to_stop
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
+from attnwarp.propagate.pictures import check_source_picture
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.settings import PropagateSettings
@@ -28,6 +29,9 @@ from attnwarp.propagate.settings import PropagateSettings
 FIT_FOLDER = "fit"
 
 FIRST_POINTS = 10_000
+
+MOST_NAMES = 5
+"""Names of views in one line."""
 
 COLORED = 0.1
 """Spread of a pixel's channels that no grey picture has: a photograph, or a mask of two colours,
@@ -105,7 +109,7 @@ def edit_dataset(
     index = _view_of(views.cameras, source)
     black = torch.zeros(3)
     images = [views.target(k, black).numpy() for k in range(len(views))]
-    segments = None if masks is None else _masks(masks, views.cameras)
+    segments = None if masks is None else _masks(masks, views.cameras, say)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     if words is not None:
@@ -113,7 +117,13 @@ def edit_dataset(
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
         segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
         segments = [segment(k, image) for k, image in enumerate(images)]
-    by_hand = None if source_picture is None else _rgb(read_image(source_picture))
+        say(_coverage(segments, views.cameras))
+    by_hand = None
+    if source_picture is not None:
+        by_hand = _rgb(read_image(source_picture))
+        h, w, _ = by_hand.shape
+        # Again in the edit, but here before a fit spends its minutes.
+        check_source_picture((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
@@ -192,7 +202,7 @@ def _view_of(cameras: Any, name: str | None) -> int:
     )
 
 
-def _masks(folder: Path, cameras: Any) -> list[npt.NDArray[np.bool_]]:
+def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:
     """(H, W) bool of each view from NAME.png: white is edited."""
     masks = []
     for camera in cameras:
@@ -200,7 +210,28 @@ def _masks(folder: Path, cameras: Any) -> list[npt.NDArray[np.bool_]]:
         if not path.is_file():
             raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
         masks.append(_mask(path, camera))
+    black = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
+    if len(black) == len(masks):
+        raise InputError(
+            f"--masks: every mask in {folder} is black, so nothing may change; white is edited"
+        )
+    if black:
+        more = f" and {len(black) - MOST_NAMES} more" if len(black) > MOST_NAMES else ""
+        say(
+            f"--masks: {len(black)} of {len(masks)} are black, so nothing is edited in"
+            f" {', '.join(black[:MOST_NAMES])}{more}"
+        )
     return masks
+
+
+def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
+    """One line: of which views masks cover the least and the most."""
+    shares = [float(mask.mean()) for mask in masks]
+    least, most = int(np.argmin(shares)), int(np.argmax(shares))
+    return (
+        f"masks cover {shares[least]:.1%} of {cameras[least].name} (least)"
+        f" to {shares[most]:.1%} of {cameras[most].name} (most)"
+    )
 
 
 def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:

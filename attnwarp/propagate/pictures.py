@@ -9,6 +9,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from attnwarp import check
+from attnwarp.camera import Camera
 from attnwarp.propagate.sight import Sight
 
 Image = npt.NDArray[np.float32]
@@ -29,6 +31,27 @@ def edit_size(height: int, width: int, longest: int | None, multiple: int) -> Si
     scale = 1.0 if longest is None else longest / max(height, width)
     h, w = (max(multiple, round(n * scale / multiple) * multiple) for n in (height, width))
     return h, w
+
+
+MULTIPLES = (8, 16, 32, 64)
+"""Editors round the sides of a picture to multiples of these."""
+
+
+def check_source_picture(size: Size, camera: Camera, name: str) -> None:
+    """Refuse a picture of the source view that would be stretched to the view's shape.
+
+    Args:
+        size: (h, w) of the picture: the view's aspect ratio, or what an editor makes of it by
+            rounding its sides to multiples.
+        camera: of the view.
+        name: of the argument.
+
+    Raises:
+        ValueError: another aspect ratio.
+    """
+    full = (camera.height, camera.width)
+    if all(edit_size(*full, max(size), multiple) != size for multiple in MULTIPLES):
+        check.same_aspect(size, full, name, f"crop or pad it to the view {camera.name!r}")
 
 
 def resized(image: Image, size: Size) -> Image:

@@ -31,6 +31,7 @@ from attnwarp.propagate.pictures import (
     Image,
     Mask,
     Principal,
+    check_source_picture,
     composite,
     edit_size,
     enlarged,
@@ -139,8 +140,8 @@ def propagate(
         settings: every choice of the method, see :class:`PropagateSettings`.
         source: number of the source view.
         source_picture: (h, w, 3) the source view edited elsewhere, such as by hand. It is resized
-            to the editor's size, and its features are recorded while its own noise is replayed
-            (edit-friendly inversion).
+            to the editor's size, so it has the view's aspect ratio. Its features are
+            recorded while its own noise is replayed (edit-friendly inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
         warps: the warp from the source to a target, by their numbers, such as one from exact depth;
@@ -151,7 +152,8 @@ def propagate(
         checkpoint_seconds: between two checkpoints of tuning.
         backend: of :func:`attnwarp.render.render`.
         watch: told how the edit stands, :func:`attnwarp.propagate.progress.progress_display`.
-        announce: told the memory of the recording before it is made.
+        announce: told what the views or the editor leave of the settings, and the memory of the
+            recording before it is made.
 
     Raises:
         ValueError: an argument of another size or type; the message names it.
@@ -183,7 +185,11 @@ def propagate(
         near = near_of(cameras)
         images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
     scene = Scene.checked(cameras, images, segments)
-    by_hand = None if source_picture is None else _by_hand(source_picture)
+    by_hand = None
+    if source_picture is not None:
+        by_hand = _by_hand(source_picture)
+        h, w, _ = by_hand.shape
+        check_source_picture((h, w), cameras[source], "source_picture")
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
             gaussians, scene, editor, instruction, settings, source, by_hand, warps,
@@ -233,6 +239,8 @@ class _Run:
         if self.folder.has("times.json"):
             self.seconds = dict(self.folder.read_json("times.json"))
         self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
+        if announce is not None:
+            self._announce_changes(announce, source, multiple)
         self.tuning = Tuning(
             gaussians, scene.cameras, settings, len(self.plan.stages), backend=backend
         )
@@ -258,6 +266,21 @@ class _Run:
                 },
             }
         )
+
+    def _announce_changes(
+        self, announce: Callable[[str], None], source: int, multiple: int
+    ) -> None:
+        asked, longest = self.settings, max(self.sizes[source])
+        if asked.size is not None and longest != asked.size:
+            announce(
+                f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
+                f" of {multiple}"
+            )
+        if len(self.plan.stages) < asked.stages:
+            announce(
+                f"stages: {len(self.plan.stages)} in place of {asked.stages}, as"
+                f" {len(self.scene.cameras)} views leave no more to edit"
+            )
 
     def go(self) -> Propagation:
         self._write_segments()
@@ -471,17 +494,21 @@ class _Run:
         if self.warps is not None:
             return self._masked(self.warps(source, target))
         before = self.frozen if s.depth_from == "frozen" else model
-        segments = self.scene.segments
+        reads: dict[str, Any] = {}
+        if s.warp.photometric is not None:
+            reads["source_image"] = self.scene.pictures[source]
+            reads["target_image"] = self.scene.pictures[target]
+        if s.warp.segment and self.scene.segments is not None:
+            reads["target_segment"] = self.scene.segments[target]
         warp = warp_view(
             before,
             self.scene.cameras[source],
             self.scene.cameras[target],
             s.warp,
-            source_image=self.scene.pictures[source],
-            target_image=self.scene.pictures[target],
-            target_segment=None if segments is None else torch.from_numpy(segments[target]),
+            **reads,
             source_surface=self._surface(source, before),
             backend=self.backend,
+            warn_empty=False,
         )
         return self._masked(warp)
 

@@ -42,6 +42,8 @@ def correspond_and_mask(
 ) -> tuple[Correspondence, dict[str, Tensor], Tensor]:
     """What :func:`attnwarp.warp.warp_surfaces` computes, in one pass over the target's pixels.
 
+    Pictures and ``target_segment``, (H, W) bool on the CPU, were checked there.
+
     Returns:
         The correspondence, each rule's (H, W) mask by name in order, and the mask of all.
     """
@@ -76,9 +78,8 @@ def correspond_and_mask(
         row.get(settings.normal_test, -1),
     )
     segment = np.zeros((0, 0), np.bool_)
-    if settings.segment and target_segment is not None:
-        check.shape(target_segment, size, "target_segment")
-        segment = target_segment.to(device="cpu", dtype=torch.bool).contiguous().numpy()
+    if target_segment is not None:
+        segment = target_segment.contiguous().numpy()
     positions = _positions(size)
     passes, mask = _pool.empty((len(names), *size), np.bool_), _pool.empty(size, np.bool_)
     views = _pair(source, target, settings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Literal, TypeAlias
 
 import torch
@@ -51,11 +52,17 @@ class FeatureWarp:
         """Target features (C, H, W) or (B, C, H, W) from the source's.
 
         Args:
-            features: (C, h, w) or (B, C, h, w) floating, of any size: :func:`attnwarp.warp.sample`.
+            features: (C, h, w) or (B, C, h, w) floating, of any size with the aspect ratio of the
+                source's grid: :func:`attnwarp.warp.sample`.
+
+        Raises:
+            ValueError: another number of axes, another aspect ratio, or a type that cannot be
+                blended.
         """
         check.instance(features, Tensor, "features", "torch.Tensor")
         if features.ndim not in (3, 4) or not features.dtype.is_floating_point:
             return sampling.sample(features, self.correspondence)[0]  # says what is wrong
+        self._check_size(features)
         taps = self._taps_for(features, *features.shape[-2:])
         warped = self._engine(features).sample_maps(features.flatten(-2), taps)
         return warped.unflatten(-1, tuple(self.mask.shape))
@@ -138,6 +145,17 @@ class FeatureWarp:
 
         return cpu.blend_tokens(source, new, taps, mask, alpha, in_place=in_place)
 
+    def _check_size(self, features: Tensor) -> None:
+        h, w = features.shape[-2:]
+        if h < 1 or w < 1:
+            raise ValueError(f"features: got {h} x {w} (height x width), expected at least 1 x 1")
+        camera = self.correspondence.source
+        remedy = (
+            "transpose a map of (w, h); for features of a stretched picture make the layer with"
+            f" at(..., source_size=({h}, {w}))"
+        )
+        check.same_aspect((h, w), (camera.height, camera.width), "features", remedy)
+
     def _engine(self, features: Tensor) -> Any:
         """The module that samples: kernels or torch."""
         if self.backend == "reference" or features.device.type != "cpu":
@@ -149,6 +167,7 @@ class FeatureWarp:
 
     def _check_blend(self, source: Tensor, new: Tensor, alpha: float, in_place: bool) -> None:
         target = self.correspondence.target
+        check.instance(new, Tensor, "new", "torch.Tensor")
         check.shape(new, ("B", target.height * target.width, "C"), "new")
         if source.shape[0] not in (1, new.shape[0]) or source.shape[2] != new.shape[2]:
             raise ValueError(
@@ -159,8 +178,8 @@ class FeatureWarp:
             raise ValueError(f"new: got {new.dtype}, expected a floating type")
         if source.device != new.device:
             raise ValueError(f"source: lies on {source.device}, new on {new.device}")
-        if not 0 <= alpha <= 1:
-            raise ValueError(f"alpha: got {alpha}, expected a number in [0, 1]")
+        if not isinstance(alpha, Real | Tensor) or not 0 <= alpha <= 1:
+            raise ValueError(f"alpha: got {alpha!r}, expected a number in [0, 1]")
         if in_place and torch.is_grad_enabled() and (source.requires_grad or new.requires_grad):
             raise ValueError(
                 "in_place: got True where a gradient is recorded; use torch.no_grad() or"
@@ -169,6 +188,7 @@ class FeatureWarp:
 
     def _check_tokens(self, source: Tensor) -> None:
         camera = self.correspondence.source
+        check.instance(source, Tensor, "source", "torch.Tensor")
         check.shape(source, ("B", camera.height * camera.width, "C"), "source")
         if not source.dtype.is_floating_point:
             raise ValueError(f"source: got {source.dtype}, expected a floating type")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.errors import InputWarning
 from attnwarp.gaussians import Gaussians
 from attnwarp.warp.correspondence import (
     Correspondence,
@@ -34,6 +36,9 @@ from attnwarp.warp.rules import (
 )
 from attnwarp.warp.settings import PRESETS, NormalTest, WarpSettings
 from attnwarp.warp.surface import Surface, needed
+
+OVERSHOOT = 0.1
+"""How far beyond [0, 1] a picture may reach: cubic resampling overshoots an edge by a tenth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +137,9 @@ def warp_surfaces(
     source_surface: Surface | None = None,
     settings: WarpSettings = PRESETS["corrected"],
     *,
-    target_segment: Tensor | None = None,
+    target_segment: Array | None = None,
     backend: Backend = "auto",
+    warn_empty: bool = True,
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from depth maps: rendered, measured or
     exact.
@@ -146,14 +152,19 @@ def warp_surfaces(
             test (image).
         settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
             concern the rendering of the surfaces and play no part here.
-        target_segment: (H, W) bool, the part of the target that is edited.
+        target_segment: (H, W) bool, the part of the target that is edited; for settings with
+            ``segment``.
         backend: "auto" computes with kernels (:mod:`attnwarp.warp.cpu`), "reference" with the
             definition in torch. Positions agree to 1e-6 px, masks but for a pixel within rounding
             of a rule's threshold.
+        warn_empty: warn where no pixel of the target has a position in the source. A loop over
+            views, some of which see nothing, turns it off.
 
     Raises:
-        ValueError: a rule needs something that is not given; the message names the rule and what it
-            needs.
+        ValueError: a rule needs something that is not given, or what is given is read by no rule;
+            the message names both. A picture or a segment of another size than its view's; a
+            picture in 0 to 255.
+        TypeError: an argument of another type.
 
     Example:
         >>> import numpy as np
@@ -171,15 +182,25 @@ def warp_surfaces(
         ['defined', 'in_bounds', 'in_front', 'opaque', 'depth_agrees', 'facing']
     """
     check.one_of(backend, get_args(Backend), "backend")
+    _check_pair(source, target, settings)
+    check.instance(target_surface, Surface, "target_surface", "Surface, such as Surface(depth)")
+    if source_surface is not None:
+        check.instance(source_surface, Surface, "source_surface", "Surface, such as Surface(depth)")
+    if settings.photometric is not None:
+        _check_pictures(source, target, target_surface, source_surface)
+    segment = _checked_segment(target_segment, target, settings)
     if backend != "reference":
         from attnwarp.warp import cpu
 
         correspondence, rules, mask = cpu.correspond_and_mask(
-            source, target, target_surface, source_surface, settings, target_segment
+            source, target, target_surface, source_surface, settings, segment
         )
-        return WarpedView(
+        view = WarpedView(
             settings, correspondence, mask, rules, target_surface, source_surface, backend
         )
+        if warn_empty:
+            _warn_if_empty(view)
+        return view
     correspondence = correspond(
         source,
         target,
@@ -223,13 +244,15 @@ def warp_surfaces(
         rules[settings.normal_test] = _normal_rule(
             correspondence, normal, settings.normal_test, settings.normal_angle
         )
-    if settings.segment and target_segment is not None:
-        check.shape(target_segment, (target.height, target.width), "target_segment")
-        rules["segment"] = target_segment.to(device="cpu", dtype=torch.bool)
+    if segment is not None:
+        rules["segment"] = segment
     mask = torch.stack(list(rules.values())).all(dim=0)
-    return WarpedView(
+    view = WarpedView(
         settings, correspondence, mask, rules, target_surface, source_surface, backend
     )
+    if warn_empty:
+        _warn_if_empty(view)
+    return view
 
 
 def warp_view(
@@ -240,10 +263,11 @@ def warp_view(
     *,
     source_image: Array | None = None,
     target_image: Array | None = None,
-    target_segment: Tensor | None = None,
+    target_segment: Array | None = None,
     source_surface: Surface | None = None,
     backend: str = "auto",
     warp_backend: Backend = "auto",
+    warn_empty: bool = True,
 ) -> WarpedView:
     """The correspondence and the mask of a pair of views, from splats.
 
@@ -255,13 +279,18 @@ def warp_view(
             with it.
         source, target: the cameras.
         settings: which rules, and how.
-        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test;
-            by default the renders of ``gaussians``.
-        target_segment: (H, W) bool, the part of the target that is edited.
+        source_image, target_image: (H, W, 3) sRGB images before the edit, for the photometric test,
+            the target's of its camera's size and the source's of its aspect ratio;
+            by default the renders of ``gaussians``. For settings with ``photometric``.
+        target_segment: (H, W) bool, the part of the target that is edited; for settings with
+            ``segment``.
         source_surface: the source's render if it is at hand, :func:`render_surface`; one source
             serves many targets.
         backend: of the renderer, as in :func:`attnwarp.render.render`.
-        warp_backend: of the warp, as in :func:`warp_surfaces`.
+        warp_backend, warn_empty: of the warp, as in :func:`warp_surfaces`.
+
+    Raises:
+        ValueError, TypeError: as in :func:`warp_surfaces`.
 
     Example:
         >>> import torch
@@ -276,9 +305,13 @@ def warp_view(
         (True, torch.Size([4, 4]))
     """
     check.instance(gaussians, Gaussians, "gaussians", "attnwarp.Gaussians")
-    check.instance(source, Camera, "source", "attnwarp.Camera")
-    check.instance(target, Camera, "target", "attnwarp.Camera")
-    check.instance(settings, WarpSettings, "settings", "WarpSettings, such as PRESETS['corrected']")
+    _check_pair(source, target, settings)
+    for name, image in (("source_image", source_image), ("target_image", target_image)):
+        if image is not None and settings.photometric is None:
+            raise ValueError(
+                f"{name}: the settings have photometric=None and do not read it; set photometric,"
+                " such as preset('corrected', photometric=0.2), or leave it out"
+            )
     keep = gaussian_filter(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
     )
@@ -296,7 +329,7 @@ def warp_view(
         source_surface = render_surface(gaussians, source, settings, backend=backend)
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
-    return warp_surfaces(
+    view = warp_surfaces(
         source,
         target,
         seen,
@@ -304,7 +337,12 @@ def warp_view(
         settings,
         target_segment=target_segment,
         backend=warp_backend,
+        warn_empty=False,
     )
+    # Where a filter left splats out, it may be what emptied the view.
+    if warn_empty and filtered is gaussians:
+        _warn_if_empty(view)
+    return view
 
 
 def render_surface(
@@ -352,6 +390,62 @@ def render_surface(
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)
     )
+
+
+def _check_pair(source: Camera, target: Camera, settings: WarpSettings) -> None:
+    check.instance(source, Camera, "source", "attnwarp.Camera")
+    check.instance(target, Camera, "target", "attnwarp.Camera")
+    check.instance(settings, WarpSettings, "settings", "WarpSettings, such as PRESETS['corrected']")
+
+
+def _check_pictures(
+    source: Camera, target: Camera, target_surface: Surface, source_surface: Surface | None
+) -> None:
+    """What the photometric test reads: pictures of their views, in [0, 1]."""
+    first = needed(source_surface, "source_surface", "image", "photometric")
+    second = needed(target_surface, "target_surface", "image", "photometric")
+    check.shape(first, ("H", "W", "C"), "source_image")
+    # The source's is read at positions, so at any resolution.
+    size = (source.height, source.width)
+    check.same_aspect(tuple(first.shape[:2]), size, "source_image", "its axes are (H, W, C)")
+    check.shape(second, (target.height, target.width, first.shape[2]), "target_image")
+    for name, image in (("source_image", first), ("target_image", second)):
+        # A render's colours may exceed 1 here and there, resampling may overshoot either end.
+        if image.min() < -OVERSHOOT or image.mean() > 1 + OVERSHOOT:
+            raise ValueError(
+                f"{name}: got values in [{image.min():.3g}, {image.max():.3g}], expected sRGB in"
+                " [0, 1]; divide 8 bits by 255"
+            )
+
+
+def _warn_if_empty(view: WarpedView) -> None:
+    if view.rules["defined"].any():
+        return
+    surface = torch.isfinite(view.correspondence.target_depth).any()
+    reason = "every point lies behind the source" if surface else "the target sees no surface"
+    warnings.warn(
+        f"no pixel of the target has a position in the source: {reason}; check world_to_camera of"
+        " both: from world to camera, not camera-to-world; OpenCV axes (x right, y down, z"
+        " forward), not OpenGL's",
+        InputWarning,
+        stacklevel=3,
+    )
+
+
+def _checked_segment(
+    segment: Array | None, target: Camera, settings: WarpSettings
+) -> Tensor | None:
+    """(H, W) bool on the CPU."""
+    if segment is None:
+        return None
+    if not settings.segment:
+        raise ValueError(
+            "target_segment: the settings have segment=False and do not read it; set segment=True,"
+            " such as preset('corrected', segment=True), or leave it out"
+        )
+    tensor = segment if isinstance(segment, Tensor) else torch.from_numpy(np.array(segment))
+    check.shape(tensor, (target.height, target.width), "target_segment")
+    return tensor.to(device="cpu", dtype=torch.bool)
 
 
 def _near_plane(gaussians: Gaussians, camera: Camera) -> float:

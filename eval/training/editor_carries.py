@@ -283,7 +283,9 @@ def _view_warp(worlds: Worlds, source: Case, target: Case) -> Any:
     def surface(case: Case) -> Surface:
         return Surface(worlds.depth[case.world, case.view].astype(np.float64))
 
-    return warp_surfaces(camera(source), camera(target), surface(target), surface(source), EXACT)
+    return warp_surfaces(
+        camera(source), camera(target), surface(target), surface(source), EXACT, warn_empty=False
+    )
 
 
 def _disagreement(target: Image, source: Image, grid: Any) -> float:

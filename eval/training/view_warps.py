@@ -24,7 +24,9 @@ def view_warp(worlds: Worlds, world: int, target: int, cells: int) -> FeatureWar
         return Surface(worlds.depth[world, view].astype(np.float64))
 
     source = 1 - target
-    view = warp_surfaces(camera(source), camera(target), surface(target), surface(source), EXACT)
+    view = warp_surfaces(
+        camera(source), camera(target), surface(target), surface(source), EXACT, warn_empty=False
+    )
     return view.at((cells, cells))
 
 

@@ -150,6 +150,9 @@ def test_a_camera_cannot_be_changed_in_place():
         ({"K": np.where(np.eye(3) > 0, np.nan, K)}, r"K: nan at index \(0, 0\)"),
         ({"K": K + np.array([[0, 0, 0], [1, 0, 0], [0, 0, 0]])}, "expected \\[\\[fx, skew, cx\\]"),
         ({"width": 0}, "got 0 x 480"),
+        ({"height": 96.5}, "height: got 96.5, expected a whole number of pixels"),
+        ({"width": "160"}, "width: got '160', expected a whole number of pixels"),
+        ({"width": float("nan")}, "width: got nan, expected a whole number of pixels"),
         ({"world_to_camera": np.ones((4, 4))}, "last row"),
         ({"world_to_camera": np.diag([2.0, 2, 2, 1])}, "not orthonormal.*= 3"),
         ({"world_to_camera": np.diag([1.0, 1, -1, 1])}, "mirrors"),
@@ -158,6 +161,12 @@ def test_a_camera_cannot_be_changed_in_place():
 def test_a_wrong_camera_says_what_came_and_what_was_expected(changes, message):
     with pytest.raises(ValueError, match=message):
         camera(**changes)
+
+
+def test_a_whole_number_of_any_type_is_a_size():
+    for size in (96.0, np.int64(96), np.uint16(96), np.float32(96)):
+        made = camera(width=size, height=size)
+        assert (made.width, type(made.width), made.height) == (96, int, 96)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -315,6 +316,19 @@ def test_render_needs_no_points(data, tmp_path):
     assert done.exit_code == 0, done.stderr
 
 
+def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
+    for name, shift, expected in (("there.ply", 0.0, 0), ("far.ply", 50.0, 1)):
+        splat = one_splat()
+        write_ply(tmp_path / name, replace(splat, means=splat.means + torch.tensor([0, 0, shift])))
+        out = tmp_path / name.removesuffix(".ply")
+        done = in_process("render", tmp_path / name, data, "--out", out)
+        assert done.exit_code == 0, done.stderr
+        pictures = [cv2.imread(str(path)) for path in out.glob("*.png")]
+        assert len(pictures) == 9 and any(picture.any() for picture in pictures) == (not expected)
+        said = f"warning: {tmp_path / name}: no view shows any of its splats; check"
+        assert done.stderr.count(said) == expected
+
+
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
     write_ply(tmp_path / "m.ply", one_splat())
     cameras = [
@@ -455,6 +469,23 @@ def test_convert_says_what_it_cannot_do(tmp_path, arguments, message):
     names = {"a": tmp_path / "a.ply", "out": tmp_path / "out", "none": tmp_path / "none.ply"}
     done = in_process("convert", *(a.format(**names) for a in arguments))
     assert done.exit_code == 2 and message in done.stderr
+
+
+def test_what_is_read_is_not_written_over_by_its_name_or_a_link(data, tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, spread("3d"))
+    before = path.read_bytes()
+    (tmp_path / "soft.ply").symlink_to(path)
+    os.link(path, tmp_path / "hard.ply")
+    for name in ("a.ply", "./a.ply", "soft.ply", "hard.ply"):
+        done = in_process("convert", path, f"{tmp_path}/{name}", "--sh-degree", 0)
+        assert done.exit_code == 2 and "is the file to convert; choose another" in done.stderr
+    assert path.read_bytes() == before
+    frames = (data / "transforms.json").read_bytes()
+    for named in (data, data / "transforms.json"):
+        done = in_process("undistort", named, data)
+        assert done.exit_code == 2 and "is the folder to undistort; choose" in done.stderr
+    assert (data / "transforms.json").read_bytes() == frames
 
 
 def test_a_fit_writes_a_third_scale_for_other_viewers(data, tmp_path):

@@ -100,3 +100,10 @@ def test_another_dtype_leaves_the_origin_in_float64():
 def test_wrong_splats_are_refused_by_name_and_row(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(splats(), **changes)
+
+
+def test_an_array_in_place_of_a_tensor_is_named():
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        array = getattr(splats(), name).numpy()
+        with pytest.raises(TypeError, match=f"{name}: got ndarray, expected torch.Tensor"):
+            dataclasses.replace(splats(), **{name: array})

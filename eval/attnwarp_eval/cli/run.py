@@ -281,6 +281,7 @@ def report(
     pictures: Annotated[bool, typer.Option(help="Without: tables and figures alone.")] = True,
 ) -> None:
     """Make report.md, report.html and results.jsonl again from the cells of a run."""
+    from attnwarp_eval.report import read_results
     from attnwarp_eval.study.store import Store
 
     with clear_errors():
@@ -288,6 +289,20 @@ def report(
         _write_report(store, timings=timings, pictures=pictures)
         if "sha256" not in store.read_study():
             typer.echo(f"attnwarp-eval: {_unsealed(run)}", err=True)
+        results = read_results(store)
+    missing = len(results.cells) - results.measured
+    if results.failures:
+        raise fail(
+            f"{run}: {len(results.failures)} of {len(results.cells)} cells failed or are damaged,"
+            f" {missing} have no figures in the report; attnwarp-eval verify {run} names them",
+            TOO_LITTLE,
+        )
+    if missing:
+        typer.echo(
+            f"attnwarp-eval: {run}: {missing} of {len(results.cells)} cells are missing, as the run"
+            f" is unfinished; attnwarp-eval verify {run} names them",
+            err=True,
+        )
 
 
 def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> None:

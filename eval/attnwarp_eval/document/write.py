@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _CLASSES = {
     "seen": "holds",
+    "seen where defined": "holds",
     "not seen": "fails",
     "better": "better",
     "worse": "worse",

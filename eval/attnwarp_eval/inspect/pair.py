@@ -183,15 +183,18 @@ class Pair:
         if self.model is None or self.settings.gaussian_filter == "none":
             own = replace(self.surfaces[0], image=source_image)
             seen = replace(self.surfaces[1], image=target_image)
-            return warp_surfaces(source, target, seen, own, self.settings)
+            return warp_surfaces(source, target, seen, own, self.settings, warn_empty=False)
+        reads: dict[str, Any] = {}
+        if self.settings.photometric is not None:
+            reads = {"source_image": source_image, "target_image": target_image}
         return warp_view(
             self.model,
             source,
             target,
             self.settings,
             source_surface=self.surfaces[0],
-            source_image=source_image,
-            target_image=target_image,
+            **reads,
+            warn_empty=False,
         )
 
     @cached_property

@@ -25,6 +25,17 @@ YAW_EDGES = (0, 15, 30, 60, 90, 120, 150, 180)
 """Ends of the bins in degrees, those of :func:`attnwarp_eval.metrics.by_yaw`."""
 
 
+ABOVE_FLOOR = "multiview.delta_e_above"
+"""Beginning of the names of disagreement above its floor."""
+
+BELOW_FLOOR = (
+    "Disagreement is **below its floor**, so negative, where edited views are more alike than the"
+    " true edited views. Something that differs between true views, such as shine, a shadow's edge"
+    " or fine texture, is lost there. Less is no gain there."
+)
+"""What a negative disagreement above the floor means, in words for a report."""
+
+
 def above_floor(
     edited: tuple[Any, Any],
     truth: tuple[Any, Any],

@@ -2,23 +2,56 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import Interval, benjamini_hochberg, paired, verdict
+from attnwarp_eval.report.claims import Comparison, judge, load_claims, of_comparisons
+from attnwarp_eval.statistics.intervals import (
+    Interval,
+    Verdict,
+    benjamini_hochberg,
+    paired,
+    verdict,
+)
 from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import Probe, mean_values
+from attnwarp_eval.study.probes.base import mean_values
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
+
+CLAIMED = "†"
+"""Stands beside the p-value of a comparison that a claim makes."""
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """A variant against the baseline of its table, in one metric.
+
+    Attributes:
+        variant, metric: names.
+        difference: the variant's minus the baseline's.
+        p: adjusted over the table, or over the claims where one makes this comparison.
+        claimed: whether one does.
+        verdict: None where no direction of the metric is better.
+    """
+
+    variant: str
+    metric: str
+    difference: Interval
+    p: float
+    claimed: bool
+    verdict: Verdict | None
 
 
 def ablations(results: Results) -> list[Section]:
     """A section for each ablation that the study names."""
-    return [_section(results, ablation) for ablation in results.study.ablations]
+    claimed = of_comparisons(judge(results, load_claims()))
+    return [_section(results, ablation, claimed) for ablation in results.study.ablations]
 
 
-def _section(results: Results, ablation: Ablation) -> Section:
+def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]) -> Section:
     own, baseline = probe(ablation.probe), ablation.baseline
     names = [baseline, *[v for v in ablation.variants if v != baseline]]
     section = Section(ablation.title, [ablation.note] if ablation.note else [])
@@ -49,52 +82,79 @@ def _section(results: Results, ablation: Ablation) -> Section:
     section.tables.append(Table(["variant", *columns, *pairs, time], rows, timed=(time,)))
     section.tables += own.details(results, names)
     if len(names) > 1:
-        section.tables.append(_contrasts(results, own, ablation))
+        compared = contrasts(results, ablation, claimed)
+        section.tables.append(_table(compared, ablation.baseline))
+        if any(contrast.claimed for contrast in compared):
+            section.text.append(
+                f"{CLAIMED} in the table of differences: a claim makes this comparison. p-value and"
+                " verdict are the claim's, adjusted over the claims and not over the table."
+            )
     return section
 
 
-def contrasts(results: Results, ablation: Ablation) -> list[tuple[str, str, Interval, float]]:
-    """(variant, metric, difference from the baseline, p-value adjusted over the table)."""
+def contrasts(
+    results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]
+) -> list[Contrast]:
+    """Each variant against the baseline, in each metric that its probe tests.
+
+    A comparison has one verdict in a report. So one that a claim makes has the claim's, and is no
+    test of this table.
+
+    Args:
+        results: of the run.
+        ablation: of the study.
+        claimed: from :func:`attnwarp_eval.report.claims.of_comparisons`.
+    """
     own, baseline = probe(ablation.probe), ablation.baseline
-    metrics = [metric.format(layer=results.layer) for metric in own.contrasts]
-    differences = [
-        (
-            name,
-            metric,
-            paired(
-                results.views(own.name, baseline, metric), results.views(own.name, name, metric)
-            ),
-        )
+    pairs = [
+        (name, metric.format(layer=results.layer))
         for name in ablation.variants
         if name != baseline
-        for metric in metrics
+        for metric in own.contrasts
     ]
-    adjusted = benjamini_hochberg([difference.p for _, _, difference in differences])
-    return [(*difference, p) for difference, p in zip(differences, adjusted, strict=True)]
-
-
-def _contrasts(results: Results, own: Probe[Any], ablation: Ablation) -> Table:
+    differences = [
+        paired(results.views(own.name, baseline, metric), results.views(own.name, name, metric))
+        for name, metric in pairs
+    ]
+    of_claims = [claimed.get((own.name, m, frozenset({baseline, n}))) for n, m in pairs]
+    adjusted = benjamini_hochberg(
+        [
+            difference.p if of_claim is None else math.nan
+            for difference, of_claim in zip(differences, of_claims, strict=True)
+        ]
+    )
     rows = []
-    for name, metric, difference, p in contrasts(results, ablation):
-        specification = own.metric(metric)
-        judged: str = "–"
+    for pair, difference, of_table, of_claim in zip(
+        pairs, differences, adjusted, of_claims, strict=True
+    ):
+        specification, judged = own.metric(pair[1]), of_claim is not None
+        p = of_table if of_claim is None else of_claim
+        outcome: Verdict | None = None
         if specification.direction in ("higher", "lower"):
-            direction: Literal["higher", "lower"] = (
-                "higher" if specification.direction == "higher" else "lower"
-            )
-            judged = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
+            # Claims know no tolerance, so a comparison that one makes has none here.
+            atol = 0.0 if judged else specification.atol
+            outcome = verdict(difference, specification.direction, atol=atol, adjusted_p=p)
+        rows.append(Contrast(*pair, difference, p, judged, outcome))
+    return rows
+
+
+def _table(compared: Sequence[Contrast], baseline: str) -> Table:
+    rows = []
+    for contrast in compared:
+        difference = contrast.difference
+        judged: str = contrast.verdict or "–"
         if difference.views == 0:
             judged = "not measured"
         elif difference.mean == difference.low == difference.high == 0:
             judged = "same values"
         rows.append(
             [
-                name,
-                metric,
+                contrast.variant,
+                contrast.metric,
                 spread(difference),
                 judged,
                 number(difference.detectable),
-                number(p),
+                number(contrast.p) + (f" {CLAIMED}" if contrast.claimed else ""),
                 f"{difference.scenes}, {difference.views}",
             ]
         )
@@ -108,5 +168,5 @@ def _contrasts(results: Results, own: Probe[Any], ablation: Ablation) -> Table:
         "scenes, views",
     ]
     return Table(
-        columns, rows, caption=f"Differences from {ablation.baseline!r}, with verdicts", folded=True
+        columns, rows, caption=f"Differences from {baseline!r}, with verdicts", folded=True
     )

@@ -44,8 +44,8 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         lead.append(
             f"Figures are means over {len(study.scenes)} scenes of means over their views, ±"
             " half of the 95 % interval (Student's t over scenes). Differences are paired on scene"
-            " and view; verdicts are adjusted for the number of tests in their table. \"can't"
-            ' tell" is not "equal".'
+            " and view; verdicts are adjusted for the number of tests in their table, those of"
+            ' claims for the number of claims. "can\'t tell" is not "equal".'
         )
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}

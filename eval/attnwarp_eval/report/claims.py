@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
+from statistics import fmean
 from typing import Any, Literal
 
 import yaml
 
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import spread
+from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.metrics.multiview import ABOVE_FLOOR, BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import (
     ByView,
     Interval,
     agreement,
     benjamini_hochberg,
+    common,
     interval,
     paired,
 )
@@ -25,7 +28,7 @@ from attnwarp_eval.study.study import parse_variant
 
 Verdict = Literal["holds", "does not hold", "can't tell", "depends on the editor"]
 
-Here = Literal["seen", "mixed", "not seen", "depends on the editor"]
+Here = Literal["seen", "seen where defined", "mixed", "not seen", "depends on the editor"]
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,9 @@ class Claim:
             zero = {scene: dict.fromkeys(views, 0.0) for scene, views in first.items()}
             return Measured(metric, {a: _interval(first)}, zero, first)
         second = results.views(self.probe, b, metric, self.yaw)
-        return Measured(metric, {a: _interval(first), b: _interval(second)}, first, second)
+        # Over the views that both have: only there is the difference of the means the claim's.
+        sides = dict(zip((a, b), map(_interval, common([first, second])), strict=True))
+        return Measured(metric, sides, first, second)
 
 
 @dataclass(frozen=True)
@@ -119,6 +124,25 @@ class JudgedClaim:
     agreement: tuple[int, int]
     here: Here
     verdict: Verdict
+    p: float
+    """Of the contrast, adjusted over the claims."""
+    below_floor: tuple[str, ...] = ()
+    """Scenes in which both sides disagree less than true views do."""
+
+
+Comparison = tuple[str, str, frozenset[str]]
+"""A probe, a metric and two variants."""
+
+
+def of_comparisons(judged: Iterable[JudgedClaim]) -> dict[Comparison, float]:
+    """The adjusted p-value of each comparison of two variants, over all views, that a claim makes:
+    a table that shows such a comparison has the claim's verdict.
+    """
+    return {
+        (one.claim.probe, one.metric, frozenset(one.sides)): one.p
+        for one in judged
+        if one.claim.yaw is None
+    }
 
 
 def load_claims() -> list[Claim]:
@@ -175,8 +199,10 @@ def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
             m.sides,
             contrast,
             agreement(m.a, m.b, claim.sign),
-            _here(claim, m),
+            _here(claim, m, len(results.study.scenes)),
             _in_general(claim, contrast, p),
+            p,
+            _below_floor(m),
         )
         for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views
@@ -196,11 +222,25 @@ def together(findings: Sequence[JudgedClaim], editors: Sequence[str]) -> tuple[H
     return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"
 
 
-def _here(claim: Claim, measured: Measured) -> Literal["seen", "mixed", "not seen"]:
-    """Whether the mean difference has the expected sign in every scene that has one."""
-    scenes = [paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b]
-    signs = [difference.mean * claim.sign > 0 for difference in scenes if difference.views]
-    return "seen" if all(signs) else "mixed" if any(signs) else "not seen"
+def _here(claim: Claim, measured: Measured, scenes: int) -> Here:
+    """Whether the mean difference has the expected sign in every scene.
+
+    ``scenes``: how many the study has. One without values cannot show what is expected.
+    """
+    differences = [
+        paired({s: measured.a[s]}, {s: measured.b[s]}) for s in measured.a if s in measured.b
+    ]
+    signs = [one.mean * claim.sign > 0 for one in differences if one.views]
+    if not all(signs):
+        return "mixed" if any(signs) else "not seen"
+    return "seen" if len(signs) == scenes else "seen where defined"
+
+
+def _below_floor(measured: Measured) -> tuple[str, ...]:
+    if not measured.metric.startswith(ABOVE_FLOOR):
+        return ()
+    a, b = common([measured.a, measured.b])
+    return tuple(s for s in a if max(fmean(a[s].values()), fmean(b[s].values())) < 0)
 
 
 def _in_general(claim: Claim, contrast: Interval, adjusted_p: float) -> Verdict:
@@ -234,11 +274,17 @@ def variant_like(
     return None
 
 
+def _scenes(finding: JudgedClaim, scenes: int) -> str:
+    below = ", ".join(finding.below_floor)
+    text = f"{finding.contrast.scenes} of {scenes}"
+    return f"{text}; below the floor: {below}" if below else text
+
+
 def claims(results: Results) -> Section:
     """The section of the report."""
     declared = {claim.id: claim for claim in load_claims()}
     findings = judge(results, list(declared.values()))
-    rows = []
+    rows, scenes = [], len(results.study.scenes)
     for finding in findings:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
@@ -249,8 +295,10 @@ def claims(results: Results) -> Section:
                 claim.text,
                 finding.here,
                 finding.verdict,
+                _scenes(finding, scenes),
                 f"{agree} of {views}",
                 contrast,
+                number(finding.p),
                 sides,
                 finding.metric,
             ]
@@ -260,25 +308,37 @@ def claims(results: Results) -> Section:
         if editors and finding is own[-1]:
             here, verdict = together(own, editors)
             text = f"**{declared[claim.id].text}: both editors together**"
-            rows.append([text, here, verdict, "–", "–", "–", finding.metric])
+            rows.append([text, here, verdict, *["–"] * 5, finding.metric])
     section = Section("What was expected, and what was seen")
     if not rows:
         section.text = ["Nothing that a claim speaks of was measured."]
         return section
     section.text = [
+        "A claim that does not hold on these scenes is a result, not an error.",
         (
-            "A claim that does not hold on these scenes is a result, not an error. **Here** speaks"
-            " of these scenes alone: `seen` when the difference has the expected sign in every"
-            " scene, with the views that agree beside it. **In general** speaks of scenes like"
-            " these, of which a few were drawn, and says `can't tell` when so few cannot settle it."
+            "- **Here** speaks of these scenes alone. `seen`: the difference has the expected sign"
+            " in every scene of the study. `seen where defined`: in every scene that has values,"
+            " and some have none. `not seen`: in no scene.\n"
+            "- **In general** speaks of scenes like these, of which a few were drawn. It says"
+            " `can't tell` when so few cannot settle it. p-values are adjusted over the claims.\n"
+            "- **Scenes**: those in which the difference is defined. **Views that agree** have the"
+            " expected sign.\n"
+            "- **Measured** are means. Those of two variants are over the views that both have, so"
+            " that the difference is theirs."
         ),
     ]
+    if any(finding.metric.startswith(ABOVE_FLOOR) for finding in findings):
+        section.text.append(
+            f"{BELOW_FLOOR} The column of scenes names those in which both sides are."
+        )
     columns = [
         "claim",
         "here",
         "in general",
+        "scenes",
         "views that agree",
         "difference",
+        "adjusted p",
         "measured",
         "metric",
     ]

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
 
 from attnwarp_eval.document.model import Finding, Picture, Slider
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.ablations import contrasts
-from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
-from attnwarp_eval.statistics.intervals import Interval, verdict
+from attnwarp_eval.report.claims import (
+    Comparison,
+    JudgedClaim,
+    judge,
+    load_claims,
+    of_comparisons,
+)
+from attnwarp_eval.statistics.intervals import Interval
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
@@ -47,9 +53,11 @@ def findings(results: Results, problems: list[str], *, pictures: bool = True) ->
         pictures: whether each has its picture.
     """
     first = [_calibration(results, problems)] if results.finished(_instrument()) else []
-    clearest = _clearest(results)
+    judged_claims = judge(results, load_claims())
+    clearest = _clearest(judged_claims)
     claims = [_claim(results, judged) for judged in clearest]
-    effects = _effects(results, [set(judged.sides) for judged in clearest])
+    told = [set(judged.sides) for judged in clearest]
+    effects = _effects(results, told, of_comparisons(judged_claims))
     others = [finding for probe in probes() for finding in probe.findings(results)]
     chosen = [*first, *claims, *others, *effects][:MOST]
     return chosen if pictures else [replace(finding, picture=None) for finding in chosen]
@@ -81,54 +89,57 @@ def _calibration(results: Results, problems: list[str]) -> Finding:
     )
 
 
-def _clearest(results: Results) -> list[JudgedClaim]:
+def _clearest(judged_claims: Sequence[JudgedClaim]) -> list[JudgedClaim]:
     """The claims with a clear outcome, those that hold in general or do not before the others."""
-    clear = [j for j in judge(results, load_claims()) if len(j.sides) > 1 and j.here != "mixed"]
+    clear = [j for j in judged_claims if len(j.sides) > 1 and j.here != "mixed"]
     return sorted(clear, key=lambda j: (j.verdict == "can't tell", j.contrast.p))[:CLAIMS]
 
 
 def _claim(results: Results, judged: JudgedClaim) -> Finding:
     first, second = list(judged.sides)
-    outcome = {"seen": "seen here", "not seen": "not seen here"}[judged.here]
+    scenes = f"{judged.contrast.scenes} of {len(results.study.scenes)} scenes"
+    seen = {"seen": "seen here", "seen where defined": f"seen here in {scenes}"}
+    outcome = seen.get(judged.here, "not seen here")
     if judged.verdict != "can't tell":
         outcome += f", {judged.verdict} in general"
     return Finding(
         f"{judged.claim.text}: {outcome}.",
         _value(results, judged.claim.probe, judged.metric, judged.contrast),
         f"`{judged.metric}`: {second} against {first}",
-        "holds" if judged.here == "seen" else "fails",
+        "holds" if judged.here in seen else "fails",
         _pair(results, judged.claim.probe, first, second, judged.metric),
     )
 
 
-def _effects(results: Results, claimed: list[set[str]]) -> list[Finding]:
+def _effects(
+    results: Results, told: list[set[str]], claimed: Mapping[Comparison, float]
+) -> list[Finding]:
     """The clearest difference of each table of variants, then the next ones; pairs of variants of
     which a claim has told are left out.
     """
-    tables = [_of_table(results, ablation, claimed) for ablation in results.study.ablations]
+    tables = [_of_table(results, ablation, told, claimed) for ablation in results.study.ablations]
     rounds = itertools.zip_longest(*tables)
     return [finding for row in rounds for finding in row if finding is not None]
 
 
-def _of_table(results: Results, ablation: Ablation, claimed: list[set[str]]) -> list[Finding]:
+def _of_table(
+    results: Results,
+    ablation: Ablation,
+    told: list[set[str]],
+    claimed: Mapping[Comparison, float],
+) -> list[Finding]:
     """The clearest difference of each variant from the baseline, those with pictures first."""
     own, clearest = probe(ablation.probe), dict[str, tuple[bool, float, Finding]]()
-    for name, metric, difference, p in contrasts(results, ablation):
-        specification = own.metric(metric)
-        if specification.direction not in ("higher", "lower") or not difference.bounded:
-            continue
-        direction: Literal["higher", "lower"] = (
-            "higher" if specification.direction == "higher" else "lower"
-        )
-        outcome = verdict(difference, direction, atol=specification.atol, adjusted_p=p)
-        if outcome not in ("better", "worse") or {name, ablation.baseline} in claimed:
+    for contrast in contrasts(results, ablation, claimed):
+        name, metric, p, outcome = contrast.variant, contrast.metric, contrast.p, contrast.verdict
+        if outcome not in ("better", "worse") or {name, ablation.baseline} in told:
             continue
         if name in clearest and clearest[name][1] <= p:
             continue
         finding = Finding(
             f"{ablation.title}: `{name}` is {outcome} than `{ablation.baseline}`"
-            f" ({specification.description}).",
-            _value(results, ablation.probe, metric, difference),
+            f" ({own.metric(metric).description}).",
+            _value(results, ablation.probe, metric, contrast.difference),
             f"`{metric}`: {name} against {ablation.baseline}",
             "holds" if outcome == "better" else "fails",
             _pair(results, ablation.probe, ablation.baseline, name, metric),

@@ -9,7 +9,7 @@ from attnwarp_eval.statistics.intervals import Interval, Ratio, interval
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
-from attnwarp_eval.study.results import Results
+from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
 
 
@@ -24,9 +24,11 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
     section.text = _text(results)
     for index, front in enumerate(results.study.fronts):
         metric = front.metric.format(layer=results.layer)
-        points, rows = _points(results, front, metric)
+        shared = results.shared(front.probe, front.variants, metric)
+        points, rows = _points(results, front, shared)
         if not points:
             continue
+        section.text += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
         own = probe(front.probe)
         label = f"{metric} ({own.metric(metric).unit})"
@@ -85,17 +87,20 @@ def _in_turn(timed: Timed) -> str:
 
 
 def _points(
-    results: Results, front: Front, metric: str
+    results: Results, front: Front, shared: Shared
 ) -> tuple[dict[str, tuple[Interval, Interval]], list[list[str]]]:
-    """Seconds and quality of each variant, and the rows of the table but for their last column."""
+    """Seconds and quality of each comparable variant; the rows but for their last column."""
     timed = timed_in_turn(results, probe(front.probe).stage)
     points: dict[str, tuple[Interval, Interval]] = {}
     rows = []
     for name in front.variants:
-        quality = results.mean(front.probe, name, metric)
+        quality = shared.mean(name)
+        shown = spread(quality, len(results.study.scenes))
+        if name in shared.apart and quality.views:
+            shown += ", own views"
         if timed is not None and name not in timed.names:
             # Seconds of another kind have no place on the same axis.
-            rows.append([name, spread(quality), "–", "not timed", "–"])
+            rows.append([name, shown, "–", "not timed", "–"])
             continue
         if timed is not None:
             base, ratio = name == timed.baseline, timed.ratio(name)
@@ -111,8 +116,9 @@ def _points(
                 "one pass",
                 "–",
             )
-        points[name] = (seconds, quality)
-        rows.append([name, spread(quality), number(1000 * seconds.mean), text, judged])
+        if name not in shared.apart:
+            points[name] = (seconds, quality)
+        rows.append([name, shown, number(1000 * seconds.mean), text, judged])
     if timed is not None:
         noise = timed.noise
         again = number(1000 * timed.base * noise.ratio)

@@ -129,6 +129,33 @@ def paired(a: ByView, b: ByView) -> Interval:
     return interval(differences)
 
 
+def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:
+    """Each table over the views in which all tables are defined; scenes without any are left out.
+
+    Args:
+        tables: scene -> view key -> value, NaN where undefined.
+
+    Example:
+        >>> ours = {"bear": {"yaw010": 1.0, "yaw020": 2.0}, "fence": {"yaw010": 3.0}}
+        >>> theirs = {"bear": {"yaw010": float("nan"), "yaw020": 4.0}}
+        >>> common([ours, theirs])
+        [{'bear': {'yaw020': 2.0}}, {'bear': {'yaw020': 4.0}}]
+    """
+    keys = [
+        {(s, v) for s, views in table.items() for v, value in views.items() if np.isfinite(value)}
+        for table in tables
+    ]
+    shared = set.intersection(*keys) if keys else set()
+    return [
+        {
+            scene: own
+            for scene, views in table.items()
+            if (own := {view: x for view, x in views.items() if (scene, view) in shared})
+        }
+        for table in tables
+    ]
+
+
 @dataclass(frozen=True)
 class Ratio:
     """How much longer one thing took than another.

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.statistics.intervals import ByView, Interval, common, interval
 from attnwarp_eval.study.record import Failure, Record
 from attnwarp_eval.study.schema import Study
 
@@ -30,6 +31,49 @@ class Outcome:
     probe: str
     seed: int
     record: Record[Any] | None
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A metric of several variants over the views that all of them have.
+
+    Attributes:
+        tables: variant -> scene -> view (and seed) -> value, none of them NaN.
+        apart: variants that have too few views, so that their tables are over their own.
+        views: how many views the others share.
+        of: how many views there are.
+    """
+
+    tables: dict[str, dict[str, dict[str, float]]]
+    apart: tuple[str, ...]
+    views: int
+    of: int
+
+    def mean(self, variant: str, scenes: Collection[str] | None = None) -> Interval:
+        """Over ``scenes``, all by default, of the means over the views."""
+        table = self.tables[variant]
+        chosen = table if scenes is None else [scene for scene in scenes if scene in table]
+        return interval({scene: list(table[scene].values()) for scene in chosen})
+
+    def text(self, title: str) -> list[str]:
+        """A paragraph that says what the means are over; none where that is every view.
+
+        Args:
+            title: of the table.
+        """
+        if self.views == self.of and not self.apart:
+            return []
+        text = f"{title}: over the {self.views} of {self.of} views in which all have a value."
+        if self.apart:
+            text += (
+                f" Left out, since they have one in fewer than half of the views of the variant"
+                f" with most: {', '.join(self.apart)}."
+            )
+        return [text]
+
+
+def _count(table: ByView) -> int:
+    return sum(map(len, table.values()))
 
 
 @dataclass(frozen=True)
@@ -118,6 +162,26 @@ class Results:
         """Mean over scenes of a variant's metric, with its interval."""
         table = self.views(probe, variant, metric)
         return interval({scene: list(values.values()) for scene, values in table.items()})
+
+    def shared(self, probe: str, variants: Sequence[str], metric: str) -> Shared:
+        """A metric of several variants over the views that all of them have.
+
+        A variant with values in fewer than half of the views of the one with most would leave too
+        little: it stays apart, over its own views.
+        """
+        tables = {name: self.views(probe, name, metric) for name in variants}
+        own = {name: common([table])[0] for name, table in tables.items()}
+        counts = {name: _count(table) for name, table in own.items()}
+        most = max(counts.values(), default=0)
+        apart = tuple(name for name in tables if 2 * counts[name] < most)
+        together = [name for name in tables if name not in apart]
+        reduced = common([tables[name] for name in together])
+        return Shared(
+            own | dict(zip(together, reduced, strict=True)),
+            apart,
+            _count(reduced[0]) if reduced else 0,
+            max(map(_count, tables.values()), default=0),
+        )
 
     def seconds(self, probe: str, variant: str, stage: str) -> dict[str, float]:
         """Scene -> seconds of a stage ("steady", "warm", ...), mean over seeds."""

@@ -30,6 +30,7 @@ def warp_truth(world: World, truth: TwoView, settings: WarpSettings, **images: A
         Surface(truth.hits.depth, truth.hits.normal, image=images.get("target_image")),
         Surface(source.depth, source.normal, image=images.get("source_image")),
         settings,
+        warn_empty=False,
     )
 
 

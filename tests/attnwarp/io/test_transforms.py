@@ -474,6 +474,21 @@ def test_a_split_that_names_no_frame_is_refused_with_the_nearest_name(tmp_path):
         read_transforms(folder_of(tmp_path, **lists))
 
 
+def test_names_of_frames_that_were_removed_by_hand_are_refused_with_the_remedy_that_mends_it(
+    tmp_path,
+):
+    """Oracle: the file reads once the message is followed."""
+    path = folder_of(tmp_path, **split_names(tmp_path, lambda name: name))
+    data = json.loads(path.read_text())
+    removed = data["frames"].pop(0)["file_path"]
+    path.write_text(json.dumps(data))
+    with pytest.raises(FileFormatError, match="frames were removed, remove their names too, or al"):
+        read_transforms(path)
+    data["train_filenames"] = [name for name in data["train_filenames"] if name != removed]
+    path.write_text(json.dumps(data))
+    assert read_transforms(path).splits == ["test", "train"]
+
+
 def test_a_frame_to_fit_on_is_not_held_out_as_well(tmp_path):
     lists = split_names(tmp_path, lambda name: name)
     lists["val_filenames"] = ["images/002.png"]

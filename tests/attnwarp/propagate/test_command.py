@@ -9,11 +9,13 @@ import sys
 import threading
 import time
 from base64 import b64decode
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from tiny_editors import pix2pix
 from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
@@ -56,6 +58,10 @@ def place(tmp_path_factory):
     )
     write_ply(folder / "splats.ply", model)
     pix2pix().save_pretrained(folder / "editor")
+    (folder / "black").mkdir()
+    for camera in views:
+        (folder / "black" / camera.name).write_bytes(encode_png(np.zeros((32, 32, 3), np.uint8)))
+    (folder / "wide.png").write_bytes(encode_png(np.zeros((32, 48, 3), np.uint8)))
     return folder
 
 
@@ -187,6 +193,11 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
     assert [path.name for path in files] == [camera.name for camera in cameras()]
     shares = [(read_image(path) > 127).mean() for path in files]
     assert min(shares) > 0 and max(shares) < 1
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("masks cover")]
+    percent = [float(number) for number in re.findall(r"([0-9.]+)%", line)]
+    assert percent == pytest.approx([100 * min(shares), 100 * max(shares)], abs=0.051)
+    names = re.findall(r"v\d\.png", line)
+    assert [shares[int(name[1])] for name in names] == [min(shares), max(shares)]
     result = run(place, tmp_path / "files", *ply, "--masks", tmp_path / "words" / "segments")
     assert result.exit_code == 0, result.output
     for name in ("source.png", "edited.ply"):
@@ -197,6 +208,8 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
     ("more", "message"),
     [
         (("--source", "v9"), "--source: got 'v9', expected a view's name or a number below 5"),
+        (("--preset", "corected"), "expected one of 'paper', "),
+        (("--preset", "corected"), "; did you mean 'corrected'?"),
         (("--editor", "smal"), "editor 'smal': neither bundled"),
         (("--set", "opaqe=1"), "setting: got 'opaqe', expected one of"),
         (("--set", "steps=3"), "--set: steps has an option of its own, --steps"),
@@ -207,7 +220,12 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
         (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
+        (("--masks", "black"), "--masks: every mask in black is black, so nothing may change"),
         (("--source-picture", "no.png"), "no.png: no such file"),
+        (
+            ("--source-picture", "wide.png"),
+            "--source-picture: wide.png: got 32 x 48 (height x width), expected the aspect ratio of 32 x 32;",
+        ),
         (("--ply", "no.ply"), "no.ply: no such file"),
     ],
 )
@@ -218,6 +236,51 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, m
     assert result.exit_code == 2
     assert message in result.output
     assert len(result.output.strip().splitlines()) == 1
+
+
+def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, tmp_path):
+    """Oracle: the cameras' own projection; all centres lie outside every picture."""
+    model = splats()
+    write_ply(tmp_path / "far.ply", replace(model, means=model.means + torch.tensor([50.0, 0, 0])))
+    for camera in cameras():
+        xy, _ = camera.project(read_ply(tmp_path / "far.ply").world_means())
+        assert not ((xy > 0) & (xy < 32)).all(axis=-1).any()
+    result = run(place, tmp_path / "out", "--ply", tmp_path / "far.ply")
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'far.ply'}: its splats cover less than 0.2% of each view" in result.output
+    assert "same coordinates and the same units" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_stages_and_a_size_that_cannot_be_had_are_said_in_one_line_each(place, tmp_path):
+    """Oracle: the manifest and the pictures that the edit leaves."""
+    more = ("--ply", place / "splats.ply", "--stages", 9, "--views-per-stage", 2, "--size", 31)
+    result = run(place, tmp_path, *more)
+    assert result.exit_code == 0, result.output
+    stages = json.loads((tmp_path / "manifest.json").read_text())["stages"]
+    longest = max(read_image(tmp_path / "source.png").shape)
+    assert (len(stages), longest) == (2, 32)
+    assert "stages: 2 in place of 9, as 5 views leave no more to edit\n" in result.stderr
+    assert "size: 32 px in place of 31, as this editor's sides are multiples of" in result.stderr
+
+
+def test_an_edit_whose_targets_got_no_features_says_so(place, tmp_path):
+    """Oracle: the masks leave no pixel of a view but the source's to be edited."""
+    white = np.full((32, 32, 3), 255, np.uint8)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for k, camera in enumerate(cameras()):
+        (masks / camera.name).write_bytes(encode_png(white if k == 2 else 0 * white))
+    ply = ("--ply", place / "splats.ply", "--source", 2, "--set", "warp.segment=true")
+    result = run(place, tmp_path / "out", *ply, "--masks", masks)
+    assert result.exit_code == 0, result.output
+    names = ", ".join(f"images/v{k}.png" for k in (0, 1, 3, 4))
+    assert f"--masks: 4 of 5 are black, so nothing is edited in {names}\n" in result.stderr
+    assert "warning: each view was edited alone, as none got features" in result.stderr
+    assert f"perhaps {place / 'splats.ply'} does not fit the photographs" in result.stderr
+    result = run(place, tmp_path / "all", *ply)
+    assert result.exit_code == 0 and "edited alone" not in result.stderr
+    assert "in place of" not in result.stderr
 
 
 def test_words_that_a_view_does_not_show_are_one_clear_line_with_the_view(place, tmp_path):

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from attnwarp import Camera
 from attnwarp.propagate.pictures import (
     Principal,
+    check_source_picture,
     composite,
     edit_size,
     enlarged_change,
@@ -75,3 +77,22 @@ def test_sides_are_the_multiples_nearest_to_the_size_asked_for():
 def test_a_mask_is_white_where_it_is_true():
     mask = torch.tensor([[True, False]])
     assert mask_picture(mask).tolist() == [[[255] * 3, [0] * 3]]
+
+
+def test_a_picture_of_the_source_is_the_views_shape_at_any_size_or_what_an_editor_makes_of_it():
+    """Oracle: sizes worked out by hand for a view of 1080 x 1920."""
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=1920, height=1080, fov_y=40, up=(0, 1, 0))
+    # Halves, a third of a third, a seventh either way, the double; multiples of 32 and 64.
+    for size in (
+        (540, 960),
+        (120, 213),
+        (154, 274),
+        (155, 275),
+        (2160, 3840),
+        (32, 64),
+        (256, 448),
+    ):
+        check_source_picture(size, camera, "picture")
+    for size in ((1920, 1080), (1080, 1080), (540, 1000), (512, 512)):
+        with pytest.raises(ValueError, match="picture: got .* expected the aspect ratio of 1080 x"):
+            check_source_picture(size, camera, "picture")

@@ -2,11 +2,14 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from closed_forms import orbit, sphere
 
+from attnwarp import Camera
 from attnwarp.render.threads import set_thread_count
+from attnwarp.warp import FeatureWarp, correspond
 from attnwarp.warp.settings import preset
 from attnwarp.warp.view import Surface, warp_surfaces
 
@@ -222,6 +225,8 @@ def test_one_source_for_all_gathers_the_gradient_of_all(layer):
             r"source: got shape .*expected \(1 or 1, 192, 5",
         ),
         (lambda w, s, n: w.blend_tokens(s, n, 1.5), r"alpha: got 1\.5"),
+        (lambda w, s, n: w.blend_tokens(s, n, None), r"alpha: got None, expected a number in"),
+        (lambda w, s, n: w.warp(torch.rand(3, 0, 80)), "features: got 0 x 80 .* at least 1 x 1"),
         (
             lambda w, s, n: w.blend_tokens(s.clone().requires_grad_(), n, 1, in_place=True),
             r"in_place: got True where a gradient is recorded",
@@ -232,6 +237,40 @@ def test_the_doors_for_tokens_say_what_came_and_what_was_expected(layer, call, m
     source = tokens_of(random_maps(layer))
     with pytest.raises(ValueError, match=message):
         call(layer, source, source.clone())
+
+
+def test_arrays_in_place_of_tensors_are_named(layer):
+    rows = tokens_of(random_maps(layer))
+    for call, name in (
+        (lambda: layer.warp_tokens(rows.numpy()), "source"),
+        (lambda: layer.blend_tokens(rows.numpy(), rows, 0.5), "source"),
+        (lambda: layer.blend_tokens(rows, rows.numpy(), 0.5), "new"),
+    ):
+        with pytest.raises(TypeError, match=f"{name}: got ndarray, expected torch.Tensor"):
+            call()
+
+
+def test_a_map_is_taken_at_every_size_that_a_network_makes_of_the_picture_and_not_transposed():
+    """Oracle: the sizes that torch's own pooling and resizing give."""
+    K = np.array([[60.0, 0, 40], [0, 60.0, 40], [0, 0, 1]])
+    depth = np.full((8, 8), 2.0)
+    for height, width in ((96, 160), (99, 165), (45, 1000), (37, 61)):
+        source = Camera(K, np.eye(4), width, height)
+        c = correspond(source, Camera(K, np.eye(4), 8, 8), depth)
+        layer = FeatureWarp(c, c.defined)
+        picture = torch.rand(1, 1, height, width)
+        pool = torch.nn.functional.avg_pool2d
+        maps = [pool(picture, by, ceil_mode=up) for by in (2, 3, 8, 14) for up in (False, True)]
+        twice = pool(pool(picture, 2, ceil_mode=True), 4)
+        maps += [twice, pool(pool(picture, 2), 4, ceil_mode=True)]
+        maps += [torch.nn.functional.interpolate(picture, scale_factor=s) for s in (0.3, 0.17, 1.7)]
+        for features in maps:
+            assert layer.warp(features).shape == (1, 1, 8, 8)
+            with pytest.raises(ValueError, match=r"features: got .* expected the aspect ratio of"):
+                layer.warp(features.mT)
+    # A picture squeezed into a square, as for a vision transformer: the layer says so.
+    squeezed = FeatureWarp(correspond(source.resize(16, 16), c.target, depth), c.defined)
+    assert squeezed.warp(torch.rand(4, 16, 16)).shape == (4, 8, 8)
 
 
 def test_a_layer_makes_its_taps_once(layer, monkeypatch):

@@ -67,7 +67,8 @@ def test_every_field_changes_what_it_says():
     assert set(changes) == {field.name for field in dataclasses.fields(WarpSettings)}
 
     def result(settings, views):
-        view = warp_view(splats, *views, settings, target_segment=segment)
+        edited = segment if settings.segment else None
+        view = warp_view(splats, *views, settings, target_segment=edited)
         layer = view.at((13, 13), source_size=(13, 13))
         parts = (view.correspondence.xy, view.mask, layer.correspondence.xy, layer.mask)
         return [torch.nan_to_num(part.double()) for part in parts]

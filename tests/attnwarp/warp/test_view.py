@@ -92,9 +92,8 @@ def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():
         view = warp_surfaces(source, target, Surface(depth), None, settings)
         assert view.mask.sum() > 1000
         assert (view.correspondence.z[view.mask] < 0).all()
-        tested = warp_surfaces(
-            source, target, Surface(depth), None, dataclasses.replace(settings, in_front=True)
-        )
+        strict = dataclasses.replace(settings, in_front=True)
+        tested = warp_surfaces(source, target, Surface(depth), None, strict, warn_empty=False)
         assert not tested.mask.any()
         assert not in_front(tested.correspondence)[view.mask].any()
 
@@ -213,7 +212,8 @@ def test_every_rule_can_be_varied_alone():
         ({"normal_test": "source_incidence"}, "source_incidence"),
         ({"segment": True}, "segment"),
     ):
-        view = run(dataclasses.replace(bare, **change), target_segment=segment)
+        edited = segment if rule == "segment" else None
+        view = run(dataclasses.replace(bare, **change), target_segment=edited)
         assert list(view.rules) == ["defined", "in_bounds", rule]
         assert view.mask.any() == (rule != "segment")
 
@@ -256,12 +256,89 @@ def test_a_mistaken_argument_is_named_with_what_was_expected():
     ):
         with pytest.raises(TypeError, match=message):
             warp_view(**{"gaussians": disc, "source": camera, "target": camera, **change})
+    wall = Surface(np.full((8, 8), 2.0))
+    for change, message in (
+        ({"settings": "corrected"}, "settings: got str, expected WarpSettings, such as PRESETS"),
+        ({"target_surface": wall.depth}, "target_surface: got ndarray, expected Surface, such as"),
+        ({"source_surface": wall.depth}, "source_surface: got ndarray, expected Surface, such as"),
+    ):
+        given = {"source": camera, "target": camera, "target_surface": wall, **change}
+        with pytest.raises(TypeError, match=message):
+            warp_surfaces(**given)
     view = warp_view(disc, camera, camera)
     for size in (64, (4,), (4, 4, 4)):
         with pytest.raises(ValueError, match=r"size: got .*, expected \(height, width\)"):
             view.at(size)
     with pytest.raises(TypeError, match="features: got ndarray, expected torch.Tensor"):
         view.at((4, 4)).warp(np.zeros((3, 4, 4), np.float32))
+
+
+def test_what_no_rule_reads_is_refused_with_the_setting_that_would_read_it():
+    disc, camera = shell(50), orbit(0, size=8)
+    for change, message in (
+        ({"source_image": np.zeros((8, 8, 3))}, "source_image: the settings have photometric=None"),
+        ({"target_image": np.zeros((8, 8, 3))}, "target_image: the settings have photometric=None"),
+        ({"target_segment": np.ones((8, 8), bool)}, "target_segment: the settings have segment=F"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            warp_view(disc, camera, camera, **change)
+    wall = Surface(np.full((8, 8), 2.0))
+    with pytest.raises(ValueError, match="target_segment: the settings have segment=False"):
+        warp_surfaces(camera, camera, wall, target_segment=np.ones((8, 8), bool))
+
+
+def test_a_view_without_a_position_says_what_to_check_and_why():
+    """Oracle: poses in the other conventions, made by hand from one in OpenCV's."""
+    disc = Gaussians(
+        "2d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 2), 0.3),
+        torch.ones(1), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    given = {"width": 16, "height": 16, "fov_y": 40, "up": (0, 1, 0)}
+    right = Camera.look_at((0.5, 0, -3), (0, 0, 0), **given)
+    opengl = np.diag([1.0, -1, -1, 1]) @ right.world_to_camera
+    backwards = np.linalg.inv(right.world_to_camera)
+    remedy = "; check world_to_camera of both: from world to camera, not camera-to-world; OpenCV"
+    wall = Surface(np.full((16, 16), 2.0))
+    assert warp_view(disc, right, right).mask.any()
+    for pose in (opengl, backwards):
+        wrong = Camera(right.K, pose, 16, 16)
+        with pytest.warns(UserWarning, match=f"the target sees no surface{remedy}") as issued:
+            view = warp_view(disc, wrong, wrong)
+        assert [warning.filename for warning in issued] == [__file__]
+        assert not view.mask.any()
+        warp_view(disc, wrong, wrong, warn_empty=False)  # a warning would be an error here
+    ahead, behind = (Camera(right.K, np.diag(d), 16, 16) for d in ([1.0] * 4, [1.0, -1, -1, 1]))
+    settings = preset("corrected", depth_agreement=False, normal_test="none")
+    for backend in ("auto", "reference"):
+        with pytest.warns(UserWarning, match=f"every point lies behind the source{remedy}") as got:
+            warp_surfaces(behind, ahead, wall, None, settings, backend=backend)
+        assert [warning.filename for warning in got] == [__file__]
+
+
+def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an_array():
+    disc, source, target = shell(50), orbit(0, size=8), orbit(0, size=12, width=16)
+    settings = preset("corrected", photometric=0.2, segment=True)
+    first, second = np.zeros((8, 8, 3)), np.full((12, 16, 3), 0.5)
+    for change, message in (
+        ({"source_image": np.zeros((3, 8, 8))}, r"source_image: got 3 x 8 .* \(H, W, C\)"),
+        ({"source_image": np.zeros((12, 16, 3))}, "source_image: got 12 x 16 .* of 8 x 8; its"),
+        ({"target_image": np.zeros((3, 12, 16))}, r"shape \(3, 12, 16\), expected \(12, 16, 3\)"),
+        ({"target_image": np.zeros((12, 16, 4))}, r"shape \(12, 16, 4\), expected \(12, 16, 3\)"),
+        (
+            {"target_image": 255 * second},
+            r"target_image: got values in \[128, 128\], expected sRGB",
+        ),
+        ({"source_image": first - 1}, r"source_image: got values in \[-1, -1\], expected sRGB"),
+        ({"target_segment": np.ones((8, 8))}, r"target_segment: got shape \(8, 8\), expected \(12"),
+    ):
+        given = {"source_image": first, "target_image": second, **change}
+        with pytest.raises(ValueError, match=message):
+            warp_view(disc, source, target, settings, **given)
+    segment = np.zeros((12, 16), bool)
+    segment[:, 8:] = True
+    segment.setflags(write=False)
+    view = warp_view(disc, source, target, settings, target_segment=segment)
+    assert np.array_equal(view.rules["segment"], segment)
 
 
 def test_a_layers_mask_drops_pixels_whose_own_correspondence_is_undefined():

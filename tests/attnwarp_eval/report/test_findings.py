@@ -65,6 +65,13 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
     assert finding.picture.before.path == "good-three-v0.jpg"
 
 
+def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
+    values = {**VALUES, "slipped": [[0.6, 0.6], [0.5, 0.7], [None, None]]}
+    (finding,) = findings(results(CLAIMED, values), [])
+    assert finding.text.endswith("seen here in 2 of 3 scenes, holds in general.")
+    assert finding.outcome == "holds"
+
+
 def test_a_difference_that_no_claim_names_is_told_once_with_its_verdict():
     (finding,) = findings(results(OTHER, VALUES), [])
     assert finding.text.startswith("Slip: `slipped` is worse than `good` (")

@@ -2,23 +2,27 @@
 hand."""
 
 import dataclasses
+import math
+import re
 
+import numpy as np
 import pytest
 import written_runs
+from scipy import stats
 
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
-from attnwarp_eval.report.claims import Claim, JudgedClaim, judge, load_claims, together
+from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.statistics.intervals import interval
-from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.editing import EditResult
-from attnwarp_eval.study.probes.editing_sections import abilities
+from attnwarp_eval.study.probes.editing_sections import abilities, by_scene
 from attnwarp_eval.study.study import load_study, parse_variant
 
 SCENES = ("one", "two", "three")
@@ -116,6 +120,43 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     assert row[6] == "3, 6"
 
 
+def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_part_in_their_family():
+    """Oracle: scipy's t test of the scenes' differences, adjusted by hand (Benjamini, Hochberg)."""
+    recall, precision = "occlusion.recall", "occlusion.precision"
+    # Mean differences of the three scenes. A claim speaks of SLIP alone.
+    differences = {
+        SLIP: [0.50, 0.51, 0.49],
+        recall: [-0.30, -0.30, -0.34],
+        precision: [-0.10, -0.20, -0.12],
+    }
+    cells = [
+        written_runs.outcome(
+            "warp",
+            scene,
+            [variant],
+            written_runs.record(
+                [("v0", 0.0, {m: 0.6 + factor * v[i] for m, v in differences.items()})],
+                cost={"seconds": {"steady": 0.1}, "counters": {}},
+            ),
+        )
+        for variant, factor in (("good", 0), ("slipped", 1))
+        for i, scene in enumerate(SCENES)
+    ]
+    run = written_runs.results(study(), cells)
+    p = {metric: stats.ttest_1samp(values, 0).pvalue for metric, values in differences.items()}
+    (claim,) = judge(run, load_claims())
+    (section,) = ablations(run)
+    rows = {row[1]: row for row in section.tables[-1].rows}
+    # One claim, so its p-value is not multiplied; with the table's two others it would be by 3/1.
+    assert rows[SLIP][5] == f"{number(p[SLIP])} †" == f"{number(claim.p)} †"
+    assert (rows[SLIP][3], claim.verdict) == ("worse", "holds")
+    # The smaller of the table's two tests is doubled, the larger stays.
+    assert p[recall] < p[precision]
+    assert rows[recall][5] == number(2 * p[recall])
+    assert rows[precision][5] == number(max(p[precision], 2 * p[recall]))
+    assert any(text.startswith("† in the table") for text in section.text)
+
+
 def test_a_baseline_that_was_not_measured_stays_in_the_table_and_is_named():
     (section,) = ablations(results({"good": [None] * 3, "slipped": CLEAR["slipped"]}))
     assert section.text == ["**Not measured:** good."]
@@ -183,7 +224,9 @@ def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
     assert sides == [(name, {"editor": {"name": name}}) for name in ("small", "small-plain")]
 
     def finding(here, verdict):
-        return JudgedClaim(claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict)
+        return JudgedClaim(
+            claim, claim.metric, {}, interval({"one": [1.0]}), (1, 1), here, verdict, 0.01
+        )
 
     holds, fails = finding("seen", "holds"), finding("not seen", "does not hold")
     assert together([holds, holds], claim.editors) == ("seen", "holds")
@@ -215,15 +258,81 @@ OWN_CLAIM = Claim(
 )
 
 
-def edited(name, value=0.0, *, done=True, scene="one", **spec):
+def edited(
+    name, value=0.0, *, done=True, scene="one", metric="embedding.dino_image.render", **spec
+):
     source = Judgement("red", done, 30.0, 10.0, 10.0)
     extra = EditResult("red", "paint it red", source, source, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
-        [("red/v0", 15.0, {"embedding.dino_image.render": value})],
+        [("red/v0", 15.0, {metric: value})],
         spec={"method": "propagate", "settings": {}, **spec},
         **extra.to_json(),
     )
     return written_runs.outcome("editing", scene, [name], data, f"{name}-{scene}")
+
+
+def test_a_claim_names_the_scenes_in_which_both_sides_are_below_the_floor_and_says_what_it_means():
+    metric = "multiview.delta_e_above.edit_inside"
+    values = {
+        "alone": {"one": -1.0, "two": 2.0, "three": 4.0},
+        "mine": {"one": -2.0, "two": -1.0, "three": 1.0},
+    }
+    cells = [
+        edited(name, value, metric=metric, scene=scene)
+        for name, own in values.items()
+        for scene, value in own.items()
+    ]
+    names = {name: METHODS[name] for name in values}
+    run = written_runs.results(
+        study(variants=names, probes={"editing": list(names)}, ablations=[]), cells
+    )
+    claim = dataclasses.replace(
+        OWN_CLAIM, metric=metric, a=METHODS["alone"], b=METHODS["mine"], expect="lower"
+    )
+    (finding,) = judge(run, [claim])
+    # In scene two only one side is.
+    assert (finding.here, finding.below_floor) == ("seen", ("one",))
+
+
+def test_a_scene_without_a_part_of_the_controls_disagreement_says_why():
+    metric = "multiview.delta_e_above.edit_inside"
+    values = {
+        "alone": {"one": 4.0, "two": -1.0, "three": None, "four": 3.0, "five": 2.0},
+        "mine": {"one": 1.0, "two": -2.0, "three": 1.0, "four": None, "five": None},
+    }
+    undone = {("alone", "three"), ("mine", "four")}
+    cells = [
+        edited(
+            name,
+            value,
+            metric=metric,
+            scene=scene,
+            done=(name, scene) not in undone,
+            editor={"sha256": "e"},
+            method={"alone": "by_view", "mine": "propagate"}[name],
+        )
+        for name, own in values.items()
+        for scene, value in own.items()
+    ]
+    names = list(values)
+    content = study(
+        scenes=list(values["mine"]),
+        variants={name: {} for name in names},
+        probes={"editing": names},
+        ablations=[],
+    )
+    section = by_scene(written_runs.results(content, cells), "editing", names)
+    assert section.tables[0].rows == [
+        [
+            "mine",
+            "alone",
+            "0.250",  # 1 / 4
+            "below the floor",
+            "control's source edit not done",
+            "source edit not done",
+            "no view in common",
+        ]
+    ]
 
 
 def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_the_control():
@@ -247,6 +356,33 @@ def test_a_comparison_counts_the_source_edits_of_each_method_and_shows_those_of_
         study(variants={"warped": {}}, probes={"editing": ["warped"]}, ablations=[]), cells[-1:]
     )
     assert len(abilities(one_method, "editing").tables) == 1
+
+
+def test_the_numbers_of_an_edit_decide_whether_it_is_done():
+    """Oracle: the rule that the section states, read from its cells."""
+    answer = {"view": np.full((4, 4, 3), 0.5)}
+    unedited = {"view": np.full((4, 4, 3), 0.3)}
+    inside = {"view": np.ones((4, 4), bool)}
+    truth = EditTruth(unedited, {"red": answer}, {"red": inside}, inside)
+    # Near the answer; nearer to the unedited picture; farther from the answer than that one is.
+    expected = {0.45: "yes", 0.35: "**no**", 0.9: "**no**"}
+    judged = {value: truth.judge({"view": np.full((4, 4, 3), value)}) for value in expected}
+    for value, judgement in judged.items():
+        extra = EditResult("red", "paint it red", judgement, judgement, {}, {}, 30.0, 2, 0.0)
+        data = written_runs.record(
+            [], spec={"method": "by_view", "settings": {}}, **extra.to_json()
+        )
+        cell = written_runs.outcome("editing", "one", ["control"], data, "a")
+        content = study(variants={"control": {}}, probes={"editing": ["control"]}, ablations=[])
+        section = abilities(written_runs.results(content, [cell]), "editing")
+        row = dict(zip(section.tables[-1].columns, section.tables[-1].rows[0], strict=True))
+        psnr, *limits = map(float, re.findall(r"[\d.]+", row["source, dB"]))
+        decibels = [
+            -20 * math.log10(abs(a - b)) for a, b in ((value, 0.5), (0.3, 0.5), (value, 0.3))
+        ]
+        assert [psnr, *limits] == pytest.approx(decibels, rel=5e-3)
+        assert row["source done"] == expected[value]
+        assert (psnr > max(limits)) == (row["source done"] == "yes")
 
 
 @pytest.mark.parametrize(
@@ -298,6 +434,16 @@ def test_each_comparison_that_ships_has_both_sides_of_the_claims_about_methods(n
         assert alike == labels
 
 
+def test_what_is_claimed_of_methods_edited_views_is_claimed_of_what_a_person_gets_too():
+    def sides(metric):
+        own = [c for c in load_claims() if c.settings == "own" and c.metric == metric]
+        return [(c.a, c.b, c.expect) for c in own]
+
+    edited_views = sides("multiview.delta_e_above.edit_inside")
+    assert len(edited_views) == 5
+    assert sides("multiview.delta_e_above.render_inside") == edited_views
+
+
 def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
     declared = load_claims()
     assert len({claim.id for claim in declared}) == len(declared)
@@ -305,12 +451,35 @@ def test_every_claim_names_a_metric_of_its_probe_and_a_claim_only_once():
         assert probe(claim.probe).metric(claim.metric.replace("{layer}", "64")), claim.id
 
 
-def test_an_undefined_scene_neither_agrees_nor_disagrees():
+def test_an_undefined_scene_neither_agrees_nor_disagrees_and_seen_needs_every_scene():
     (finding,) = judge(
         results({"good": [[0.1]] * 3, "slipped": [[0.6], [None], [0.7]]}), [SLIP_CLAIM]
     )
-    assert (finding.here, finding.agreement, finding.contrast.scenes) == ("seen", (2, 2), 2)
+    here = "seen where defined"
+    assert (finding.here, finding.agreement, finding.contrast.scenes) == (here, (2, 2), 2)
+    missing = results({"good": [[0.1]] * 3, "slipped": [[0.6], None, [0.7]]})
+    assert [one.here for one in judge(missing, [SLIP_CLAIM])] == [here]
+    (table,) = claims(missing).tables
+    assert {row[table.columns.index("scenes")] for row in table.rows} == {"2 of 3"}
+    (finding,) = judge(
+        results({"good": [[0.9], [None], [0.9]], "slipped": [[0.6]] * 3}), [SLIP_CLAIM]
+    )
+    assert finding.here == "not seen"
     assert judge(results({"good": [[None]] * 3, "slipped": [[0.6]] * 3}), [SLIP_CLAIM]) == []
+
+
+def test_the_means_beside_a_claims_difference_are_over_the_views_that_both_sides_have():
+    run = results(
+        {
+            "good": [[0.1, 9.0], [0.1, 0.3], [0.1, 0.1]],
+            "slipped": [[0.6, None], [0.5, 0.7], [None, None]],
+        }
+    )
+    (finding,) = judge(run, [SLIP_CLAIM])
+    # Scene one without its second view, two whole, three left out; 9.0 would turn the order round.
+    means = {name: side.mean for name, side in finding.sides.items()}
+    assert means == pytest.approx({"good": (0.1 + 0.2) / 2, "slipped": (0.6 + 0.6) / 2})
+    assert finding.contrast.mean == pytest.approx(means["slipped"] - means["good"])
 
 
 def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
@@ -368,6 +537,42 @@ def test_a_front_never_puts_seconds_of_two_kinds_on_one_axis(tmp_path):
     (section,) = fronts(once, Layout(tmp_path))
     assert "one pass" in section.text[1]
     assert {row[3] for row in section.tables[0].rows} == {"one pass"}
+
+
+def test_a_front_holds_variants_against_each_other_over_the_views_that_all_of_them_have(tmp_path):
+    """Oracle: a reading view by view. Over their own views, "fast" would be better than "slow"."""
+    values = {
+        "slow": [[1.0, 5.0, 9.0], [2.0, 6.0, None], [3.0, 7.0, 11.0]],
+        "fast": [[2.0, None, None], [3.0, 7.0, None], [4.0, None, None]],
+        # 3 of the 8 views that "slow" has: too few.
+        "rare": [[0.1, None, None], [None, 0.1, 0.1], [None, None, None]],
+    }
+    names = list(values)
+    front = [{"title": "Cost", "metric": SLIP, "variants": names}]
+    run = results(
+        values, variants={n: {} for n in names}, probes={"warp": names}, ablations=[], fronts=front
+    )
+    means = {}
+    for name in ("slow", "fast"):
+        scenes = []
+        for i in range(3):
+            both = [j for j in range(3) if None not in (values["slow"][i][j], values["fast"][i][j])]
+            scenes.append(sum(values[name][i][j] for j in both) / len(both))
+        means[name] = sum(scenes) / len(scenes)
+    assert means == pytest.approx({"slow": 8 / 3, "fast": 11 / 3})
+    (section,) = fronts(run, Layout(tmp_path))
+    rows = {row[0]: row for row in section.tables[0].rows}
+    for name, mean in means.items():
+        assert rows[name][1].startswith(f"{number(mean)} ± ")
+    assert rows["rare"][1].endswith("own views")
+    # Equally slow here, so only the better of the two is on the front.
+    assert {name: row[-1] for name, row in rows.items()} == {
+        "slow": "yes",
+        "fast": "no",
+        "rare": "–",
+    }
+    (text,) = [text for text in section.text if text.startswith("Cost: ")]
+    assert "over the 4 of 9 views" in text and text.endswith("with most: rare.")
 
 
 def test_text_of_a_page_is_escaped_before_it_is_set():

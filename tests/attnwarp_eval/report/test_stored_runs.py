@@ -1,10 +1,10 @@
 """Two runs that former code computed: today's code verifies them and writes the same reports.
 
 ``data/runs.tar.xz`` holds ``variants`` (the probes of variants on two scenes, 24 x 24 px) and
-``edits`` (sensitivity, without encoders) as revision 33b7813e6823 wrote them, with its report.md and
-results.jsonl of ``report --no-timings --no-pictures``. One paragraph is younger: that about small
-pictures, in the report's calibration section, was inserted by hand. The runs' two scenes said ``bounces: 1``, so today's
-are given that. Where a protocol is changed on purpose, run the studies in their study.json again and
+``edits`` (sensitivity, without encoders) as revision 33b7813e6823 wrote them, with its results.jsonl of
+``report --no-timings --no-pictures``. The report.md are younger: where the report's words or the rules of its
+verdicts are changed on purpose, read the difference and put the new file there. The runs' two scenes said
+``bounces: 1``, so today's are given that. Where a protocol is changed on purpose, run the studies in their study.json again and
 put the new folders there.
 """
 

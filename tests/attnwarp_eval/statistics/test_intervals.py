@@ -10,6 +10,7 @@ from scipy import stats
 from attnwarp_eval.statistics.intervals import (
     agreement,
     benjamini_hochberg,
+    common,
     front,
     interval,
     paired,
@@ -96,6 +97,27 @@ def test_a_view_that_only_one_side_has_counts_as_undefined():
     )
     assert difference.mean == pytest.approx(1.0)
     assert difference.undefined == 1
+
+
+def test_the_common_part_of_tables_is_the_brute_force_reading_view_by_view():
+    rng = np.random.default_rng(5)
+    scenes, views = ("a", "b", "c"), ("v0", "v1", "v2", "v3")
+    for _ in range(20):
+        # Views that are missing, and views that are undefined.
+        tables = [
+            {
+                s: {v: rng.choice([rng.random(), np.nan]) for v in views if rng.random() < 0.9}
+                for s in scenes
+            }
+            for _ in range(3)
+        ]
+        for table, reduced in zip(tables, common(tables), strict=True):
+            for s in scenes:
+                for v in views:
+                    everywhere = all(np.isfinite(t[s].get(v, np.nan)) for t in tables)
+                    expected = table[s][v] if everywhere else None
+                    assert reduced.get(s, {}).get(v) == expected
+            assert all(reduced.values())
 
 
 def test_the_front_is_the_brute_force_set_of_undominated_points():

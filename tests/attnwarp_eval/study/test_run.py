@@ -135,12 +135,26 @@ def test_a_damaged_cell_costs_itself_and_is_mended_by_the_next_run(finished, und
     victim = next(p for p in (run / "cells").rglob("*.json") if '"depth"' in p.read_text())
     victim.write_bytes(victim.read_bytes()[:100])
     assert call("verify", run).exit_code == 3
-    assert call("report", run).exit_code == 0
+    done = call("report", run)
+    assert done.exit_code == 3
+    assert f"1 of {CELLS} cells failed or are damaged, 1 have no figures" in done.stderr
+    assert f"attnwarp-eval verify {run} names them" in done.stderr and done.stderr.count("\n") == 1
     assert "not JSON" in (run / "report.md").read_text()
     mended = call("run", "study.yaml", "--out", run)
     assert mended.exit_code == 0, mended.stderr
     assert f"{CELLS - 1} already done" in mended.stderr
     assert without_timings(run) == undisturbed
+
+
+def test_the_report_of_an_unfinished_run_says_how_much_is_missing(finished, folder):
+    run = folder / "unfinished"
+    shutil.copytree(finished, run)
+    assert call("report", run).stderr == ""
+    for cell in [p for p in (run / "cells").rglob("*.json") if '"depth"' in p.read_text()][:1]:
+        cell.unlink()
+    done = call("report", run)
+    assert done.exit_code == 0
+    assert f"1 of {CELLS} cells are missing, as the run is unfinished" in done.stderr
 
 
 def test_a_damaged_picture_is_refused_by_name_and_made_anew(finished, folder):

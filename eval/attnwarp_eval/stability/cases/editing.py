@@ -37,7 +37,9 @@ def _layer(way: Way, mask: torch.Tensor | None = None) -> FeatureWarp:
 def _view(source: Camera, target: Camera, depth: np.ndarray, way: Way) -> WarpedView:
     """A warp by positions alone."""
     surface = Surface(torch.from_numpy(depth))
-    return warp_surfaces(source, target, surface, None, BOUNDS_ONLY, backend=engine_of(way))
+    return warp_surfaces(
+        source, target, surface, None, BOUNDS_ONLY, backend=engine_of(way), warn_empty=False
+    )
 
 
 def _tokens(way: Way, magnitude: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:

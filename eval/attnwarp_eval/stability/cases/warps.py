@@ -78,7 +78,9 @@ def positions(pair: Pair, way: Way) -> Correspondence:
     depth = torch.from_numpy(pair.depth.astype(way.numpy))
     if way.backend == "reference":
         return correspond(pair.source, pair.target, depth)
-    view = warp_surfaces(pair.source, pair.target, Surface(depth), None, BOUNDS_ONLY)
+    view = warp_surfaces(
+        pair.source, pair.target, Surface(depth), None, BOUNDS_ONLY, warn_empty=False
+    )
     return view.correspondence
 
 
@@ -361,7 +363,9 @@ def _scaled_rules(exponent: float, way: Way) -> float:
     """Pixels whose label by any rule is not the exact one."""
     (source, seen), (target, surface) = _rules_of_scale(exponent, way)
     backend = engine_of(way)
-    view = warp_surfaces(source, target, surface, seen, SCALED_RULES, backend=backend)
+    view = warp_surfaces(
+        source, target, surface, seen, SCALED_RULES, backend=backend, warn_empty=False
+    )
     exact_rules = _labels_of_rules(way.precision)
     # Nothing has an alpha here, so every pixel is opaque.
     wrong = int((~view.rules["opaque"]).sum())
@@ -395,7 +399,7 @@ def _resized(
     if way.backend == "reference":
         return resize_depth(stored, size, spread=spread).numpy()
     chosen = WarpSettings.from_dict({**BOUNDS_ONLY.to_dict(), "depth_spread": spread})
-    view = warp_surfaces(camera, camera, Surface(stored), None, chosen)
+    view = warp_surfaces(camera, camera, Surface(stored), None, chosen, warn_empty=False)
     return view.at(size, source_size=size).correspondence.target_depth.numpy()
 
 

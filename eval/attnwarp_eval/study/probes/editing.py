@@ -852,7 +852,7 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
             if spec["geometry"] == "truth":
                 view = warp_truth(world, pair, settings)
             else:
-                view = warp_view(model, pair.source, pair.target, settings)
+                view = warp_view(model, pair.source, pair.target, settings, warn_empty=False)
             if spec["mask"] == "truth":
                 visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
                 view = replace(view, mask=visible & view.correspondence.defined, _at={})

@@ -13,7 +13,8 @@ from typing import Any
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import Interval, interval
+from attnwarp_eval.metrics.multiview import BELOW_FLOOR
+from attnwarp_eval.statistics.intervals import Interval, common, interval
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import timed_in_turn
 from attnwarp_eval.study.record import PictureFile
@@ -64,8 +65,9 @@ def abilities(results: Results, probe: str) -> Section:
     section.text = [
         (
             "An edit counts as done where the picture, inside the edited object, is nearer to a"
-            " right answer than to the unedited picture, and than the unedited picture is. PSNR is"
-            " inside the object, dB; in brackets that of the unedited picture."
+            " right answer than to the unedited picture, and than the unedited picture is. So its"
+            " PSNR to that answer, in dB inside the object, must exceed both numbers in brackets:"
+            " that of the unedited picture to the answer, and its own to the unedited picture."
             " **Agreement between views is judged only where the source's edit is done**; the"
             " others have undefined figures. The edits of the control stand here by name; a"
             " comparison counts those of each method."
@@ -142,7 +144,8 @@ def is_alone(spec: Mapping[str, Any]) -> bool:
 
 
 def _against(judgement: Any) -> str:
-    return f"{number(judgement.psnr)} ({number(judgement.unedited)})"
+    limits = f"{number(judgement.unedited)}, {number(judgement.unchanged)}"
+    return f"{number(judgement.psnr)} ({limits})"
 
 
 def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -> Section:
@@ -193,6 +196,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
             "Means over the scenes whose source edit was done, with 95 % intervals over scenes from"
             f" {FEWEST} scenes on."
         ),
+        BELOW_FLOOR,
     ]
     for name in measured:
         scenes = dict.fromkeys(scene for scene, _, _ in results.records(probe, name))
@@ -215,7 +219,18 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
             rows.append([name, *(number(value) for value in means), spread(interval(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
-    text = ["A dash: the editor did none of the scene's edits in its source view, or one answer."]
+    text = [
+        (
+            "A dash: no view has the figure. Agreement needs a source edit that is done, a view"
+            " that was edited, and a surface of the object in both views. The share of views with"
+            " the source's answer needs an edit with several answers besides."
+        ),
+        BELOW_FLOOR,
+        (
+            "A part of the control's disagreement is over the views that both have. A control at or"
+            " below its floor has no parts, and the cell says so."
+        ),
+    ]
     return Section("Edited views by scene", text, tables)
 
 
@@ -230,20 +245,34 @@ def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
         base = control.get(results.records(probe, name)[0][2].spec["editor"]["sha256"], "")
         if base in ("", name):
             continue
-        own, other = (results.views(probe, each, DISAGREEMENT) for each in (name, base))
-        ratios = [
-            _ratio(own.get(scene, {}), other.get(scene, {})) for scene in results.study.scenes
-        ]
-        rows.append([name, base, *(number(ratio) for ratio in ratios)])
+        shared = common([results.views(probe, each, DISAGREEMENT) for each in (name, base)])
+        parts = [_part(results, probe, (name, base), shared, s) for s in results.study.scenes]
+        rows.append([name, base, *parts])
     title = "Disagreement with the source above its floor, as a part of the control's"
     return Table(["variant", "control", *results.study.scenes], rows, title)
 
 
-def _ratio(own: Mapping[str, float], other: Mapping[str, float]) -> float:
-    """Of the sums over the views that both have."""
-    shared = [v for v in own if v in other and math.isfinite(own[v]) and math.isfinite(other[v])]
-    below = sum(other[view] for view in shared)
-    return sum(own[view] for view in shared) / below if below > 0 else math.nan
+def _part(
+    results: Results,
+    probe: str,
+    names: tuple[str, str],
+    shared: Sequence[Mapping[str, Mapping[str, float]]],
+    scene: str,
+) -> str:
+    """The ratio of a variant's sum over the shared views to its control's, or why there is none.
+
+    Args:
+        names: of the variant and its control.
+        shared: what both have in the views that they share, by scene.
+    """
+    if scene in shared[0]:
+        own, control = (sum(table[scene].values()) for table in shared)
+        return number(own / control) if control > 0 else "below the floor"
+    for name, whose in zip(names, ("", "control's "), strict=True):
+        records = [record for where, _, record in results.records(probe, name) if where == scene]
+        if not any(record.extra.source.done for record in records):
+            return f"{whose}source edit not done"
+    return "no view in common"
 
 
 def side_by_side(results: Results, probe: str) -> Section | None:
@@ -309,23 +338,33 @@ def parts_of_time(results: Results, probe: str) -> Section:
         own = _seconds(results, probe, name)
         shared = [cell for cell in own if cell in base and _editing(base[cell]) > 0]
         ratios = [_editing(own[cell]) / _editing(base[cell]) for cell in shared]
-        counts = [record.cost.counters.get("network_rows", 0) for _, _, record in records]
-        means = [_mean(row[part] for row in own.values()) for part in PARTS]
-        whole = _mean(sum(row.values()) for row in own.values())
+        means = [
+            _over_scenes((scene, row[part]) for (scene, *_), row in own.items()) for part in PARTS
+        ]
+        whole = _over_scenes((scene, sum(row.values())) for (scene, *_), row in own.items())
+        counts = _over_scenes(
+            (scene, record.cost.counters.get("network_rows", 0)) for scene, _, record in records
+        )
         rows.append(
             [
                 name,
                 *(number(value) for value in means),
                 number(whole),
                 number(statistics.median(ratios) if ratios else None),
-                number(_mean(counts)),
+                number(counts),
             ]
         )
+    better = (
+        "Where it differs from the table of seconds taken in turn, believe that one."
+        if timed_in_turn(results, WHOLE) is not None
+        else "This run has no seconds taken in turn, which would be the ones to believe."
+    )
     text = [
         (
-            "Seconds of one edited scene, each cell at another time: for orientation. The ratio is"
-            " the median over scenes, edits and seeds of source, warps and edited views together"
-            f" against {control!r}, tuning apart."
+            "Own seconds of the cells, as means over scenes: they show how the time of an edit"
+            " divides. Each cell ran at another time, beside whatever else the machine did."
+            f" {better} The ratio is the median over scenes, edits and seeds of source, warps and"
+            f" edited views together against {control!r}, tuning apart."
         ),
     ]
     timed = tuple(columns[1:-1])
@@ -339,15 +378,13 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     measured = [name for name in names if results.records(probe, name)]
     timed = timed_in_turn(results, WHOLE)
     if timed is None:
-        seconds = {
-            name: _mean(sum(row.values()) for row in _seconds(results, probe, name).values())
-            for name in measured
-        }
-        origin = "Seconds are means over cells, each at another time: for orientation."
+        seconds = {name: _mean(results.seconds(probe, name, WHOLE).values()) for name in measured}
+        origin = "Seconds are those of the fronts: of one pass, for orientation."
     else:
         seconds = {name: timed.seconds(name).mean for name in measured if name in timed.names}
         origin = (
-            f"Seconds were taken in turn in one process: {', '.join(t.of for t in timed.turns)}."
+            "Seconds are those of the fronts, taken in turn in one process:"
+            f" {', '.join(t.of for t in timed.turns)}."
         )
         if rest := [name for name in measured if name not in seconds]:
             origin += f" Not timed in turn, so left out: {', '.join(rest)}."
@@ -362,15 +399,14 @@ def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence
     ]
     columns = ["seconds at most", "variant", "where chosen", "elsewhere", "best elsewhere"]
     for metric in metrics:
+        shared = results.shared(probe, list(seconds), metric)
+        section.text += shared.text(metric)
         rows, last = [], ""
         for limit in sorted(seconds.values()):
             scores = {
-                name: (
-                    _on(results, probe, name, metric, chosen_on),
-                    _on(results, probe, name, metric, checked_on),
-                )
+                name: (shared.mean(name, chosen_on).mean, shared.mean(name, checked_on).mean)
                 for name, taken in seconds.items()
-                if taken <= limit
+                if taken <= limit and name not in shared.apart
             }
             defined = {name: pair for name, pair in scores.items() if math.isfinite(pair[0])}
             best = min(defined, key=lambda name: defined[name][0], default="")
@@ -400,36 +436,40 @@ def budgets(results: Results, probe: str) -> Section | None:
     ]
     rows, cut, untuned = [], [], []
     for name in results.study.variants:
-        records = [record for _, _, record in results.records(probe, name) if record.extra.budget]
-        if not records:
+        cells = [
+            (scene, record)
+            for scene, _, record in results.records(probe, name)
+            if record.extra.budget
+        ]
+        if not cells:
             continue
+        records = [record for _, record in cells]
         spent = [record.extra.budget for record in records]
         ended = [value.cut for value in spent if value.cut is not None]
         if ended:
             by = " and ".join(sorted({limit.replace("_", " ") for limit in ended}))
             cut.append(f"{name} ({len(ended)} of {len(spent)}, by {by})")
-        counters = [record.cost.counters for record in records]
-        idle = sum(own["iterations"] == 0 for own in counters)
+        idle = sum(record.cost.counters["iterations"] == 0 for record in records)
         if idle:
             untuned.append(f"{name} ({idle} of {len(spent)})")
         rows.append(
             [
                 name,
-                number(_mean(value.seconds for value in spent if value.seconds is not None)),
+                number(_limit(cells, "seconds")),
                 spent[0].seconds_of or "–",
-                number(_mean(v.network_rows for v in spent if v.network_rows is not None)),
+                number(_limit(cells, "network_rows")),
                 f"{len(ended)} of {len(spent)}",
-                number(_mean(record.cost.seconds["whole"] or 0.0 for record in records)),
-                number(_mean(own["network_rows"] for own in counters)),
-                number(_mean(record.extra.edited for record in records)),
-                number(_mean(own["iterations"] for own in counters)),
+                number(_over_scenes((s, r.cost.seconds["whole"] or 0.0) for s, r in cells)),
+                number(_over_scenes((s, r.cost.counters["network_rows"]) for s, r in cells)),
+                number(_over_scenes((s, r.extra.edited) for s, r in cells)),
+                number(_over_scenes((s, r.cost.counters["iterations"]) for s, r in cells)),
             ]
         )
     if not rows:
         return None
     text = [
         (
-            "Means over scenes, edits and seeds. Nothing begins beyond a budget, so a method may"
+            "Means over scenes. Nothing begins beyond a budget, so a method may"
             " take a little longer. **A budget in seconds makes a result depend on the machine and"
             " on what else runs there; no comparison of two runs reads these figures.**"
         ),
@@ -444,9 +484,10 @@ def budgets(results: Results, probe: str) -> Section | None:
     return Section("Methods with a budget", text, [Table(columns, rows, timed=timed)])
 
 
-def _on(results: Results, probe: str, name: str, metric: str, scenes: Sequence[str]) -> float:
-    table = results.views(probe, name, metric)
-    return interval({s: list(table[s].values()) for s in scenes if s in table}).mean
+def _limit(cells: Sequence[tuple[str, Any]], name: str) -> float:
+    """Mean over scenes of one limit of the cells' budgets, NaN without any."""
+    limits = [(scene, getattr(record.extra.budget, name)) for scene, record in cells]
+    return _over_scenes((scene, limit) for scene, limit in limits if limit is not None)
 
 
 def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], dict[str, float]]:
@@ -457,6 +498,14 @@ def _seconds(results: Results, probe: str, name: str) -> dict[tuple[Any, ...], d
         }
         for scene, seed, record in results.records(probe, name)
     }
+
+
+def _over_scenes(values: Iterable[tuple[str, float]]) -> float:
+    """Mean over scenes of the means over their cells: (scene, value) each."""
+    by_scene: dict[str, list[float]] = {}
+    for scene, value in values:
+        by_scene.setdefault(scene, []).append(value)
+    return interval(by_scene).mean
 
 
 def _editing(seconds: Mapping[str, float]) -> float:

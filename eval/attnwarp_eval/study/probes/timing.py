@@ -91,7 +91,10 @@ class Timing(Probe[Rounds]):
 
         def pair(index: int) -> None:
             model, settings = contestants[index]
-            view = warp_view(model, world.source, target, settings, source_surface=sources[index])
+            surface = sources[index]
+            view = warp_view(
+                model, world.source, target, settings, source_surface=surface, warn_empty=False
+            )
             for layer in spec["feature_sizes"]:
                 view.at((layer, layer))
 

@@ -135,6 +135,7 @@ class Warp(Probe[NoExtra]):
                         settings,
                         source_surface=source_surface,
                         **images,
+                        warn_empty=False,
                     )
                 for layer in spec["feature_sizes"]:
                     view.at((layer, layer))

@@ -7,6 +7,7 @@ import written_runs
 import yaml
 from ball_scene import SCENE
 
+from attnwarp_eval.document.numbers import number
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import StudyError, cells_of, load_study
@@ -117,16 +118,16 @@ BY_CELLS = {"full": 1.0, "alone": 1.0, "fast": 40.0, "slow": 0.1}
 """Seconds of separate cells, which the machine's drift has turned upside down."""
 
 
-def edited(scene, name):
+def edited(scene, name, edit="red", times=1.0):
     done = Judgement("edited", True, 30.0, 10.0, 10.0)
-    extra = EditResult("red", "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
+    extra = EditResult(edit, "paint it red", done, done, {}, {}, 30.0, 2, 0.0)
     data = written_runs.record(
-        [("red/v0", 15.0, {ERROR: ERRORS[name], "fidelity.mse.edit_inside": ERRORS[name]})],
+        [(f"{edit}/v0", 15.0, {ERROR: ERRORS[name], "fidelity.mse.edit_inside": ERRORS[name]})],
         spec={"method": "propagate", "settings": {}, "editor": {"sha256": "a"}},
-        cost={"seconds": {"whole": BY_CELLS[name], "method: edit": BY_CELLS[name]}},
+        cost={"seconds": {part: times * BY_CELLS[name] for part in ("whole", "method: edit")}},
         **extra.to_json(),
     )
-    return written_runs.outcome("editing", scene, [name], data, f"{scene}-{name}")
+    return written_runs.outcome("editing", scene, [name], data, f"{scene}-{name}-{edit}")
 
 
 def in_turn(scene, names):
@@ -153,7 +154,7 @@ def in_turn(scene, names):
     return written_runs.outcome("editing-timing", scene, names, data)
 
 
-def results(timed=()):
+def results(timed=(), more=()):
     scenes = ["bear", "face"]
     study = {
         "name": "mine",
@@ -166,7 +167,7 @@ def results(timed=()):
     }
     cells = [edited(scene, name) for scene in scenes for name in VARIANTS]
     return written_runs.results(
-        study, [*cells, *(in_turn(scene, timed) for scene in scenes if timed)]
+        study, [*cells, *more, *(in_turn(scene, timed) for scene in scenes if timed)]
     )
 
 
@@ -201,6 +202,28 @@ def test_a_variant_is_chosen_by_seconds_taken_in_turn_and_left_out_without_any(t
     assert rows == [["3.20", "alone"], ["4.00", "full"]]
     assert "left out: fast, slow" in text
     assert chosen(results())[0] == [["0.100", "slow"]]
+
+
+def test_one_pass_has_the_same_seconds_in_the_front_the_choice_and_the_table_of_parts(tmp_path):
+    # A scene with two edits does not outvote the other: (s + 3 s) / 2 of bear, s of face.
+    run = results(more=[edited("bear", name, "blue", 3.0) for name in VARIANTS])
+    expected = {name: (2 * BY_CELLS[name] + BY_CELLS[name]) / 2 for name in VARIANTS}
+    sections = {s.title: s for _, s in probe("editing").sections(run, Layout(tmp_path))}
+    (section,) = fronts(run, Layout(tmp_path))
+    assert {row[0]: row[2] for row in section.tables[0].rows} == {
+        name: number(1000 * seconds) for name, seconds in expected.items()
+    }
+    parts = sections["Seconds by part"]
+    whole = parts.tables[0].columns.index("whole")
+    assert {row[0]: row[whole] for row in parts.tables[0].rows} == {
+        name: number(seconds) for name, seconds in expected.items()
+    }
+    row = sections["Which variant for a given time"].tables[0].rows[0]
+    assert row[:2] == [number(expected["slow"]), "slow"]
+    assert "no seconds taken in turn" in parts.text[0]
+    timed = probe("editing").sections(results(VARIANTS), Layout(tmp_path))
+    (parts,) = [s for _, s in timed if s.title == "Seconds by part"]
+    assert "believe that one" in parts.text[0]
 
 
 def test_the_section_of_seconds_holds_medians_spreads_and_ratios(tmp_path):
