@@ -15,7 +15,7 @@ TILE_COLUMNS = 5
 MOST_PIXELS = 4096
 """Longest side that an edit works at; more is a typing error that would take all the memory."""
 
-SEGMENTER = "clip-small"
+SEGMENTER = "clip-parts"
 """What ``--where`` asks if ``--segmenter`` is left out."""
 
 InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
@@ -32,7 +32,7 @@ WhereOption = Annotated[
 SegmenterOption = Annotated[
     str | None,
     typer.Option(
-        help="What --where asks: clip-small if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
+        help="What --where asks: clip-parts if left out, or DINO_FOLDER,SAM_FOLDER (transformers)."
     ),
 ]
 ThreadsOption = Annotated[

@@ -2,7 +2,7 @@
 
 ``GroundedSam`` detects boxes with Grounding DINO and outlines them with SAM, both from local
 folders. ``ClipSegmenter`` needs no download: it rates places of the picture with
-clip-small.
+clip-parts.
 """
 
 from __future__ import annotations
@@ -103,22 +103,22 @@ def load_segmenter(name: str, *, device: str = "cpu") -> Segmenter:
     """A segmenter by name.
 
     Args:
-        name: "clip-small", or "DINO_FOLDER,SAM_FOLDER" of transformers' models.
+        name: "clip-parts", or "DINO_FOLDER,SAM_FOLDER" of transformers' models.
         device: "cpu" or "cuda", for the models in folders.
 
     Raises:
         InputError: no such segmenter, or files that are missing, by name.
 
     Example:
-        >>> type(load_segmenter("clip-small")).__name__
+        >>> type(load_segmenter("clip-parts")).__name__
         'ClipSegmenter'
     """
-    if name == "clip-small":
+    if name == "clip-parts":
         return ClipSegmenter.bundled()
     folders = name.split(",")
     if len(folders) != 2 or not all(folder.strip() for folder in folders):
         raise InputError(
-            f"segmenter {name!r}: unknown, expected clip-small, or DINO_FOLDER,SAM_FOLDER"
+            f"segmenter {name!r}: unknown, expected clip-parts, or DINO_FOLDER,SAM_FOLDER"
         )
     return GroundedSam.from_folders(*(Path(folder.strip()) for folder in folders), device=device)
 
@@ -314,8 +314,8 @@ class ClipSegmenter:
 
     @classmethod
     def bundled(cls) -> ClipSegmenter:
-        """With clip-small."""
-        encoder = load_encoder("clip-small", "clip")
+        """With clip-parts."""
+        encoder = load_encoder("clip-parts", "clip")
         assert isinstance(encoder, PlaceEncoder)
         return cls(encoder)
 

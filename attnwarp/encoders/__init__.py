@@ -43,6 +43,10 @@ __all__ = [
 
 BUNDLED: dict[str, tuple[Kind, str]] = {
     "clip-small": ("clip", "a small text and image encoder trained on random rendered scenes"),
+    "clip-parts": (
+        "clip",
+        "clip-small, taught things with parts, and what each place of a picture shows",
+    ),
     "dino-small": (
         "dino",
         "a small image encoder trained on random rendered scenes, without labels",
@@ -75,7 +79,7 @@ def available() -> dict[str, str]:
 
     Example:
         >>> sorted(available())
-        ['clip-small', 'dino-small', 'perceptual-small']
+        ['clip-small', 'clip-parts', 'dino-small', 'perceptual-small']
     """
     return {name: line for name, (_, line) in BUNDLED.items()}
 
@@ -119,7 +123,7 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
     """Load an encoder by name.
 
     Args:
-        name: a bundled one (``clip-small``, ``dino-small``, ``perceptual-small``), or
+        name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``, ``perceptual-small``), or
             ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
         kind: the expected kind; an encoder of another kind is refused before it is loaded.
         device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.

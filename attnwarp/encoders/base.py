@@ -110,7 +110,7 @@ class PlaceEncoder(Protocol):
     Example:
         >>> import numpy as np
         >>> from attnwarp.encoders import load_encoder
-        >>> encoder = load_encoder("clip-small")
+        >>> encoder = load_encoder("clip-parts")
         >>> isinstance(encoder, PlaceEncoder)
         True
         >>> encoder.shown(np.zeros((64, 96, 3)), ["a red sphere", "the sky"]).shape

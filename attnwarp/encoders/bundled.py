@@ -1,4 +1,4 @@
-"""The three bundled encoders, trained from nothing by eval/training/; their weights lie in
+"""The bundled encoders, trained from nothing by eval/training/; their weights lie in
 weights/.
 """
 
@@ -22,7 +22,7 @@ from attnwarp.encoders.base import (
     checked_pairs,
     checked_texts,
 )
-from attnwarp.encoders.nets import ClipSmall, DinoSmall, PerceptualSmall
+from attnwarp.encoders.nets import ClipParts, ClipSmall, DinoSmall, PerceptualSmall
 from attnwarp.encoders.preprocess import Preprocessing, resize
 from attnwarp.errors import InputError, optional_imports
 
@@ -34,19 +34,20 @@ Array = npt.NDArray[np.float64]
 
 
 def load(name: str, folder: Path = WEIGHTS) -> BundledClip | BundledDino | BundledPerceptual:
-    """A bundled encoder by name: "clip-small", "dino-small" or "perceptual-small".
+    """A bundled encoder by name: "clip-small", "clip-parts", "dino-small" or "perceptual-small".
 
     Args:
         name: of the encoder.
-        folder: holds ``name``.safetensors, and clip-small's tokenizer; the package's own if left
-            out.
+        folder: holds ``name``.safetensors, and for clip-small and clip-parts a tokenizer; the
+            package's own if left out.
 
     Raises:
         InputError: no such encoder, or weights that are missing, of another network, or other
             than those that the model card beside them names.
     """
     kinds: dict[str, Callable[[str, Path], Any]] = {
-        "clip-small": BundledClip, "dino-small": BundledDino, "perceptual-small": BundledPerceptual,
+        "clip-small": BundledClip, "clip-parts": BundledClipParts,
+        "dino-small": BundledDino, "perceptual-small": BundledPerceptual,
     }  # fmt: skip
     if name not in kinds:
         raise InputError(f"encoder {name!r}: not bundled, expected one of {', '.join(kinds)}")
@@ -105,9 +106,10 @@ class _OfSquares:
 
 
 class BundledClip(_OfSquares):
-    """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`, and a
-    :class:`~attnwarp.encoders.base.PlaceEncoder`.
-    """
+    """clip-small: a :class:`~attnwarp.encoders.base.TextImageEncoder`."""
+
+    network: type[ClipSmall] = ClipSmall
+    net: ClipSmall
 
     def __init__(self, name: str, folder: Path) -> None:
         with optional_imports():
@@ -120,7 +122,7 @@ class BundledClip(_OfSquares):
                 " (eval/training/README.md)"
             )
         self.tokenizer = Tokenizer.from_file(str(vocabulary_file))
-        self.net = ClipSmall(self.tokenizer.get_vocab_size())
+        self.net = self.network(self.tokenizer.get_vocab_size())
         weights = folder / f"{name}.safetensors"
         _read(self.net, weights)
         self.preprocess = Preprocessing(
@@ -159,6 +161,13 @@ class BundledClip(_OfSquares):
                 [code.ids for code in self.tokenizer.encode_batch(checked)], dtype=torch.int64
             )
             return self.net.texts(codes).double().numpy()
+
+
+class BundledClipParts(BundledClip):
+    """clip-parts: as clip-small, and a :class:`~attnwarp.encoders.base.PlaceEncoder`."""
+
+    network = ClipParts
+    net: ClipParts
 
     def shown(self, image: Image, texts: Sequence[str]) -> Array:
         """(h, w, T) float64 probabilities, see :class:`~attnwarp.encoders.base.PlaceEncoder`.

@@ -191,7 +191,6 @@ class ClipSmall(nn.Module):
         super().__init__()
         self.vision = Stages((32, 64, 128, 224), (1, 1, 2, 2))
         self.pool = Pool(224, dim)
-        self.patches = Patches((64, 128, 224), dim)
         self.text = TextTower(vocabulary, 128, 3, 4, self.length, dim)
         # exp of it multiplies the cosine, as in the paper, which starts at 1 / 0.07.
         self.scale = nn.Parameter(torch.tensor(2.66))
@@ -203,6 +202,19 @@ class ClipSmall(nn.Module):
     def texts(self, tokens: Tensor) -> Tensor:
         """(N, L) tokens -> (N, dim)."""
         return self.text(tokens)
+
+
+class ClipParts(ClipSmall):
+    """The same, and a vector for each place of 8 x 8 px in the space of texts.
+
+    Args:
+        vocabulary: of the tokenizer.
+        dim: of the shared space.
+    """
+
+    def __init__(self, vocabulary: int, dim: int = 192) -> None:
+        super().__init__(vocabulary, dim)
+        self.patches = Patches((64, 128, 224), dim)
 
     def places(self, x: Tensor) -> Tensor:
         """(N, 3, H, W) in [0, 1], sides multiples of 32 -> (N, dim, H / 8, W / 8)."""

@@ -22,7 +22,7 @@ Threads = Annotated[int, typer.Option(min=1, help="Of training and rendering.")]
 
 DATA, OUT = Path("../runs/encoders/data"), Path("../runs/encoders")
 WEIGHTS = Path(__file__).parents[2] / "attnwarp" / "encoders" / "weights"
-NAMES = ("clip-small", "dino-small", "perceptual-small")
+NAMES = ("clip-small", "clip-parts", "dino-small", "perceptual-small")
 
 
 @app.command()
@@ -39,7 +39,7 @@ def data(folder: Data = DATA, threads: Threads = 2) -> None:
 
 @app.command()
 def train(name: str, data: Data = DATA, out: Out = OUT, threads: Threads = 2) -> None:
-    """Train one encoder: clip-small, dino-small or perceptual-small."""
+    """Train one encoder: clip-small, clip-parts, dino-small or perceptual-small."""
     import torch
 
     torch.set_num_threads(threads)
@@ -95,13 +95,14 @@ def assess(
     sets = training.assess.test_sets(data)
 
     def figures() -> list[dict[str, Any]]:
-        if name == "clip-small":
+        if name.startswith("clip"):
             results = training.assess.clip_figures(encoder, sets)
+        if name == "clip-parts":
             results += part_figures(encoder, part_pictures.load(data, "parts-test"))
             results.append(scene_figure(encoder)[0])
-        elif name == "dino-small":
+        if name == "dino-small":
             results = training.assess.dino_figures(encoder, sets)
-        else:
+        if name == "perceptual-small":
             results = training.assess.perceptual_figures(encoder, sets["test"].images)
         return [f.to_dict() for f in results]
 
@@ -110,7 +111,7 @@ def assess(
     torch.manual_seed(0)
     encoder.net = (
         type(encoder.net)(encoder.tokenizer.get_vocab_size())
-        if name == "clip-small"
+        if name.startswith("clip")
         else type(encoder.net)()
     )
     encoder.net.eval().requires_grad_(False)
@@ -145,7 +146,12 @@ def _recipe(name: str) -> Any:
 
     if name not in NAMES:
         raise typer.BadParameter(f"got {name!r}, expected one of {', '.join(NAMES)}")
-    modules = {"clip-small": "clip_parts", "dino-small": "dino", "perceptual-small": "perceptual"}
+    modules = {
+        "clip-small": "clip",
+        "clip-parts": "clip_parts",
+        "dino-small": "dino",
+        "perceptual-small": "perceptual",
+    }
     return importlib.import_module(f"training.{modules[name]}")
 
 
@@ -193,13 +199,15 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
     }  # fmt: skip
     checkpoints = [
         out / f"{name}.pt",
-        *([out / f"{name}-{stage}.pt" for stage in ("naming", "contrast") if name == "clip-small"]),
+        *([out / "clip-small-naming.pt"] if name.startswith("clip") else []),
+        *([out / "clip-small.pt"] if name == "clip-parts" else []),
     ]
     facts["minutes"] = minutes(*checkpoints)
-    if name == "clip-small":
+    if name.startswith("clip"):
         facts |= {"vision": millions(net.vision) + millions(net.pool), "text": millions(net.text)}
         facts["pictures"] += f", {SPLITS['train-rendered'].worlds} by Mitsuba"
         facts["warm_epochs"] = importlib.import_module("training.naming").EPOCHS
+    if name == "clip-parts":
         split = part_pictures.PART_SPLITS["parts-train"]
         count = split.worlds * part_pictures.VIEWS * part_pictures.LOOKS
         facts["more"] = f", {count} of things with parts (`training/assemblies.py`)"

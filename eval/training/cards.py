@@ -14,26 +14,36 @@ from attnwarp.encoders._weights import sha256_of
 ABOUT = {
     "clip-small": """Pictures and English sentences in one space of {dim} dimensions: a convolutional tower of {vision:.1f} million
 parameters for pictures of 112 x 112 px, of which each is embedded as the mean with its mirror image, a transformer of {text:.1f} million for
-text, byte-pair tokens. Beside it a vector for each place of 8 x 8 px, from which follows which words are true of the place.
+text, byte-pair tokens.
 
-**Good for**: scores of renders and edits of scenes like those in `scenes/`: a thing on a ground, its parts, their colour, material or pattern,
-the ground, the time of day; whether an edit went in the direction of the words; comparisons between methods on the same views;
-masks by words (docs/masks-by-words.md).
+**Good for**: scores of renders and edits of scenes like those in `scenes/`: one thing on a ground, its colour, its material or pattern,
+the ground, the time of day; whether an edit went in the direction of the words; comparisons between methods on the same views.
 
 **Not good for**: photographs of the world, people's identity, style ("as Van Gogh would paint it"), counting, left and right, anything
-outside its words. It knows {objects} things, {part_words} parts of {kinds} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`training/worlds.py`,
-`training/assemblies.py`). A word that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
+outside its words. It knows {objects} things, {colors} colours, {finishes} surfaces, {grounds} grounds and {times} times of day (`training/worlds.py`). A word
+that it does not know is read in pieces and mostly passed over: "a robot dinosaur" is a dinosaur to it. Its figures do not
 compare with those of OpenAI's CLIP, whose name stands beside a figure when it was used (`--clip clip:FOLDER`).
 On edits whose truth is known similarity to the prompt prefers blurred results and is blind to small shifts; docs/metrics.md
 and reports/metrics have the figures.
 
-**Recipe**: `training/naming.py`, `training/clip.py`, then `training/clip_parts.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image
+**Recipe**: `training/naming.py`, then `training/clip.py`. First {warm_epochs} epochs in which linear heads name each attribute from the image
 tower's features; three in ten pictures have their colours scrambled, and of these the thing alone is asked. Then contrast over batches of 128 pictures and 256
 sentences, half of which have one attribute wrong; looks of one world, which differ in little, lie in one batch; sentences that happen to be
 true of another picture are no negatives. Beside it contrast with the words for one attribute at a time, and the heads, which are left behind.
-Rare words and invented ones are scattered into captions so that unknown words do little harm. Last, things with parts: sentences about
-parts, which surface a part has, and for each place which of all words are true of it, by the focal loss. Exact pixels of each part are known.
-A share of the pictures of things of one piece is shown too, so that nothing is forgotten.""",
+Rare words and invented ones are scattered into captions so that unknown words do little harm.""",
+    "clip-parts": """clip-small, trained further on things with parts: pictures and English sentences in one space of {dim} dimensions, and
+a vector for each place of 8 x 8 px. From the two follows with which probability words are true of a place.
+
+**Good for**: masks by words (docs/masks-by-words.md); scores of scenes that show things with parts: people in garments, plants in pots, busts,
+tables laid. There it names the thing and tells edits of parts apart more often than clip-small.
+
+**Not good for**: what clip-small is not good for; and things of one piece, which it names less often than clip-small (the card of that one has
+the same questions). It knows clip-small's words and {part_words} parts of {kinds} things (`training/assemblies.py`). Scenes with much more detail than
+its worlds are outside of what it learned: reports/editor/segments.md has the overlap of its masks there.
+
+**Recipe**: `training/clip_parts.py`, on clip-small's weights as they are published, in half precision. Sentences about parts by contrast, half of
+them with one thing wrong; which surface a part has; and for each place which of all words are true of it, by the focal loss. Rays know the part
+that every pixel shows. A share of the pictures of things of one piece is shown too, so that little is forgotten.""",
     "dino-small": """A class token and 8 x 8 patch tokens of {dim} dimensions from pictures of 128 x 128 px: convolutions to a sixteenth of the
 size, then three transformer blocks; {size:.1f} million parameters.
 

@@ -1,4 +1,4 @@
-"""Second stage of clip-small: pictures and sentences in one space, by contrast.
+"""Recipe of clip-small: pictures and sentences in one space, by contrast.
 
 A batch holds all looks of a world, which differ in one attribute, and for every sentence another
 with one wrong attribute. Pairs of a picture and another picture's sentence that is true of it are
@@ -46,7 +46,6 @@ a target. Without them, things in colours new to them were named in 88.8 % (95.7
 VISION = 0.4
 """Share of the learning rate for the image tower, which has learned much already."""
 VOCABULARY = 1024
-CHECKPOINT = "clip-small-contrast.pt"
 
 Ints = npt.NDArray[np.int64]
 
@@ -229,7 +228,7 @@ def naming_loss(
 
 
 def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
-    """Train clip-small's second stage; the checkpoint's path."""
+    """Train clip-small; the checkpoint's path."""
     out.mkdir(parents=True, exist_ok=True)
     sets = pictures_of(data)
     warm = warm_start(sets, out)
@@ -304,7 +303,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
             sums += [float(part.detach()) for part in (apart, named, guessed)]
         return dict(zip(("contrast", "names", "heads"), sums / each, strict=True))
 
-    checkpoint = out / CHECKPOINT
+    checkpoint = out / "clip-small.pt"
     # The checkpoint depends on the first stage's settings too.
     recipe = settings(globals()) | {"naming": naming.recipe()}
     Run(checkpoint, {"model": model, "heads": heads, "optimizer": optimizer}, epochs, recipe).train(

@@ -1,4 +1,4 @@
-"""Third stage of clip-small: things with parts, and what each place of a picture shows.
+"""Recipe of clip-parts: clip-small, taught things with parts and what each place of a picture shows.
 
 Pictures and sentences by contrast, as in :mod:`training.clip`, now with sentences about parts. Beside it each place
 of a picture has to say which of many words are true of it, which makes masks by words. All in float32: in bfloat16
@@ -18,7 +18,7 @@ import torch
 from tokenizers import Tokenizer
 from torch.nn import functional
 
-from attnwarp.encoders.nets import ClipSmall
+from attnwarp.encoders.nets import ClipParts
 from training import clip, part_captions, part_pictures
 from training.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
 from training.clip import contrast, naming_loss, tokens
@@ -45,7 +45,7 @@ STEPS = 50
 UNITS = 10
 """Views of worlds in a batch, each in all its looks."""
 SINGLE = 48
-"""Pictures of things of one piece in a batch, so that nothing is forgotten."""
+"""Pictures of things of one piece in a batch, so that little is forgotten."""
 CROP = 112
 SCALE = (0.42, 1.0)
 SINGLE_SCALE = (0.6, 0.95)
@@ -203,7 +203,7 @@ def surface_number(surfaces: Ints) -> Ints:
 
 
 def part_losses(
-    model: ClipSmall, pooled: Tensor, dense: Tensor, ids: npt.NDArray[np.uint8], surfaces: Ints, tokenizer: Tokenizer,
+    model: ClipParts, pooled: Tensor, dense: Tensor, ids: npt.NDArray[np.uint8], surfaces: Ints, tokenizer: Tokenizer,
     rng: np.random.Generator,
 ) -> Tensor:  # fmt: skip
     """Which surface a part has, among all colours and materials: asked of the picture and of the part's places.
@@ -253,7 +253,7 @@ def part_losses(
 
 
 def whole_losses(
-    model: ClipSmall,
+    model: ClipParts,
     pooled: Tensor,
     kind: Ints,
     ground: Ints,
@@ -278,7 +278,7 @@ def whole_losses(
     return total / len(columns)
 
 
-def _texts(model: ClipSmall, tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
+def _texts(model: ClipParts, tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
     """(N, D) unit embeddings."""
     return functional.normalize(model.texts(tokens(tokenizer, list(texts))), dim=-1)
 
@@ -297,14 +297,15 @@ def recipe() -> dict[str, Any]:
 
 
 def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
-    """Train clip-small's third stage on the checkpoint of the second; the checkpoint's path."""
+    """Train clip-parts on the checkpoint of clip-small; the checkpoint's path."""
     before = clip.train(data, out)
     tokenizer = Tokenizer.from_file(str(out / "clip-small.tokenizer.json"))
     pictures = part_pictures.load(data, "parts-train")
     singles = [load_pictures(data, name, worlds=n) for name, n in OLD_WORLDS.items()]
     torch.manual_seed(SEED)
-    model = channels_last(ClipSmall(tokenizer.get_vocab_size()))
-    model.load_state_dict(torch.load(before, weights_only=True)["model"])
+    model = channels_last(ClipParts(tokenizer.get_vocab_size()))
+    model.load_state_dict(model.state_dict() | torch.load(before, weights_only=True)["model"])
+    tokenizer.save(str(out / "clip-parts.tokenizer.json"))
     towers = [*groups(model.vision, 0.05), *groups(model.pool, 0.05), *groups(model.text, 0.05)]
     optimizer = torch.optim.AdamW(
         [*towers, *groups(model.patches, 0.05), {"params": [model.scale], "weight_decay": 0.0}],
@@ -336,7 +337,7 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
         names = ("contrast", "single", "whole", "parts", "places")
         return dict(zip(names, sums / STEPS, strict=True))
 
-    checkpoint = out / "clip-small.pt"
+    checkpoint = out / "clip-parts.pt"
     Run(checkpoint, {"model": model, "optimizer": optimizer}, epochs, recipe(), steps=STEPS).train(
         epoch
     )
@@ -350,7 +351,7 @@ def learning_rate(step: int, total: int, peak: float) -> float:
 
 
 def batch_losses(
-    model: ClipSmall, pictures: PartPictures, rows: Ints, singles: Sequence[Any], chosen: Sequence[tuple[int, int]],
+    model: ClipParts, pictures: PartPictures, rows: Ints, singles: Sequence[Any], chosen: Sequence[tuple[int, int]],
     tokenizer: Tokenizer, rng: np.random.Generator,
 ) -> list[Tensor]:  # fmt: skip
     """Contrast, the same and names for things of one piece, names of wholes, surfaces of parts, places."""

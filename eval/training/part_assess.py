@@ -1,4 +1,4 @@
-"""Figures of clip-small about parts: surfaces by name, edits by direction, on held-out worlds and the package's own scenes."""
+"""Figures of an encoder about parts: surfaces by name, edits by direction, on held-out worlds and the package's own scenes."""
 
 from __future__ import annotations
 

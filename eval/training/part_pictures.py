@@ -1,4 +1,4 @@
-"""Pictures of things with parts in many looks, with what each pixel shows: what clip-small learns parts from.
+"""Pictures of things with parts in many looks, with what each pixel shows: what clip-parts learns from.
 
 Every part has a surface of its own, drawn anew for each look. The looks of a world differ in one part, in all, in
 the ground or in the light.

@@ -148,8 +148,8 @@ def report(
     """In Markdown."""
     lines = [
         "# Masks by words: overlap with exact masks", "",
-        "`ClipSegmenter` with clip-small. Made by `python -m training.segment_assess`, from the folder eval/.",
-        "Its constants were chosen on training worlds that are not among those below, nor among those that clip-small learned from.",
+        "`ClipSegmenter` with clip-parts. Made by `python -m training.segment_assess`, from the folder eval/.",
+        "Its constants were chosen on training worlds that are not among those below, nor among those that clip-parts learned from.",
         "Brackets hold 95 % intervals, bootstrapped over worlds.",
     ]  # fmt: skip
     for title, rows in figures.items():
@@ -179,7 +179,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Markdown file.")] = REPORT,
     worlds: Annotated[int, typer.Option(min=2, help="First worlds of the test split.")] = 20,
 ) -> None:
-    """Assess clip-small's masks on held-out worlds and on scenes."""
+    """Assess clip-parts' masks on held-out worlds and on scenes."""
     segmenter = ClipSegmenter.bundled()
     asked = {
         "Held-out things of one piece": pictures(load_pairs(data, "edit-test", count=worlds)),

@@ -1,4 +1,4 @@
-"""The third stage of clip-small. Oracles: loops over places, float64 formulas, a run that was not stopped."""
+"""The recipe of clip-parts. Oracles: loops over places, float64 formulas, a run that was not stopped."""
 
 import numpy as np
 import pytest
@@ -121,7 +121,7 @@ def drawn(worlds):
 
 @pytest.fixture
 def small(monkeypatch, tmp_path):
-    """The recipe on a few pictures of noise; the second stage is an untrained network."""
+    """The recipe on a few pictures of noise; clip-small is an untrained network."""
     rng = np.random.default_rng(4)
     zeros = np.zeros(12, np.int64)
     attributes = np.stack(
@@ -142,16 +142,16 @@ def small(monkeypatch, tmp_path):
     }.items():
         monkeypatch.setattr(clip_parts, name, value)
 
-    def second_stage(_, out):
+    def clip_small(_, out):
         tokenizer = clip.make_tokenizer(300)
         tokenizer.save(str(out / "clip-small.tokenizer.json"))
         torch.manual_seed(0)
         torch.save(
-            {"model": ClipSmall(tokenizer.get_vocab_size()).state_dict()}, out / clip.CHECKPOINT
+            {"model": ClipSmall(tokenizer.get_vocab_size()).state_dict()}, out / "clip-small.pt"
         )
-        return out / clip.CHECKPOINT
+        return out / "clip-small.pt"
 
-    monkeypatch.setattr(clip, "train", second_stage)
+    monkeypatch.setattr(clip, "train", clip_small)
     return tmp_path
 
 
@@ -172,13 +172,15 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(small, m
     monkeypatch.setattr(clip_parts, "learning_rate", original)
     clip_parts.train(small, small / "halves", epochs=2)
     one, other = (
-        torch.load(small / n / "clip-small.pt", weights_only=True)["model"]
+        torch.load(small / n / "clip-parts.pt", weights_only=True)["model"]
         for n in ("whole", "halves")
     )
     assert all(torch.equal(value, other[key]) for key, value in one.items())
-    start = torch.load(small / "whole" / clip.CHECKPOINT, weights_only=True)["model"]
+    start = torch.load(small / "whole" / "clip-small.pt", weights_only=True)["model"]
     changed = {
-        key.split(".")[0] for key, value in one.items() if not torch.equal(value, start[key])
+        key.split(".")[0]
+        for key, value in one.items()
+        if key not in start or not torch.equal(value, start[key])
     }
     assert changed >= {"vision", "pool", "text", "patches", "scale"}
     assert all(torch.isfinite(value.float()).all() for value in one.values())

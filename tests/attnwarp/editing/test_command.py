@@ -131,7 +131,7 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
         ({"picture": "text.png"}, "text.png: cannot be read as a picture"),
         ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
         ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
-        ({"more": ("--segmenter", "clip-small")}, "--segmenter: needs --where, the words that it"),
+        ({"more": ("--segmenter", "clip-parts")}, "--segmenter: needs --where, the words that it"),
         ({"picture": "."}, "is a folder, expected a PNG or JPEG picture"),
         ({"out": "photo.png"}, "photo.png: is the picture to edit; choose another name"),
         ({"instruction": " "}, "instruction: is empty, expected words such as 'make it red'"),

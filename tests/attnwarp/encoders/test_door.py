@@ -46,13 +46,19 @@ def test_a_name_that_is_like_none_gets_the_list():
 
 def test_another_kind_than_asked_for_is_refused_before_anything_is_loaded():
     with pytest.raises(
-        InputError, match="is of kind 'dino', expected 'clip'; name one of clip-small, clip:FOLDER"
+        InputError,
+        match="is of kind 'dino', expected 'clip'; name one of clip-small, clip-parts, clip:FOLDER",
     ):
         encoders.load_encoder("dinov2:/nowhere", "clip")
 
 
 def test_bundled_ones_are_described():
-    assert list(encoders.available()) == ["clip-small", "dino-small", "perceptual-small"]
+    assert list(encoders.available()) == [
+        "clip-small",
+        "clip-parts",
+        "dino-small",
+        "perceptual-small",
+    ]
     assert all(encoders.available().values())
 
 

@@ -219,7 +219,7 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
         (("--masks", "data/images"), "v0.png is coloured, expected a grey picture"),
         (("--where", " "), "--where: got ' ', expected words such as 'bear'"),
         (("--where", "bear", "--segmenter", "dino"), "segmenter 'dino': unknown, expected"),
-        (("--segmenter", "clip-small"), "--segmenter: needs --where, the words that it looks for"),
+        (("--segmenter", "clip-parts"), "--segmenter: needs --where, the words that it looks for"),
         (("--masks", "black"), "--masks: every mask in black is black, so nothing may change"),
         (("--source-picture", "no.png"), "no.png: no such file"),
         (
