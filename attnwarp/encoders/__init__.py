@@ -78,7 +78,7 @@ def available() -> dict[str, str]:
     """The bundled encoders: name -> description.
 
     Example:
-        >>> sorted(available())
+        >>> list(available())
         ['clip-small', 'clip-parts', 'dino-small', 'perceptual-small']
     """
     return {name: line for name, (_, line) in BUNDLED.items()}
@@ -123,8 +123,8 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
     """Load an encoder by name.
 
     Args:
-        name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``, ``perceptual-small``), or
-            ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
+        name: a bundled one (``clip-small``, ``clip-parts``, ``dino-small``,
+            ``perceptual-small``), or ``clip:FOLDER``, ``dinov2:FOLDER``, ``lpips:FILE_OR_FOLDER``.
         kind: the expected kind; an encoder of another kind is refused before it is loaded.
         device: "cpu" or "cuda", for real ones; the bundled ones are small and stay on the CPU.
 
