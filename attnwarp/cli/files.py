@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 COVERED = 0.002
 """Share of a picture, 8 pixels of 64 x 64, below which splats leave nothing to edit in it."""
 
-
 LOOK_SIZE = 256
 """Longest side in px of the renders that look for splats: a photograph's own takes its seconds."""
 

@@ -411,9 +411,11 @@ def _check_pictures(
     check.shape(second, (target.height, target.width, first.shape[2]), "target_image")
     for name, image in (("source_image", first), ("target_image", second)):
         # A render's colours may exceed 1 here and there, resampling may overshoot either end.
-        if image.min() < -OVERSHOOT or image.mean() > 1 + OVERSHOOT:
+        # Tensors of 8 bits have no mean of their own.
+        values = torch.as_tensor(image).float()
+        if values.min() < -OVERSHOOT or values.mean() > 1 + OVERSHOOT:
             raise ValueError(
-                f"{name}: got values in [{image.min():.3g}, {image.max():.3g}], expected sRGB in"
+                f"{name}: got values in [{values.min():.3g}, {values.max():.3g}], expected sRGB in"
                 " [0, 1]; divide 8 bits by 255"
             )
 

@@ -209,7 +209,7 @@ def _facts(name: str, encoder: Any, out: Path) -> dict[str, Any]:
         facts["warm_epochs"] = importlib.import_module("training.naming").EPOCHS
     if name == "clip-parts":
         split = part_pictures.PART_SPLITS["parts-train"]
-        count = split.worlds * part_pictures.VIEWS * part_pictures.LOOKS
+        count = (split.worlds - recipe.KEPT) * part_pictures.VIEWS * part_pictures.LOOKS
         facts["more"] = f", {count} of things with parts (`training/assemblies.py`)"
         facts["kinds"], facts["part_words"] = len(KINDS), len(part_pictures.PARTS)
     if name == "perceptual-small":

@@ -1,8 +1,8 @@
 """Recipe of clip-parts: clip-small, taught things with parts and what each place of a picture shows.
 
 Pictures and sentences by contrast, as in :mod:`training.clip`, now with sentences about parts. Beside it each place
-of a picture has to say which of many words are true of it, which makes masks by words. All in float32: in bfloat16
-a step took twice as long.
+of a picture has to say which of many words are true of it, which makes masks by words. All but the names of things of one piece is in
+float32: in bfloat16 a step took twice as long.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tokenizers import Tokenizer
 from torch.nn import functional
 
 from attnwarp.encoders.nets import ClipParts
-from training import clip, part_captions, part_pictures
+from training import clip, naming, part_captions, part_pictures
 from training.assemblies import KINDS, PART_NOUNS, WHOLE_NOUNS
 from training.clip import contrast, naming_loss, tokens
 from training.common import Run, channels_last, groups, placed_crops, rate, settings
@@ -293,6 +293,7 @@ def recipe() -> dict[str, Any]:
         "parts": {"protocol": part_pictures.PARTS_PROTOCOL, "looks": part_pictures.LOOKS}
     }
     own["data"] = {**own["data"], **OLD_WORLDS}
+    own["naming"] = naming.recipe()
     return own | {"captions": settings(vars(part_captions)), "contrast": settings(vars(clip))}
 
 
@@ -304,7 +305,10 @@ def train(data: Path, out: Path, *, epochs: int = EPOCHS) -> Path:
     singles = [load_pictures(data, name, worlds=n) for name, n in OLD_WORLDS.items()]
     torch.manual_seed(SEED)
     model = channels_last(ClipParts(tokenizer.get_vocab_size()))
-    model.load_state_dict(model.state_dict() | torch.load(before, weights_only=True)["model"])
+    # As published, in half precision.
+    stored = torch.load(before, weights_only=True)["model"]
+    start = {k: v.half().float() if v.is_floating_point() else v for k, v in stored.items()}
+    model.load_state_dict(model.state_dict() | start)
     tokenizer.save(str(out / "clip-parts.tokenizer.json"))
     towers = [*groups(model.vision, 0.05), *groups(model.pool, 0.05), *groups(model.text, 0.05)]
     optimizer = torch.optim.AdamW(

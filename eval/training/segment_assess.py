@@ -165,7 +165,8 @@ def report(
     for name, words, value, share in scenes:
         result = "no detection" if value is None else f"{value:.2f}"
         lines.append(f"| {name} | {words} | {result} | {share:.2f} |")
-    mean = float(np.mean([value or 0.0 for _, _, value, _ in scenes]))
+    by_scene = {s: [v or 0.0 for n, _, v, _ in scenes if n == s] for s, *_ in scenes}
+    mean = float(np.mean([np.mean(values) for values in by_scene.values()]))
     lines += ["", f"Mean over scenes, no detection counting 0: {mean:.2f}."]
     weak = [title for title, rows in figures.items() if rows[0].value < 0.4]
     weak += ["source views of bundled scenes"] if mean < 0.4 else []

@@ -217,6 +217,8 @@ def together(findings: Sequence[JudgedClaim], editors: Sequence[str]) -> tuple[H
     """
     here, verdicts = {f.here for f in findings}, {f.verdict for f in findings}
     seen: Here = next(iter(here)) if len(here) == 1 else "depends on the editor"
+    if here == {"seen", "seen where defined"}:
+        seen = "seen where defined"
     if len(findings) < len(editors):
         return seen, "can't tell"
     return seen, next(iter(verdicts)) if len(verdicts) == 1 else "depends on the editor"

@@ -21,6 +21,8 @@ from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
+from attnwarp import propagate
+from attnwarp.cli import edit
 from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
@@ -297,6 +299,10 @@ def test_a_folder_of_another_edit_is_one_clear_line(place, tmp_path):
     assert result.exit_code == 2
     assert 'instruction ("a bear", now "a robot")' in result.output
     assert "name another folder" in result.output
+
+
+def test_the_commands_help_names_every_preset():
+    assert set(edit.PRESETS) == set(propagate.PRESETS)
 
 
 def test_a_damaged_view_of_a_cut_off_edit_is_made_again_as_its_message_says(place, tmp_path):

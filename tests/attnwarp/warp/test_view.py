@@ -328,6 +328,10 @@ def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an
             {"target_image": 255 * second},
             r"target_image: got values in \[128, 128\], expected sRGB",
         ),
+        (
+            {"target_image": torch.full((12, 16, 3), 128, dtype=torch.uint8)},
+            r"target_image: got values in \[128, 128\], expected sRGB",
+        ),
         ({"source_image": first - 1}, r"source_image: got values in \[-1, -1\], expected sRGB"),
         ({"target_segment": np.ones((8, 8))}, r"target_segment: got shape \(8, 8\), expected \(12"),
     ):

@@ -232,6 +232,8 @@ def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():
     assert together([holds, holds], claim.editors) == ("seen", "holds")
     assert together([holds, fails], claim.editors) == ("depends on the editor",) * 2
     assert together([holds], claim.editors) == ("seen", "can't tell")
+    partly = dataclasses.replace(holds, here="seen where defined")
+    assert together([holds, partly], claim.editors) == ("seen where defined", "holds")
 
 
 METHODS = {
