@@ -581,6 +581,7 @@ def test_the_encoders_are_listed_and_one_is_described(models):
     listed = call("encoders").stdout
     for name in (
         "clip-small",
+        "clip-parts",
         "dino-small",
         "perceptual-small",
         "clip:FOLDER",
@@ -590,7 +591,7 @@ def test_the_encoders_are_listed_and_one_is_described(models):
         assert name in listed
     assert [row["bundled"] for row in json.loads(call("encoders", "--json").stdout)] == [
         True
-    ] * 3 + [False] * 3
+    ] * 4 + [False] * 3
     about = json.loads(call("encoders", models["clip"], "--json").stdout)
     assert about == load_encoder(models["clip"]).about.to_dict()
     assert "weights_sha256" in call("encoders", models["dino"]).stdout
