@@ -4,7 +4,8 @@ workers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,7 +162,7 @@ def render_world(
             yield image, attributes(world.thing, looks[look]), view, look
 
 
-def _make_shard(path: Path, split: Split, start: int) -> Path:
+def _make_shard(path: Path, start: int, split: Split) -> Path:
     rows = []
     for seed in range(start, min(start + split.shard, split.first + split.worlds)):
         rows += [
@@ -180,29 +181,38 @@ def _make_shard(path: Path, split: Split, start: int) -> Path:
     return path
 
 
-def make(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> list[Path]:
-    """Render the missing files of a split's first ``worlds`` (all if left out); they are returned in order."""
+def render_missing(
+    title: str, files: Mapping[Path, int], render: Callable[[Path, int], object], workers: int
+) -> list[Path]:
+    """Render the files that are not there, each from its number; all of them are returned in order.
+
+    Args:
+        title: what the progress bar says.
+        files: their numbers.
+        render: writes a file; it runs in processes of their own.
+        workers: how many of these.
+    """
     from rich.progress import Progress
 
+    missing = [pair for pair in files.items() if not pair[0].exists()]
+    if missing:
+        with Progress() as bar, ProcessPoolExecutor(workers) as pool:
+            task = bar.add_task(title, total=len(files), completed=len(files) - len(missing))
+            for finished in as_completed([pool.submit(render, *pair) for pair in missing]):
+                finished.result()
+                bar.advance(task)
+    return list(files)
+
+
+def make(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> list[Path]:
+    """Render the missing files of a split's first ``worlds`` (all if left out); they are returned in order."""
     split = SPLITS[name]
     folder.mkdir(parents=True, exist_ok=True)
     count = split.worlds if worlds is None else min(worlds, split.worlds)
     starts = range(split.first, split.first + count, split.shard)
-    files = [folder / f"{name}-v{DATA_PROTOCOL}-{start}.npz" for start in starts]
-    missing = [
-        (path, start) for path, start in zip(files, starts, strict=True) if not path.exists()
-    ]
-    if missing:
-        with Progress() as bar, ProcessPoolExecutor(workers) as pool:
-            task = bar.add_task(
-                f"pictures: {name}", total=len(files), completed=len(files) - len(missing)
-            )
-            for finished in as_completed(
-                [pool.submit(_make_shard, path, split, start) for path, start in missing]
-            ):
-                finished.result()
-                bar.advance(task)
-    return files
+    files = {folder / f"{name}-v{DATA_PROTOCOL}-{start}.npz": start for start in starts}
+    render = functools.partial(_make_shard, split=split)
+    return render_missing(f"pictures: {name}", files, render, workers)
 
 
 def load(folder: Path, name: str, workers: int = 2, *, worlds: int | None = None) -> Pictures:

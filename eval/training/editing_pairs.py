@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from training.assemblies import (
     Assembly,
     draw_assembly,
 )
+from training.data import render_missing
 from training.worlds import (
     COLORS,
     FINISHES,
@@ -246,11 +246,9 @@ def _path(folder: Path, name: str, index: int) -> Path:
     return folder / f"{name}-v{PAIRS_PROTOCOL}-{index:05d}.npz"
 
 
-def _make(folder: Path, name: str, index: int) -> Path:
-    path = _path(folder, name, index)
+def _make(path: Path, index: int, name: str) -> None:
     arrays = render_edit_world(index, PAIR_SPLITS[name])
     write_atomically(path, lambda stream: np.savez(stream, **arrays))
-    return path
 
 
 def make_pairs(
@@ -259,17 +257,8 @@ def make_pairs(
     """Render what is missing of a split's first ``count`` worlds (all if left out); their files, in order."""
     folder.mkdir(parents=True, exist_ok=True)
     worlds = PAIR_SPLITS[name].worlds if count is None else count
-    paths = [_path(folder, name, index) for index in range(worlds)]
-    missing = [index for index, path in enumerate(paths) if not path.exists()]
-    if missing:
-        from rich.progress import Progress
-
-        with Progress() as bar, ProcessPoolExecutor(workers) as pool:
-            task = bar.add_task(f"pictures: {name}", total=len(missing))
-            for done in as_completed([pool.submit(_make, folder, name, k) for k in missing]):
-                done.result()
-                bar.advance(task)
-    return paths
+    files = {_path(folder, name, index): index for index in range(worlds)}
+    return render_missing(f"pictures: {name}", files, functools.partial(_make, name=name), workers)
 
 
 def load_pairs(folder: Path, name: str, *, count: int | None = None, workers: int = 1) -> Worlds:

@@ -6,8 +6,8 @@ the ground or in the light.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from attnwarp.io.file import write_atomically
 from training.assemblies import KINDS, PART_NOUNS, Assembly, draw_assembly
-from training.data import SIZE
+from training.data import SIZE, render_missing
 from training.worlds import OBJECTS, Look, draw_look, held_out
 
 PARTS_PROTOCOL = 1
@@ -210,7 +210,7 @@ def render_part_world(index: int, split: PartSplit) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _make_shard(path: Path, split: PartSplit, start: int) -> Path:
+def _make_shard(path: Path, start: int, split: PartSplit) -> Path:
     rows = [render_part_world(k, split) for k in range(start, start + SHARD)]
     arrays: dict[str, Any] = {key: np.stack([row[key] for row in rows]) for key in rows[0]}
     write_atomically(path, lambda stream: np.savez(stream, **arrays))
@@ -219,24 +219,12 @@ def _make_shard(path: Path, split: PartSplit, start: int) -> Path:
 
 def make(folder: Path, name: str, workers: int = 2) -> list[Path]:
     """Render the missing files of a split; all of them are returned in order."""
-    from rich.progress import Progress
-
     split = PART_SPLITS[name]
     folder.mkdir(parents=True, exist_ok=True)
     starts = range(0, split.worlds, SHARD)
-    files = [folder / f"clip-{name}-v{PARTS_PROTOCOL}-{start:05d}.npz" for start in starts]
-    missing = [pair for pair in zip(files, starts, strict=True) if not pair[0].exists()]
-    if missing:
-        with Progress() as bar, ProcessPoolExecutor(workers) as pool:
-            task = bar.add_task(
-                f"pictures: {name}", total=len(files), completed=len(files) - len(missing)
-            )
-            for finished in as_completed(
-                [pool.submit(_make_shard, path, split, start) for path, start in missing]
-            ):
-                finished.result()
-                bar.advance(task)
-    return files
+    files = {folder / f"clip-{name}-v{PARTS_PROTOCOL}-{start:05d}.npz": start for start in starts}
+    render = functools.partial(_make_shard, split=split)
+    return render_missing(f"pictures: {name}", files, render, workers)
 
 
 def shards(files: list[Path]) -> Iterator[dict[str, npt.NDArray[Any]]]:

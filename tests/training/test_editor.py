@@ -46,7 +46,7 @@ TINY = Stage(64, 4, 1e-3, 2, batch=2)
 def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pairs")
     for index in range(2):
-        editing_pairs._make(folder, "edit-train", index)
+        editing_pairs._make(editing_pairs._path(folder, "edit-train", index), index, "edit-train")
     return folder
 
 

@@ -13,7 +13,7 @@ from training.editor_assess import assess, editor_card, nearest, outside_psnr, u
 def worlds(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pairs")
     for index in (0, 1):
-        editing_pairs._make(folder, "edit-test", index)
+        editing_pairs._make(editing_pairs._path(folder, "edit-test", index), index, "edit-test")
     return load_pairs(folder, "edit-test", count=2)
 
 

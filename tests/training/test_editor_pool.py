@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::UserWarning", "ignore::FutureWa
 def pool(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pairs")
     for index in range(2):
-        editing_pairs._make(folder, "edit-train", index)
+        editing_pairs._make(editing_pairs._path(folder, "edit-train", index), index, "edit-train")
     return PairPool(
         load_pairs(folder, "edit-train", count=2), make_tokenizer(400, worlds=10), sentences=4
     )

@@ -98,13 +98,13 @@ def test_seeds_and_shapes_of_tests_are_not_those_of_any_training():
 
 
 def test_a_split_is_rendered_once_and_read_again(tmp_path, monkeypatch):
-    from training import part_pictures
+    from training import data, part_pictures
 
     rows = {k: render_part_world(3, SPLIT) for k in range(2)}
     monkeypatch.setattr(part_pictures, "SHARD", 2)
     monkeypatch.setitem(PART_SPLITS, "tried", PartSplit(SPLIT.first, 2))
-    monkeypatch.setattr(part_pictures, "ProcessPoolExecutor", _Here)
-    monkeypatch.setattr(part_pictures, "as_completed", list)
+    monkeypatch.setattr(data, "ProcessPoolExecutor", _Here)
+    monkeypatch.setattr(data, "as_completed", list)
     monkeypatch.setattr(part_pictures, "render_part_world", lambda k, _: rows[k])
     loaded = load(tmp_path, "tried")
     assert len(loaded) == 2 * 2 * LOOKS
