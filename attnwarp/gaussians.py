@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -10,6 +11,7 @@ import numpy.typing as npt
 import torch
 
 from attnwarp import check
+from attnwarp.digest import digest
 
 Kind = Literal["2d", "3d"]
 
@@ -173,6 +175,28 @@ class Gaussians:
         count = (degree + 1) ** 2
         missing = self.sh.new_zeros(len(self), max(0, count - self.sh.shape[1]), 3)
         return replace(self, sh=torch.cat([self.sh[:, :count], missing], dim=1))
+
+    def used_sh_degree(self) -> int:
+        """The highest degree of the harmonics with a coefficient that is not 0.
+
+        Example:
+            >>> import torch
+            >>> from attnwarp import Gaussians
+            >>> one = Gaussians(
+            ...     "3d", torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 3),
+            ...     torch.ones(1), torch.zeros(1, 16, 3),
+            ... )
+            >>> one.sh_degree, one.used_sh_degree()
+            (3, 0)
+        """
+        used = torch.nonzero((self.sh != 0).any(dim=2).any(dim=0))
+        return math.isqrt(int(used.max())) if len(used) else 0
+
+    def digest(self) -> str:
+        """SHA-256 of the splats, as hexadecimal digits."""
+        names = ("means", "quats", "scales", "opacities", "sh")
+        arrays = [getattr(self, name).detach().cpu().numpy() for name in names]
+        return digest(self.kind, self.antialiased, self.origin, *arrays)
 
     def detach(self) -> Gaussians:
         """The same values, outside autograd."""

@@ -32,7 +32,7 @@ from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
-from attnwarp.propagate.folder import Folder
+from attnwarp.propagate.folder import Folder, record_of
 from attnwarp.propagate.pictures import Bytes, enlarged, enlarged_change, resized, to_bytes
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
@@ -41,7 +41,6 @@ from attnwarp.propagate.scene import (
     editor_digest,
     near_of,
     render_picture,
-    splats_digest,
 )
 from attnwarp.propagate.tune import TrainingView
 
@@ -195,7 +194,7 @@ class _Run:
                     for part in method.rounds
                 ],
                 "inputs": {
-                    "splats": splats_digest(work.frozen),
+                    "splats": work.frozen.digest(),
                     **work.scene.digest(),
                     "editor": editor_digest(work.editor),
                 },
@@ -228,8 +227,14 @@ class _Run:
         cut = self.cut
         return cut is not None and cut["round"] <= number
 
-    def _cut(self, limit: str, number: int) -> None:
-        self.folder.write_json("cut.json", {"limit": limit, "round": number + 1})
+    def _edited_before_cut(self, number: int, place: int) -> bool:
+        """Whether a group was edited before the cut: it is missing since its files are damaged."""
+        cut = self.cut
+        return cut is not None and (number + 1, place) < (cut["round"], cut["groups"])
+
+    def _cut(self, limit: str, number: int, groups: int) -> None:
+        """End the run in a round, of which so many groups are edited."""
+        self.folder.write_json("cut.json", {"limit": limit, "round": number + 1, "groups": groups})
 
     def _out_of_seconds(self) -> bool:
         limit = self.budget.seconds
@@ -248,12 +253,12 @@ class _Run:
         part = self.method.rounds[number]
         for place, group in enumerate(part.groups):
             rows = self.method.rows(number, group)
-            if not all(self.folder.has(self._about(number, view)) for view in group):
+            if not all([self.folder.edited(self._picture(number, view)) for view in group]):
                 limit = None if self.cut else self._limit(rows)
                 if limit is not None:
-                    self._cut(limit, number)
+                    self._cut(limit, number, place)
                 # A run that was cut while it edited this round edits no further.
-                if self.cut is not None:
+                if self.cut is not None and not self._edited_before_cut(number, place):
                     return
                 self._edit_group(number, place, group)
             else:
@@ -278,14 +283,11 @@ class _Run:
                 self.folder.write_picture(self._picture(number, view), pixels)
                 about = {"view": self.names[view], "round": number + 1, **edit.about}
                 # Last: a view counts as edited once this is there.
-                self.folder.write_json(self._about(number, view), about)
+                self.folder.write_json(record_of(self._picture(number, view)), about)
         self._write_times()
 
     def _picture(self, number: int, view: int) -> str:
         return f"rounds/{number + 1}/{self.names[view]}.png"
-
-    def _about(self, number: int, view: int) -> str:
-        return f"rounds/{number + 1}/{self.names[view]}.json"
 
     def _edited(self, view: int) -> Bytes:
         """The last edit of a view."""
@@ -318,7 +320,7 @@ class _Run:
                 saved=self._write_times,
             )
         if self.fitting.iteration < end:
-            self._cut("seconds", number)
+            self._cut("seconds", number, len(part.groups))
         self._write_times()
 
     def _training(self, view: int) -> TrainingView:

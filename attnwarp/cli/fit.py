@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import read_views, write_image
+from attnwarp.cli.files import check_seen, read_splats, read_views, write_image
 from attnwarp.cli.options import (
     DataArgument,
     Kind,
@@ -22,6 +22,8 @@ from attnwarp.process import asked_to_stop
 
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
+    from attnwarp.gaussians import Gaussians
+    from attnwarp.io import Dataset
 
 
 OWN_OPTIONS = {
@@ -33,7 +35,16 @@ OWN_OPTIONS = {
 def fit(
     data: DataArgument,
     out: Annotated[Path, typer.Option(help="Folder for the result; a fit in it is resumed.")],
-    kind: Annotated[Kind, typer.Option(help="Flat discs or ellipsoids.")] = Kind.two,
+    kind: Annotated[
+        Kind | None,
+        typer.Option(help="Flat discs or ellipsoids (default 2dgs, or that of --start)."),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SPLATS", help="Go on from fitted splats (PLY or .splat) in place of points."
+        ),
+    ] = None,
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Steps, one view each (default 7000).")
     ] = None,
@@ -76,6 +87,8 @@ def fit(
         # What needs nothing heavy is read first: a typing error is answered at once.
         changes = assignments(change or [], OWN_OPTIONS)
         check_out(out)
+        first = None if start is None else _read_start(start, out, kind)
+        kind = kind or (Kind.three if first is not None and first.kind == "3d" else Kind.two)
         _check_third_scale(third_scale, kind)
         use_threads(threads)
         result = _fit(
@@ -83,6 +96,8 @@ def fit(
             reading,
             out,
             kind,
+            start,
+            first,
             iterations,
             max_seconds,
             max_size,
@@ -106,6 +121,14 @@ def fit(
             raise typer.Exit(STOPPED)
 
 
+def _read_start(start: Path, out: Path, kind: Kind | None) -> Gaussians:
+    if start.resolve() == (out / "splats.ply").resolve():
+        raise ValueError(
+            f"--start: the fit would write over {start}; name another folder with --out"
+        )
+    return read_splats(start, kind, None)
+
+
 def _check_third_scale(third_scale: float | None, kind: Kind) -> None:
     if third_scale is None:
         return
@@ -120,6 +143,8 @@ def _fit(
     reading: Reading,
     out: Path,
     kind: Kind,
+    start: Path | None,
+    first: Gaussians | None,
     iterations: int | None,
     max_seconds: float | None,
     max_size: int | None,
@@ -137,6 +162,8 @@ def _fit(
         changes["iterations"] = iterations
     if max_splats is not None:
         changes["max_splats"] = max_splats
+    if first is not None and first.antialiased:
+        changes.setdefault("antialiased", True)
     if every == 1:
         raise ValueError(
             "--hold-out: got 1, which leaves nothing to fit on; expected 0 or at least 2"
@@ -151,26 +178,38 @@ def _fit(
     train, test = attnwarp.fit.hold_out(dataset, every)
     views = attnwarp.fit.load_views(train, max_size=max_size)
     held_out = attnwarp.fit.load_views(test, max_size=max_size) if test is not None else None
-    if dataset.points is not None and len(dataset.points):
-        first, colors = dataset.points, dataset.colors
+    if first is not None and start is not None:
+        check_seen(start, first, train.cameras)
+        first = first.with_sh_degree(settings.sh_degree)
     else:
-        typer.echo(f"{data} has no points: beginning with {points} random ones", err=True)
-        first, colors = attnwarp.fit.random_points(views.cameras, points, seed=seed)
-    start = attnwarp.fit.from_points(
-        first, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed
-    )
+        first = _from_points(data, dataset, views, points, settings)
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
-    if settings.max_splats is not None and len(start) > settings.max_splats:
-        echo(more_points(len(start), settings.max_splats))
+    if settings.max_splats is not None and len(first) > settings.max_splats:
+        echo(more_points(len(first), settings.max_splats))
     with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
         result = attnwarp.fit.fit(
-            start, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
+            first, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
             checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
         )  # fmt: skip
     _write_results(out, result, held_out)
     return result
+
+
+def _from_points(
+    data: Path, dataset: Dataset, views: Views, random: int, settings: FitSettings
+) -> Gaussians:
+    """First splats at the data set's points, or at so many random ones where it has none."""
+    import attnwarp.fit
+
+    points, colors = dataset.points, dataset.colors
+    if points is None or not len(points):
+        typer.echo(f"{data} has no points: beginning with {random} random ones", err=True)
+        points, colors = attnwarp.fit.random_points(views.cameras, random, seed=settings.seed)
+    return attnwarp.fit.from_points(
+        points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=settings.seed
+    )
 
 
 def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:

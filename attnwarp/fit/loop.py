@@ -153,7 +153,8 @@ def fit(
     uninterrupted fit.
 
     Args:
-        start: what to begin with, see :func:`attnwarp.fit.from_points`; of the settings' kind.
+        start: what to begin with: :func:`attnwarp.fit.from_points`, or splats that were fitted
+            before; of the settings' kind. Harmonics that it uses are used from the first iteration.
         views: the pictures to fit on.
         settings: the default ones for ``start.kind`` if left out.
         held_out: pictures to evaluate on, never fitted on.
@@ -171,7 +172,7 @@ def fit(
 
     Raises:
         ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
-            fit of other views or settings, or a number is out of range.
+            fit of other views, settings or first splats, or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
         RuntimeError: the loss is no longer finite, or no splat is left; the message says what to
             try. The last checkpoint stays.
@@ -236,6 +237,7 @@ class _Run:
         self.backend, self.measure = backend, measure
         self.extent = extent_of(views.cameras)
         centers = np.stack([camera.position for camera in views.cameras])
+        self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
         self.density = Density(settings, self.extent, centers.mean(0) - start.origin, len(start))
         self.random = torch.Generator().manual_seed(settings.seed)
@@ -250,6 +252,7 @@ class _Run:
         """Settings and data that a checkpoint must match to be resumed."""
         return {
             "settings": self.settings.to_dict(),
+            "start": self.start,
             "views": self.views.digest,
             "held_out": self.held_out.digest if self.held_out else None,
             "origin": [float(v) for v in self.model.origin],
@@ -274,7 +277,8 @@ class _Run:
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
                 f"folder: {folder} holds a fit of other {name}; go on with the same ones, or name"
-                " another folder, or begin again without its checkpoint.pt (--restart)"
+                " another folder (--start SPLATS.ply goes on from splats there), or begin again"
+                " without its checkpoint.pt (--restart)"
             )
         try:
             self.model.restore(state["model"])
@@ -430,7 +434,8 @@ class _Run:
         )
 
     def render(self, gaussians: Gaussians, camera: Any, background: Tensor) -> Render:
-        degree = min(self.settings.sh_degree, self.iteration // self.settings.sh_every)
+        more = self.iteration // self.settings.sh_every
+        degree = min(self.settings.sh_degree, self.first_degree + more)
         return render(
             gaussians,
             camera,

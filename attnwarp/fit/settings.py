@@ -27,7 +27,8 @@ class FitSettings:
         iterations: optimisation steps, one view each.
         seed: of the order of views, the random background and the splitting of splats.
         sh_degree: of the colour's spherical harmonics, 0 to 3.
-        sh_every: iterations after which one more degree is used, from degree 0.
+        sh_every: iterations after which one more degree is used, from the degree of the first
+            splats (0 for points).
         lr_means, lr_means_final: learning rates of the centres at the beginning and the end,
             exponential in between, times the scene's extent.
         lr_dc, lr_rest, lr_opacity, lr_scales, lr_quats: of the constant and the other harmonics,

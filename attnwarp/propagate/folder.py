@@ -14,8 +14,8 @@ times.json               seconds by part, over all sittings
 
 from __future__ import annotations
 
-import hashlib
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.io.file import FileFormatError, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.names import file_stems
@@ -107,31 +107,43 @@ class Folder:
         """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
         return read_image(self.path / name)
 
+    def edited(self, picture: str) -> bool:
+        """Whether a view is edited: beside its picture stands a record, NAME.json.
+
+        A picture that is missing or damaged all the same leaves no edit. Its record is removed,
+        so that the view is edited again.
+
+        Warns:
+            InputWarning: a record was removed.
+        """
+        record = record_of(picture)
+        if not self.has(record):
+            return False
+        try:
+            self.read_picture(picture)
+        except (FileFormatError, FileNotFoundError):
+            (self.path / record).unlink()
+            warnings.warn(
+                f"{self.path / picture}: missing or damaged; the view is edited again",
+                InputWarning,
+                stacklevel=2,
+            )
+            return False
+        return True
+
     def has(self, name: str) -> bool:
         """Whether a file is there, and so whole."""
         return (self.path / name).is_file()
 
 
-def digest(*parts: Any) -> str:
-    """SHA-256 of arrays, bytes and JSON values, one after another.
+def record_of(picture: str) -> str:
+    """The file that says what an edit was, of the file of its picture.
 
     Example:
-        >>> import numpy as np
-        >>> digest(np.zeros(2), "a") == digest(np.zeros(2), "a")
-        True
-        >>> digest(np.zeros(2)) == digest(np.zeros(2, np.float32))  # the type counts
-        False
+        >>> record_of("views/a.1.png")
+        'views/a.1.json'
     """
-    total = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, np.ndarray):
-            total.update(f"{part.dtype}{part.shape}".encode())
-            total.update(np.ascontiguousarray(part).tobytes())
-        elif isinstance(part, bytes):
-            total.update(part)
-        else:
-            total.update(json.dumps(part, sort_keys=True, default=str).encode())
-    return total.hexdigest()
+    return str(Path(picture).with_suffix(".json").as_posix())
 
 
 def _differences(stored: Any, now: Any, name: str = "") -> list[str]:

@@ -18,14 +18,15 @@ import torch
 
 from attnwarp import check, losses
 from attnwarp.camera import Camera
+from attnwarp.digest import digest
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
-from attnwarp.io import FileFormatError, write_ply
+from attnwarp.io import write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, Target, ViewEditor
-from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, digest
+from attnwarp.propagate.folder import MANIFEST, SEGMENTS_FOLDER, Folder, record_of
 from attnwarp.propagate.pictures import (
     Bytes,
     Image,
@@ -48,7 +49,6 @@ from attnwarp.propagate.scene import (
     editor_digest,
     near_of,
     render_picture,
-    splats_digest,
 )
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
@@ -258,7 +258,7 @@ class _Run:
                 **({"chain": [self.names[view] for view in chain]} if chain else {}),
                 "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],
                 "inputs": {
-                    "splats": splats_digest(gaussians),
+                    "splats": gaussians.digest(),
                     **scene.digest(),
                     "editor": editor_digest(editor),
                     "source_picture": None if by_hand is None else digest(by_hand),
@@ -325,10 +325,9 @@ class _Run:
             return choose_chain(views, source, s.sources, s.chain_coverage, seen)
 
     def _edited_sources(self) -> None:
-        parts = ["source.json", *(f"views/{self.names[view]}.json" for view in self.plan.chain)]
-        finished = sum(self.folder.has(part) for part in parts)
+        finished = sum([self.folder.edited(self._picture(view)) for view in self.plan.sources])
         self.done += finished * self.settings.steps
-        if finished < len(parts):
+        if finished < len(self.plan.sources):
             _ = self.sources
 
     @cached_property
@@ -342,9 +341,10 @@ class _Run:
     def _source(self, view: int, before: list[Source]) -> Source:
         name = self.names[view]
         text = f"editing the source, {name}" if not before else f"editing a further source, {name}"
-        record = "source.json" if not before else f"views/{name}.json"
+        file = self._picture(view)
+        stored = self.folder.has(record_of(file))
         # Edited again for its features, it is no progress.
-        step = 0 if self.folder.has(record) else 1
+        step = 0 if stored else 1
         sight = self._sight(view, self.frozen, len(before)) if before else None
         with self._timed("source"):
             source = self.view_editor.source(
@@ -356,10 +356,9 @@ class _Run:
         if not before and source.recording is not None:
             _, features = self._shown(source.recording)
             self._principal = Principal(features)
-        if self.folder.has(record):
-            file = "source.png" if not before else f"views/{name}.png"
+        if stored:
             pixels = to_bytes(self._composite(view, source.picture))
-            if not np.array_equal(pixels, self._read(file)):
+            if not np.array_equal(pixels, self.folder.read_picture(file)):
                 raise InputError(
                     f"{self.folder.path}: the source's edit is not the one in {file}; go on"
                     " with the same device, number of threads and versions, or name another folder"
@@ -396,7 +395,7 @@ class _Run:
 
     def _edit_stage(self, number: int, stage: tuple[int, ...]) -> None:
         for batch in self._batches(stage):
-            if all(self.folder.has(f"views/{self.names[view]}.json") for view in batch):
+            if all([self.folder.edited(self._picture(view)) for view in batch]):
                 self.done += len(batch) * self.settings.steps
                 continue
             self._edit_batch(number, stage, batch)
@@ -607,22 +606,13 @@ class _Run:
         h, w = self.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)
 
-    def _edited(self, view: int) -> Bytes:
-        source = view == self.plan.source
-        name = "source.png" if source else f"views/{self.names[view]}.png"
-        return self._read(name)
+    def _picture(self, view: int) -> str:
+        """The file of a view's edit."""
+        return "source.png" if view == self.plan.source else f"views/{self.names[view]}.png"
 
-    def _read(self, name: str) -> Bytes:
+    def _edited(self, view: int) -> Bytes:
         """A picture that this edit wrote earlier."""
-        try:
-            return self.folder.read_picture(name)
-        except (FileFormatError, FileNotFoundError):
-            path = self.folder.path / name
-            raise FileFormatError(
-                path,
-                f"missing or damaged; remove {path.with_suffix('.json').name} beside it, and the"
-                " same command edits the view again",
-            ) from None
+        return self.folder.read_picture(self._picture(view))
 
     # --- what is left for people
 

@@ -12,9 +12,9 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.digest import digest
 from attnwarp.fit import FitSettings, extent_of
 from attnwarp.gaussians import Gaussians
-from attnwarp.propagate.folder import digest
 from attnwarp.propagate.pictures import Image, Mask
 from attnwarp.render import render
 
@@ -47,8 +47,8 @@ class Scene:
         """Validate what came from outside.
 
         Raises:
-            ValueError: lists of different lengths, or a picture or segment of another size or type;
-                the message names it.
+            ValueError: lists of different lengths, a picture or segment of another size or type, or
+                segments that are all empty; the message names it.
         """
         if len(images) != len(cameras):
             raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
@@ -73,6 +73,8 @@ class Scene:
             if mask.dtype != np.bool_:
                 raise ValueError(f"{name}: got {mask.dtype}, expected bool")
             masks.append(mask)
+        if not any(mask.any() for mask in masks):
+            raise ValueError("segments: every one is empty, so nothing may change; True is edited")
         return cls(list(cameras), pictures, masks)
 
     def digest(self) -> dict[str, str | None]:
@@ -109,13 +111,6 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
     with torch.no_grad():
         color = render(gaussians, camera, backend=backend, near=near).color
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())
-
-
-def splats_digest(gaussians: Gaussians) -> str:
-    """SHA-256 of splats."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    arrays = [getattr(gaussians, name).detach().cpu().numpy() for name in names]
-    return digest(gaussians.kind, gaussians.antialiased, gaussians.origin, *arrays)
 
 
 def editor_digest(editor: Any) -> str:

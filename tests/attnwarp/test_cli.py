@@ -163,6 +163,41 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
     assert depth.shape == (32, 32) and 2 < np.nanmedian(depth) < 4
 
 
+def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
+    """Oracle: the held-out PSNR at which the first fit ended, through a PLY in float32."""
+
+    def history(name):
+        lines = (tmp_path / name / "history.jsonl").read_text().splitlines()
+        return [json.loads(line)["psnr"] for line in lines]
+
+    once = ("--threads", 1, "--iterations", 30)
+    flat = ("--kind", "2dgs", "--set", "sh_degree=1", "--set", "sh_every=10")
+    assert in_process("fit", data, *once, *flat, "--out", tmp_path / "a").exit_code == 0
+    splats = tmp_path / "a" / "splats.ply"
+    done = in_process("fit", data, *once, "--start", splats, "--out", tmp_path / "b")
+    assert done.exit_code == 0, done.stderr
+    assert history("b")[0] == pytest.approx(history("a")[-1], abs=1e-3)
+    assert history("b")[-1] > history("b")[0]
+    assert read_ply(tmp_path / "b" / "splats.ply").sh_degree == 3
+
+    done = in_process("fit", data, *once, "--start", splats, "--out", tmp_path / "a")
+    assert done.exit_code == 2 and f"--start: the fit would write over {splats}" in done.stderr
+    far = tmp_path / "far.ply"
+    write_ply(far, Gaussians(**{**vars(one_splat()), "means": torch.full((1, 3), 900.0)}))
+    done = in_process("fit", data, *once, "--start", far, "--out", tmp_path / "c")
+    assert done.exit_code == 2 and "cover less than" in done.stderr
+
+    # The kind is the file's, or the one that is asked for.
+    full = tmp_path / "full.ply"
+    round_one = {**vars(one_splat()), "kind": "3d", "scales": torch.full((1, 3), 0.2)}
+    write_ply(full, Gaussians(**round_one))
+    for asked, kind in (((), "3d"), (("--kind", "2dgs"), "2d")):
+        out = tmp_path / kind
+        done = in_process("fit", data, *once, "--start", full, *asked, "--out", out)
+        assert done.exit_code == 0, done.stderr
+        assert json.loads((out / "settings.json").read_text())["kind"] == kind
+
+
 def test_the_ply_opens_in_another_reader(data, tmp_path):
     done = in_process("fit", data, "--kind", "3dgs", "--out", tmp_path, "--iterations", 5)
     assert done.exit_code == 0, done.stderr

@@ -21,7 +21,7 @@ from attnwarp.baselines import (
     igs2gs,
     preset,
 )
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate.pictures import to_bytes
 
@@ -127,6 +127,19 @@ def test_no_more_rows_go_through_the_network_than_the_budget_has(
     rows, again = rows_of(network, lambda: run(name, folder=tmp_path, budget=limited))
     assert not rows
     assert again.counters == result.counters
+
+
+def test_a_damaged_edit_of_a_run_that_was_cut_is_made_again(whole, run, tmp_path):
+    """Oracle: the bytes before the damage."""
+    rows = whole("igs2gs")[2].counters["network_rows"]
+    cut = Budget(network_rows=rows * 5 // 6)
+    run("igs2gs", folder=tmp_path, budget=cut)
+    before = files(tmp_path)
+    path = next(iter(sorted(tmp_path.glob("rounds/1/*.png"))))
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.warns(InputWarning, match="missing or damaged; the view is edited again"):
+        run("igs2gs", folder=tmp_path, budget=cut)
+    assert files(tmp_path) == before
 
 
 def test_igs2gs_with_rows_for_a_part_of_a_round_ends_after_its_tuning(run, whole):

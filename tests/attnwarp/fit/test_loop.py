@@ -102,6 +102,14 @@ def test_the_harmonics_come_in_one_degree_after_another(scene, monkeypatch):
     assert bool((result.gaussians.sh[:, 1:4] != 0).any()) and bool(
         (result.gaussians.sh[:, 4:] != 0).any()
     )
+    # Splats that were fitted before use what they have from the first iteration on.
+    for sh, degrees in (
+        (result.gaussians.sh, [2] * 12),
+        (torch.cat([result.gaussians.sh[:, :4], start.sh[:, 4:]], 1), [1, 1, 1, *[2] * 9]),
+    ):
+        asked.clear()
+        fit(dataclasses.replace(result.gaussians, sh=sh), scene[0], settings)
+        assert asked == degrees
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
@@ -254,6 +262,9 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
         fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
+    moved = dataclasses.replace(start, means=start.means + 0.01)
+    with pytest.raises(ValueError, match="other start"):
+        fit(moved, scene[0], settings, folder=tmp_path)
 
 
 def test_numbers_that_explode_end_in_a_clear_error(scene):
