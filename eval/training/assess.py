@@ -46,7 +46,8 @@ class Figure:
         what: the question.
         value: the share.
         low, high: 95 % interval, bootstrapped over worlds: pictures of one world are not
-            independent.
+            independent. Where all answers are right or all wrong, no bootstrap shows what could
+            have been: then the binomial interval of as many answers as worlds (Clopper-Pearson).
         count: answers.
         chance: value of guessing; None if that says nothing.
         asked: the required share; None if none is required.
@@ -81,6 +82,11 @@ def figure(what: str, right: npt.ArrayLike, worlds: npt.ArrayLike, **more: float
     rng = np.random.default_rng(0)
     drawn = table[rng.integers(len(table), size=(2000, len(table)))].sum(axis=1)
     low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [0.025, 0.975])
+    tail = 0.025 ** (1 / len(table))
+    if (values == 0).all():
+        high = 1 - tail
+    elif (values == 1).all():
+        low = tail
     return Figure(what, float(values.mean()), float(low), float(high), len(values), **more)
 
 

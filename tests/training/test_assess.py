@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, binomtest
 
 from training import assess, render, worlds
 from training.assess import figure
@@ -69,6 +69,14 @@ def test_an_unbalanced_figure_is_that_of_a_bootstrap_written_out():
     assert found.value == sum(right) / len(right)
     assert found.low == pytest.approx(means[100], abs=0.02)
     assert found.high == pytest.approx(means[3899], abs=0.02)
+
+
+@pytest.mark.parametrize("answer", [0, 1])
+def test_answers_that_are_all_alike_have_the_binomial_interval_of_their_worlds(answer):
+    found = figure("?", np.full(60, answer), np.repeat(np.arange(20), 3))
+    exact = binomtest(20 * answer, 20).proportion_ci(0.95, "exact")
+    assert found.value == answer
+    assert (found.low, found.high) == pytest.approx((exact.low, exact.high))
 
 
 def test_a_figure_of_nothing_is_refused():
