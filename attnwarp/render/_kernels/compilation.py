@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,13 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
+from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 # NaN and infinity are left to IEEE rules: selects rely on comparisons with them.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
@@ -24,6 +32,37 @@ def fingerprint(folder: Path = Path(__file__).parent) -> str:
 
 
 FINGERPRINT = fingerprint()
+
+
+def by_one_process(dispatcher: Any) -> Any:
+    """Let one process at a time compile a kernel that is cached; the others then read it from disk.
+
+    Workers that begin together would each spend half a minute on the same kernels.
+    """
+    if fcntl is not None and hasattr(dispatcher, "_cache"):
+        compile_here = dispatcher.compile
+
+        def compile_or_read(signature: Any) -> Any:
+            # numba's lock first: a thread that holds it may come here for a kernel it calls.
+            with global_compiler_lock, _alone(dispatcher):
+                return compile_here(signature)
+
+        dispatcher.compile = compile_or_read
+    return dispatcher
+
+
+@contextmanager
+def _alone(dispatcher: Any) -> Iterator[None]:
+    path = Path(dispatcher._cache.cache_path) / f"{dispatcher.__qualname__}.lock"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("w")
+    except OSError:  # no cache either, where nothing can be written
+        yield
+        return
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
+        yield
 
 
 def _compiled(**options: Any) -> Any:
@@ -40,7 +79,7 @@ def _compiled(**options: Any) -> Any:
         file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if file is not None:
             file._source_stamp = FINGERPRINT
-        return dispatcher
+        return by_one_process(dispatcher)
 
     return decorate
 

@@ -19,8 +19,15 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from attnwarp.render._kernels.compilation import by_one_process
+
 _options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-jit = numba.njit(**_options)
+
+
+def jit(function: Any) -> Any:
+    """numba's decorator with these options."""
+    return by_one_process(numba.njit(**_options)(function))
+
 
 INVERSE, BILINEAR, NEAREST = range(3)
 """How depth is interpolated."""

@@ -18,10 +18,18 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from attnwarp.render._kernels.compilation import by_one_process
+
 # Without numba's reference counts: two threads that count the same array up and down for every
 # token spend more on that than on the token. Such kernels allocate nothing.
 _options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-jit = numba.njit(**_options)
+
+
+def jit(function: Any) -> Any:
+    """numba's decorator with these options."""
+    return by_one_process(numba.njit(**_options)(function))
+
+
 PLANES = 8
 """Planes of a feature map that are sampled together."""
 HALF, BRAIN = types.uint16, types.int16

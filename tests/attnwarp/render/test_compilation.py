@@ -1,0 +1,42 @@
+"""Kernels are compiled once, however many processes begin together."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+COMPILE = """
+import json
+import numpy as np
+from attnwarp.render._kernels.ordering import radix_order
+print("ready", flush=True)
+input()
+keys = np.array([3, 1, 2], np.float32)
+room = [np.zeros(3, kind) for kind in ("i4", "i4", "u4", "u4")]
+order = radix_order(keys, *room)[0].tolist()
+stats = radix_order.stats
+counts = [sum(each.values()) for each in (stats.cache_misses, stats.cache_hits)]
+print(json.dumps([order, *counts]))
+"""
+
+
+def test_of_processes_that_begin_together_one_compiles_and_the_others_read(tmp_path):
+    """Oracle: numba's own counts of what was compiled, and of what came from disk."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", COMPILE], env=environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    for process in processes:
+        assert process.stdout.readline() == "ready\n"
+    for process in processes:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    results = [json.loads(process.communicate()[0]) for process in processes]
+    assert [result[0] for result in results] == [[1, 2, 0]] * 2
+    assert sorted(result[1:] for result in results) == [[0, 1], [1, 0]]
