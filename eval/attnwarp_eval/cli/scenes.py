@@ -125,7 +125,8 @@ def effects(
         str | None, typer.Argument(help="A scene's name, or the path of its YAML.")
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="JSON with the keys effects and plan.")
+        bool,
+        typer.Option("--json", help="JSON: effects, plan, geometry, everything_on, cost, proof."),
     ] = False,
     prove: Annotated[
         bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
@@ -191,7 +192,10 @@ def _effects_of_all(out: Path, prove: bool, budget: float) -> None:
 def accuracy(
     scenes: Annotated[
         list[str] | None,
-        typer.Argument(help="Scenes' names or paths; a few telling ones if left out."),
+        typer.Argument(
+            help="Scenes' names or paths (default: spheres, bear, glass, fog for pictures; bear,"
+            " garden, far for geometry)."
+        ),
     ] = None,
     out: Annotated[
         Path, typer.Option(help="Folder for the report, accuracy.json and the figures.")

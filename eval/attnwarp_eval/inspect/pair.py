@@ -61,10 +61,11 @@ NEEDS_TRUTH = ("endpoint error", "depth error", "covered by")
 ACCEPTED, REJECTED = "#2ca25f", "#4a4a4a"
 
 CATEGORIES = (
-    "#1f78b4", "#e31a1c", "#33a02c", "#ff7f00", "#6a3d9a", "#b15928", "#a6cee3", "#fb9a99",
+    "#1f78b4", "#e31a1c", "#17becf", "#ff7f00", "#6a3d9a", "#b15928", "#a6cee3", "#fb9a99",
     "#b2df8a", "#fdbf6f", "#cab2d6", "#ffd92f",
 )  # fmt: skip
-"""Colours of rules and of views, in order (ColorBrewer, Paired)."""
+"""Colours of rules and of views, in order (ColorBrewer, Paired; its dark green would pass for
+``ACCEPTED``, so cyan stands in its place)."""
 
 DISAGREEMENT = 0.3
 """Mean absolute difference of sRGB at the bright end of the colours."""

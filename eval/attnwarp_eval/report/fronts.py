@@ -82,7 +82,8 @@ def _in_turn(timed: Timed) -> str:
         f" thread{'s' if first.threads != 1 else ''}; a ratio is the median over rounds of the"
         " ratio to the first contestant within a round, with a bootstrap interval over rounds."
         " The row `again` is the first contestant against itself: what noise alone does on this"
-        " machine. Inside that band nothing is called faster or slower."
+        " machine. Inside that band, or its mirror image about 1, nothing is called faster or"
+        " slower."
     )
 
 

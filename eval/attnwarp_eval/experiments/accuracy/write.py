@@ -77,7 +77,12 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
             "All contestants of a scene ran in turn in one process, in an order drawn anew each"
             " round. A ratio is the median over rounds of the ratio to the first row within a"
             " round, with a 95 % bootstrap interval over rounds. The row `again` is the first row"
-            " against itself: inside its band nothing is called faster or slower."
+            " against itself: what noise alone does."
+        ),
+        (
+            "The converged picture is made by the plan, with samples of its own. So agreement with"
+            " it shows that sampling adds no bias; that the plan drops no light, the rows with"
+            " everything on show, and `scenes effects --prove`."
         ),
     ]
     if left_out:

@@ -14,7 +14,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -23,8 +23,9 @@ import numpy.typing as npt
 import torch
 from pydantic import Field
 
-from attnwarp import check
+from attnwarp import Camera, Gaussians, check
 from attnwarp.editing.schedule import START_PROTOCOL
+from attnwarp.render import render
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
     from attnwarp.baselines import Budget
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
-    from attnwarp.gaussians import Gaussians
     from attnwarp_eval.two_view import Hits
 
 Image = npt.NDArray[np.float32]
@@ -374,6 +374,7 @@ class EditingProbe(Probe[EditResult]):
             before = splats_of(work)
         with meter.stage("setup"):
             encoders = sensitivity.loaded(work.cell.sources, spec["encoders"])
+            _compile(before.kind)
         budget = self._budget(work, truth, names)
         result = run_method(work, truth, names, before, budget)
         STOPWATCH.note(_decisive(spec), _own_seconds(result))
@@ -495,6 +496,19 @@ def source_by_hand(work: Work, truth: EditTruth, source: str) -> Image | None:
         truth.masks[answer][source],
         work.spec["seed"],
     )
+
+
+@cache
+def _compile(kind: Literal["2d", "3d"]) -> None:
+    """Compile what renders, tunes and warps, so that a first edit's seconds do not hold it."""
+    splats = Gaussians(
+        kind, torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.ones(1, 2 + (kind == "3d")),
+        torch.ones(1), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), width=16, height=16, fov_y=40, up=(0, 1, 0))
+    means = splats.means.clone().requires_grad_()
+    render(replace(splats, means=means), camera).color.sum().backward()
+    warp_view(splats, camera, camera).at((4, 4)).warp_tokens(torch.zeros(1, 16, 4))
 
 
 def splats_of(work: Work) -> Gaussians:

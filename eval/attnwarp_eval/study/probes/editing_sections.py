@@ -219,6 +219,7 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
             rows.append([name, *(number(value) for value in means), spread(interval(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
+    tables += _injected(results, probe, measured)
     text = [
         (
             "A dash: no view has the figure. Agreement needs a source edit that is done, a view"
@@ -232,6 +233,21 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
         ),
     ]
     return Section("Edited views by scene", text, tables)
+
+
+def _injected(results: Results, probe: str, names: Sequence[str]) -> list[Table]:
+    """Variants that inject features, by scenes; none where no variant does."""
+    scenes = results.study.scenes
+    rows = []
+    for name in names:
+        shares: dict[str, list[float]] = {}
+        for scene, _, record in results.records(probe, name):
+            shares.setdefault(scene, []).append(record.extra.injected)
+        if any(any(own) for own in shares.values()):
+            means = [_mean(shares.get(scene, [])) for scene in scenes]
+            rows.append([name, *(number(mean) for mean in means), spread(interval(shares))])
+    title = "Share of the targets' pixels that got features of a source; the rest is edited alone"
+    return [Table(["variant", *scenes, "all scenes"], rows, title)] if rows else []
 
 
 def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:

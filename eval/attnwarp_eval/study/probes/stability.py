@@ -227,10 +227,12 @@ def _error(error: float) -> str:
 def _verdicts(swept: Sequence[Swept]) -> Section:
     failed = verdict_lines(swept)
     names = {sweep.case.name for sweep in swept}
+    numbers = {sweep.case.number for sweep in swept}
     levels = sum(len(sweep.outcomes) for sweep in swept)
     text = [
         (
-            f"{len(names)} hard cases by {len(swept)} ways, {levels} evaluations. A case must hold"
+            f"{len(names)} sweeps of {len(numbers)} hard cases, each by several ways:"
+            f" {len(swept)} in all, {levels} evaluations. A case must hold"
             " up to its required level; harder ones follow until it breaks. Margin: decades"
             f" between error and tolerance, at most {DECADES:g}; the worst of a case's ways is"
             " shown. No oracle shares code with what it judges."
