@@ -12,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 # Of the gate: the run, and what it says.
 GATE := build/gate
 
-.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 measured venv clean
+.PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 collected measured venv clean
 
 ## the main job: scenes -> truth -> splats -> warps and masks -> runs/demo/report.html
 demo:
@@ -59,15 +59,19 @@ lint: venv
 	$(BIN)/lint-imports
 
 # Lint on one core; on another the kernels are compiled, which each worker of the tests would do for itself, and the gate
-# uses them. Lint ends first, so that some of them follow it. Output comes a target at a time, so that it does not mix.
+# uses them. Lint ends first, so that what else would be done by each worker follows it: other kernels, and modules compiled
+# by collecting the tests once. Output comes a target at a time, so that it does not mix.
 checks: venv
-	@$(MAKE) --no-print-directory -j2 --output-sync=target kernels-float64 gate
+	@$(MAKE) --no-print-directory -j2 --output-sync=target collected gate
 
 kernels: venv
 	@$(BIN)/python -m scripts.compile_kernels
 
 kernels-float64: lint
 	@$(BIN)/python -m scripts.compile_kernels float64
+
+collected: kernels-float64
+	@$(BIN)/python -m pytest --collect-only -qqq > /dev/null
 
 venv:
 	@scripts/venv.sh
