@@ -342,7 +342,8 @@ def _words(scene: Scene, step: dict[str, Any]) -> str:
     only += "; taken away" if step["sign"] < 0 else ""
     only += "" if step["aims_at_sky"] else "; no rays toward the sky but those of the materials"
     kind = "light paths" if step["integrator"] == "ptracer" else "samples"
+    drawn = sampler(step["integrator"], step["spp"])
     return (
-        f"{step['integrator']}: {step['spp']} {kind} a pixel ({sampler(step['spp'])}), "
+        f"{step['integrator']}: {step['spp']} {kind} a pixel ({drawn}), "
         f"light from {', '.join(shining)}, {depth}{roulette}{only}"
     )

@@ -111,14 +111,17 @@ class Plan:
 
     def identity(self) -> dict[str, Any]:
         """What decides the picture, without the reasons; goes into cache keys."""
-        return asdict(replace(self, reasons=()))
+        data = asdict(replace(self, reasons=()))
+        # Pictures of such passes were stratified once.
+        few = any(p.integrator == "volpath" and p.spp < FEWEST_STRATIFIED for p in self.passes)
+        return {**data, "sampler": "independent"} if few else data
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON, for ``scenes effects --json``."""
         return {
             "integrator": self.integrator,
             "sensor": {"type": self.sensor} | (asdict(self.lens) if self.lens else {}),
-            "sampler": sorted({sampler(step.spp) for step in self.passes}),
+            "sampler": sorted({sampler(step.integrator, step.spp) for step in self.passes}),
             "filter": "box",
             "media": self.media,
             "passes": [asdict(step) for step in self.passes],
@@ -126,10 +129,19 @@ class Plan:
         }
 
 
-def sampler(spp: int) -> str:
+FEWEST_STRATIFIED = 6
+"""Samples of a path through fog from which on they are stratified. With 4, multijittered samples
+made fog too bright by 1.2 % ± 0.1, independent ones did not; 6 and more agree with these."""
+
+
+def sampler(integrator: Integrator, spp: int) -> str:
     """Stratified samples where ``spp`` splits into a grid as Mitsuba wants it; elsewhere it would
     render more.
     """
+    # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
+    # stratify.
+    if integrator == "ptracer" or (integrator == "volpath" and spp < FEWEST_STRATIFIED):
+        return "independent"
     rows = int(np.sqrt(spp))
     return "multijitter" if spp > 0 and rows * -(-spp // rows) == spp else "independent"
 

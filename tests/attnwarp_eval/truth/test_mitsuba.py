@@ -155,6 +155,21 @@ def test_pictures_converge_to_albedo_times_the_light_that_ray_casting_finds(name
         assert np.corrcoef(got.mean(-1), want.mean(-1))[0, 1] > 0.9, name_
 
 
+def test_few_samples_of_fog_have_the_mean_of_many():
+    """Stratified in a 2 x 2 grid they were 1.2 % too bright."""
+    scene = load_scene("fog").with_size(32, 32)
+
+    def mean(spp, pictures):
+        each = [
+            mitsuba.render_plan(scene, scene.source, plan(scene, spp), seed, made_by="scalar_rgb")
+            for seed in range(pictures)
+        ]
+        return float(np.mean(each))
+
+    # The standard error of the ratio is 0.3 %.
+    assert mean(4, 24) == pytest.approx(mean(64, 3), rel=8e-3)
+
+
 def test_the_same_seed_gives_the_same_bits_and_another_seed_other_noise(monkeypatch, tmp_path):
     scene = load_scene("spheres").with_size(32, 32)
     planned = plan(scene, 2)

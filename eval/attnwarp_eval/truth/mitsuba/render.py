@@ -98,9 +98,7 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
                 scene, camera, plan, step, options, pass_seed, (world, center, fog)
             )
             continue
-        # Which cell of a light path's grid lands in which pixel is chance, so there is nothing to
-        # stratify.
-        kind = "independent" if step.integrator == "ptracer" else sampler(step.spp)
+        kind = sampler(step.integrator, step.spp)
         sensor = load_sensor(
             scene,
             camera,
