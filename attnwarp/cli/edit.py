@@ -52,7 +52,7 @@ def edit(
         str,
         typer.Option(
             metavar="NAME",
-            help=f"The method's choices: {', '.join(PRESETS)} (see editing-a-scene.md).",
+            help=f"The method's choices: {', '.join(PRESETS)} (see docs/presets.md).",
         ),
     ] = "corrected",
     source: Annotated[
