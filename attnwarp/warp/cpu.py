@@ -151,7 +151,13 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
 
 
 def blend_tokens(
-    source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float, *, in_place: bool = False
+    source: Tensor,
+    new: Tensor,
+    taps: Taps,
+    mask: Tensor,
+    alpha: float | Tensor,
+    *,
+    in_place: bool = False,
 ) -> Tensor:
     """:func:`attnwarp.warp.sampling.blend_tokens` by kernels; to ``new`` itself if ``in_place``."""
     if in_place and new.is_contiguous():
@@ -212,7 +218,7 @@ class _SampleTokens(torch.autograd.Function):
 class _BlendTokens(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float
+        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float | Tensor
     ) -> Tensor:
         own = _values(new)
         result = _pool.empty(own.shape, own.dtype)
@@ -238,7 +244,9 @@ class _BlendTokens(torch.autograd.Function):
         return source, own, None, None, None
 
 
-def _blend(source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float) -> None:
+def _blend(
+    source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float | Tensor
+) -> None:
     index, weight = taps.arrays
     shares = weight.dtype.type(alpha), weight.dtype.type(1 - alpha)
     run_jobs(
