@@ -249,6 +249,16 @@ def _directions(camera: Camera, pixel_centers: str) -> Tensor:
     return torch.from_numpy(camera.directions(xy))
 
 
+def check_proportions(height: int, width: int, camera: Camera, name: str) -> None:
+    """Raise ValueError unless a map of (height, width) can show a camera's whole view."""
+    check.same_aspect(
+        (height, width),
+        (camera.height, camera.width),
+        name,
+        "transpose a map of (w, h), and leave no part of the view out",
+    )
+
+
 def positions_in(correspondence: Correspondence, width: int, height: int) -> Tensor:
     """(H, W, 2) positions in an image of another size on the source's view."""
     source = correspondence.source
