@@ -277,8 +277,7 @@ class _Run:
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
                 f"folder: {folder} holds a fit of other {name}; go on with the same ones, or name"
-                " another folder (--start SPLATS.ply goes on from splats there), or begin again"
-                " without its checkpoint.pt (--restart)"
+                f" another folder, or remove {path} to begin again"
             )
         try:
             self.model.restore(state["model"])

@@ -258,7 +258,7 @@ def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
 def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_path):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     fit(start, scene[0], settings, folder=tmp_path)
-    with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)"):
+    with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)") as caught:
         fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
@@ -314,6 +314,9 @@ def test_settings_survive_json():
         ({"lr_means": float("nan")}, "lr_means: got nan"),
         ({"densify": 1}, "densify: got 1, expected true or false"),
         ({"background": "blue"}, "background: got 'blue'"),
+    # The library names the file; options are the command line's to advise.
+    assert f"remove {tmp_path / CHECKPOINT} to begin again" in str(caught.value)
+    assert "--" not in str(caught.value)
         ({"antialiased": True}, "antialiased: applies to kind '3d' only"),
         ({"distortion_form": "l2"}, "distortion_form: got 'l2'"),
         ({"iterations": True}, "iterations: got True"),
