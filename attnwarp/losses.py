@@ -92,8 +92,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         image, target: of one shape, at least 11 x 11 pixels, float32 or float64.
 
     Raises:
-        ValueError: different shapes, or a picture smaller than the window, for which it is
-            undefined.
+        ValueError: different shapes, another type, or a picture smaller than the window, for which
+            it is undefined.
 
     Example:
         >>> import torch
@@ -159,6 +159,12 @@ def _windowed(image: Tensor, target: Tensor) -> None:
             f" {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
 
+    for name, picture in (("image", image), ("target", target)):
+        if picture.dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"{name}: got {picture.dtype}, expected float32 or float64; convert it to values in"
+                " [0, 1]"
+            )
 
 def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """mu_x, mu_y and the a1, a2, b1, b2 of similarity = a1 a2 / (b1 b2), for each window."""

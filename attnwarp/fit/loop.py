@@ -204,12 +204,10 @@ def fit(
         )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
-    for name, value in {
-        "max_seconds": max_seconds,
-        "checkpoint_seconds": checkpoint_seconds,
-    }.items():
-        if value is not None and not value >= 0:
-            raise ValueError(f"{name}: got {value}, expected seconds >= 0")
+    if max_seconds is not None and not max_seconds >= 0:
+        raise ValueError(f"max_seconds: got {max_seconds}, expected seconds >= 0")
+    if checkpoint_seconds is None or not checkpoint_seconds >= 0:
+        raise ValueError(f"checkpoint_seconds: got {checkpoint_seconds}, expected seconds >= 0")
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)

@@ -89,6 +89,15 @@ def test_ssim_below_its_window_is_refused(shape):
         losses.ssim(torch.zeros(shape), torch.zeros(shape))
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
+def test_ssim_of_another_type_is_refused_by_name(dtype):
+    image, target = pictures(dtype=torch.float32)
+    with pytest.raises(ValueError, match=f"image: got {dtype}, expected float32 or float64"):
+        losses.ssim(image.to(dtype), target)
+    with pytest.raises(ValueError, match=f"target: got {dtype}"):
+        losses.ssim_terms(image, target.to(dtype))
+
+
 def test_pictures_of_different_shapes_are_refused():
     with pytest.raises(ValueError, match=r"target: got shape \(8, 9, 3\)"):
         losses.l1(torch.zeros(9, 9, 3), torch.zeros(8, 9, 3))

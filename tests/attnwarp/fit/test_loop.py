@@ -337,3 +337,4 @@ def test_defaults_that_depend_on_the_kind_follow_it():
     solid = dataclasses.replace(flat, kind="3d")
     assert (flat.normal_weight, flat.opacity_floor) == (0.05, 0.05)
     assert (solid.normal_weight, solid.distortion_weight, solid.opacity_floor) == (0.0, 0.0, 0.005)
+        ({"reset_opacity": 1}, "reset_opacity: got 1, expected a number in"),
