@@ -174,8 +174,8 @@ def fit(
         ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
             fit of other views, settings or first splats, or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
-        RuntimeError: the loss is no longer finite, or no splat is left; the message says what to
-            try. The last checkpoint stays.
+        RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
+            message says what to try. The last checkpoint stays.
 
     Warns:
         InputWarning: float32 world coordinates would not do for ``splats.ply``.
@@ -464,9 +464,13 @@ class _Run:
             background = self.background(fitting=False)
             for index, camera in enumerate(self.held_out.cameras):
                 image = self.render(gaussians, camera, background).color.clamp(0, 1)
-                errors.append(
-                    float((image - self.held_out.target(index, background)).square().mean())
-                )
+                error = image - self.held_out.target(index, background)
+                errors.append(float(error.square().mean()))
+                if math.isnan(errors[-1]):
+                    raise RuntimeError(
+                        f"after {self.iteration} iterations: the held-out view {camera.name!r}"
+                        " renders as NaN; lower the learning rates"
+                    )
         self.history.append(
             Record(
                 iteration=self.iteration,

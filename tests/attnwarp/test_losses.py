@@ -119,6 +119,15 @@ def test_psnr_is_that_of_scikit_image_and_infinite_for_equal_pictures():
     assert losses.psnr(image, image) == math.inf
 
 
+def test_psnr_of_nan_is_nan_as_in_scikit_image():
+    from skimage.metrics import peak_signal_noise_ratio
+
+    image, target = pictures()
+    image[3, 5, 1] = math.nan
+    assert math.isnan(peak_signal_noise_ratio(image.numpy(), target.numpy(), data_range=1.0))
+    assert math.isnan(losses.psnr(image, target))
+
+
 def plane(angle, size=0.12, half=12):
     """A sheet of discs through the origin, turned by ``angle`` degrees about the y axis, that face
     its own normal.
