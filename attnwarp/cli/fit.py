@@ -216,7 +216,12 @@ def _from_points(
         typer.echo(f"{data} has no points: beginning with {random} random ones", err=True)
         points, colors = attnwarp.fit.random_points(views.cameras, random, seed=settings.seed)
     return attnwarp.fit.from_points(
-        points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=settings.seed
+        points,
+        colors,
+        kind=settings.kind,
+        sh_degree=settings.sh_degree,
+        seed=settings.seed,
+        cameras=views.cameras,
     )
 
 

@@ -233,7 +233,7 @@ class _Run:
         self.third_scale = third_scale
         self.settings, self.views, self.held_out = settings, views, held_out
         self.backend, self.measure = backend, measure
-        self.extent = extent_of(views.cameras)
+        self.extent = extent_of(views.cameras, start.world_means())
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
