@@ -65,7 +65,7 @@ def test_points_at_one_place_become_one_splat():
 def test_one_point_alone_is_a_hundredth_of_the_scene_in_any_unit(unit):
     view = dict(width=8, height=8, fov_y=40)
     place = np.array([1e6, 2e6, 3e6])
-    camera = Camera.look_at(place + unit * np.array([0, 0, 4]), place, **view)
+    camera = Camera.look_at(place + unit * np.array([0, 4, 0]), place, **view)
     alone = from_points([place], kind="2d", cameras=[camera])
     torch.testing.assert_close(alone.scales, torch.full((1, 2), 0.04 * unit), rtol=1e-6, atol=0)
     # Cameras 4 units from their middle: 1.1 times that is the extent.

@@ -228,7 +228,7 @@ def test_one_source_for_all_gathers_the_gradient_of_all(layer):
         (lambda w, s, n: w.warp_tokens(s[:, 1:]), r"source: got shape \(2, 191, 5\)"),
         (lambda w, s, n: w.warp_tokens(s.long()), r"source: got torch\.int64, expected a floating"),
         (
-            lambda w, s, n: w.warp(s.long()[None]),
+            lambda w, s, n: w.warp(torch.ones(5, 12, 16, dtype=torch.int64)),
             r"features: got torch\.int64, expected a floating",
         ),
         (lambda w, s, n: w.warp(s[0]), r"features: got shape \(192, 5\)"),
