@@ -384,7 +384,7 @@ def _parts(
     for name, (_, expected) in wanted.items():
         check.shape(arrays[name], expected, name)
         if name in ("source_depth", "source_alpha"):
-            check_proportions(*arrays[name].shape, source_camera, name)
+            check_proportions(arrays[name].shape, source_camera, name)
     single = all(array.dtype == np.float32 for array in arrays.values())
     kind = np.float32 if single else np.float64
 

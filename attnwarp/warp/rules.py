@@ -85,7 +85,7 @@ def opaque(
     if source_alpha is not None:
         alpha = as_float64(source_alpha, "source_alpha")
         check.shape(alpha, ("H", "W"), "source_alpha")
-        check_proportions(*alpha.shape, correspondence.source, "source_alpha")
+        check_proportions(alpha.shape, correspondence.source, "source_alpha")
         sampled, inside = sample(alpha[None], correspondence)
         mask &= (sampled[0] >= minimum) & inside
     return mask
@@ -167,7 +167,7 @@ def photometric(
     source = as_float64(source_image, "source_image")
     target = as_float64(target_image, "target_image")
     check.shape(source, ("H", "W", "C"), "source_image")
-    check_proportions(*source.shape[:2], correspondence.source, "source_image")
+    check_proportions(source.shape[:2], correspondence.source, "source_image")
     check.shape(target, (*correspondence.z.shape, source.shape[2]), "target_image")
     warped, _ = sample(source.permute(2, 0, 1), correspondence)
     difference = (warped.permute(1, 2, 0) - target).abs().mean(dim=-1)

@@ -67,7 +67,7 @@ def sample(
         raise ValueError(
             f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)"
         )
-    check_proportions(*features.shape[-2:], correspondence.source, "features")
+    check_proportions(features.shape[-2:], correspondence.source, "features")
     xy = positions_in(correspondence, features.shape[-1], features.shape[-2])
     return sample_at(features, xy, mode=mode), in_bounds(correspondence).to(features.device)
 
@@ -211,7 +211,7 @@ def sample_depth(
         [2.0, 2.0, nan, nan]
     """
     depth = valid_depth(source_depth, "source_depth")
-    check_proportions(*depth.shape, correspondence.source, "source_depth")
+    check_proportions(depth.shape, correspondence.source, "source_depth")
     xy = positions_in(correspondence, depth.shape[1], depth.shape[0])
     inside = in_bounds(correspondence)
     sampled = blend_depth(depth, torch.where(inside[..., None], xy, 0.5), interpolation, spread)

@@ -68,7 +68,7 @@ def test_the_writers_of_a_persons_files_follow_a_link_and_the_others_replace_it(
     assert {path.name for path in (tmp_path / "big").iterdir()} == {"new.ply", "old.ply"}
 
 
-@pytest.mark.parametrize("name", [255 * "n", 63 * "\N{GRINNING FACE}"])
+@pytest.mark.parametrize("name", [255 * "n", 63 * "\N{GRINNING FACE}"], ids=["1 byte", "4 bytes"])
 def test_a_name_as_long_as_the_file_system_takes_can_be_written(tmp_path, name):
     write_atomically(tmp_path / name, lambda stream: stream.write(b"whole"))
     assert (tmp_path / name).read_bytes() == b"whole"
