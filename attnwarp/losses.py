@@ -69,14 +69,15 @@ def psnr(image: Tensor, target: Tensor) -> float:
 
 
 def psnr_of_mse(error: float) -> float:
-    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0. To average views,
-    average the error.
+    """-10 log10 of a mean squared error of values in [0, 1]; infinite for 0, NaN for NaN.
+
+    To average views, average the error.
 
     Example:
         >>> psnr_of_mse(0.001), psnr_of_mse(0.0)
         (30.0, inf)
     """
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
@@ -92,8 +93,8 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
         image, target: of one shape, at least 11 x 11 pixels, float32 or float64.
 
     Raises:
-        ValueError: different shapes, or a picture smaller than the window, for which it is
-            undefined.
+        ValueError: different shapes, another type, or a picture smaller than the window, for which
+            it is undefined.
 
     Example:
         >>> import torch
@@ -158,6 +159,12 @@ def _windowed(image: Tensor, target: Tensor) -> None:
             f"image: got {image.shape[1]} x {image.shape[0]} px; SSIM is undefined below"
             f" {SSIM_WINDOW} x {SSIM_WINDOW}"
         )
+    for name, picture in (("image", image), ("target", target)):
+        if picture.dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"{name}: got {picture.dtype}, expected float32 or float64; convert it to values in"
+                " [0, 1]"
+            )
 
 
 def _moments(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -188,11 +188,19 @@ def _fit(
         (out / CHECKPOINT).unlink(missing_ok=True)
     if settings.max_splats is not None and len(first) > settings.max_splats:
         echo(more_points(len(first), settings.max_splats))
-    with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
-        result = attnwarp.fit.fit(
-            first, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
-            checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch, stop=stop,
-        )  # fmt: skip
+    try:
+        with asked_to_stop(echo) as stop, progress_display(title=out.name) as watch:
+            result = attnwarp.fit.fit(
+                first, views, settings, held_out=held_out, folder=out, max_seconds=max_seconds,
+                checkpoint_seconds=checkpoint_seconds, third_scale=third_scale, watch=watch,
+                stop=stop,
+            )  # fmt: skip
+    except ValueError as error:
+        if str(out / CHECKPOINT) not in str(error):
+            raise
+        raise ValueError(
+            f"{error} (--restart does so; --start SPLATS.ply goes on from splats in another folder)"
+        ) from error
     _write_results(out, result, held_out)
     return result
 
@@ -208,7 +216,12 @@ def _from_points(
         typer.echo(f"{data} has no points: beginning with {random} random ones", err=True)
         points, colors = attnwarp.fit.random_points(views.cameras, random, seed=settings.seed)
     return attnwarp.fit.from_points(
-        points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=settings.seed
+        points,
+        colors,
+        kind=settings.kind,
+        sh_degree=settings.sh_degree,
+        seed=settings.seed,
+        cameras=views.cameras,
     )
 
 

@@ -174,8 +174,8 @@ def fit(
         ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
             fit of other views, settings or first splats, or a number is out of range.
         FileFormatError: the folder's checkpoint is damaged.
-        RuntimeError: the loss is no longer finite, or no splat is left; the message says what to
-            try. The last checkpoint stays.
+        RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
+            message says what to try. The last checkpoint stays.
 
     Warns:
         InputWarning: float32 world coordinates would not do for ``splats.ply``.
@@ -204,12 +204,10 @@ def fit(
         )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
-    for name, value in {
-        "max_seconds": max_seconds,
-        "checkpoint_seconds": checkpoint_seconds,
-    }.items():
-        if value is not None and not value >= 0:
-            raise ValueError(f"{name}: got {value}, expected seconds >= 0")
+    if max_seconds is not None and not max_seconds >= 0:
+        raise ValueError(f"max_seconds: got {max_seconds}, expected seconds >= 0")
+    if checkpoint_seconds is None or not checkpoint_seconds >= 0:
+        raise ValueError(f"checkpoint_seconds: got {checkpoint_seconds}, expected seconds >= 0")
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
@@ -235,7 +233,7 @@ class _Run:
         self.third_scale = third_scale
         self.settings, self.views, self.held_out = settings, views, held_out
         self.backend, self.measure = backend, measure
-        self.extent = extent_of(views.cameras)
+        self.extent = extent_of(views.cameras, start.world_means())
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
@@ -277,8 +275,7 @@ class _Run:
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
                 f"folder: {folder} holds a fit of other {name}; go on with the same ones, or name"
-                " another folder (--start SPLATS.ply goes on from splats there), or begin again"
-                " without its checkpoint.pt (--restart)"
+                f" another folder, or remove {path} to begin again"
             )
         try:
             self.model.restore(state["model"])
@@ -467,9 +464,13 @@ class _Run:
             background = self.background(fitting=False)
             for index, camera in enumerate(self.held_out.cameras):
                 image = self.render(gaussians, camera, background).color.clamp(0, 1)
-                errors.append(
-                    float((image - self.held_out.target(index, background)).square().mean())
-                )
+                error = image - self.held_out.target(index, background)
+                errors.append(float(error.square().mean()))
+                if math.isnan(errors[-1]):
+                    raise RuntimeError(
+                        f"after {self.iteration} iterations: the held-out view {camera.name!r}"
+                        " renders as NaN; lower the learning rates"
+                    )
         self.history.append(
             Record(
                 iteration=self.iteration,

@@ -18,7 +18,8 @@ Tensor = torch.Tensor
 NAMES = ("means", "dc", "rest", "opacity", "scales", "quats")
 
 SMALLEST, LARGEST = 1e-7, 1e3
-"""Scales stay within these shares of the extent: beyond, they would leave float32."""
+"""Scales stay within these shares of the extent, or the first splats' own range where that is
+wider: beyond, they would leave float32."""
 
 EPSILON = 1e-15
 """Adam's (3DGS): gradients of a mean over pixels are tiny, and must not be taken for noise."""
@@ -40,6 +41,7 @@ class Model:
         steps: steps done.
         rates: learning rates by name.
         extent: of the scene, in its units.
+        scales_range: smallest and largest logarithm that a scale may take.
     """
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
@@ -54,6 +56,12 @@ class Model:
             "scales": g.scales.log(),
             "quats": g.quats.clone(),
         }
+        smallest, largest = math.log(SMALLEST * extent), math.log(LARGEST * extent)
+        if len(g):
+            # So that a step moves no splat whose scales have the learning rate 0.
+            smallest = min(smallest, float(self.tensors["scales"].min()))
+            largest = max(largest, float(self.tensors["scales"].max()))
+        self.scales_range = smallest, largest
         self.rates = {
             "means": settings.lr_means * extent,
             "dc": settings.lr_dc,
@@ -126,9 +134,7 @@ class Model:
             tensor.grad = None
         self.steps += 1
         with torch.no_grad():
-            self.tensors["scales"].clamp_(
-                math.log(SMALLEST * self.extent), math.log(LARGEST * self.extent)
-            )
+            self.tensors["scales"].clamp_(*self.scales_range)
             self.tensors["opacity"].clamp_(-LARGEST_LOGIT, LARGEST_LOGIT)
 
     def replace(self, keep: Tensor, added: dict[str, Tensor]) -> None:

@@ -212,7 +212,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "prune_opacity": (0, 1),
     "prune_scale": (1e-6, math.inf),
     "reset_every": (1, math.inf),
-    "reset_opacity": (1e-6, 1),
+    "reset_opacity": (1e-6, 1 - 1e-6),  # its logit must be finite
     "near": (1e-9, math.inf),
     "evaluate_every": (1, math.inf),
     "patience": (1, math.inf),

@@ -30,11 +30,21 @@ and two positions are compared.
 """
 
 
-def extent_of(cameras: Sequence[Camera]) -> float:
+LONE_SIZE = 0.01
+"""Size of a first splat without neighbours, as a share of the scene's extent."""
+
+
+def extent_of(cameras: Sequence[Camera], points: Array | None = None) -> float:
     """Size of a scene in its own units: 1.1 times the largest distance of a camera from their mean
     (3DGS).
 
-    Cameras that stand at one place say nothing about it; then it is 1.
+    Cameras that stand at one place say nothing about it. Then it is the median distance of
+    ``points`` from there.
+
+    Args:
+        cameras: at least one.
+        points: (P, 3) world coordinates of what they see. Without any, or where they lie at the
+            cameras' place, the extent of cameras at one place is 1.
 
     Example:
         >>> from attnwarp import Camera
@@ -45,9 +55,11 @@ def extent_of(cameras: Sequence[Camera]) -> float:
         3.3
     """
     centers = np.stack([camera.position for camera in cameras])
-    if _at_one_place(centers):
+    if not _at_one_place(centers):
+        return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    if points is None or len(points) == 0:
         return 1.0
-    return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
+    return float(np.median(np.linalg.norm(points - centers[0], axis=1))) or 1.0
 
 
 def _at_one_place(centers: Array) -> bool:
@@ -66,6 +78,7 @@ def from_points(
     kind: Kind,
     sh_degree: int = 3,
     seed: int = 0,
+    cameras: Sequence[Camera] = (),
 ) -> Gaussians:
     """One splat a point: as large as the gaps around it, opacity 0.1, grey where no colour is
     given.
@@ -78,6 +91,8 @@ def from_points(
         kind: "2d" or "3d".
         sh_degree: room for harmonics up to this degree; all but the constant are 0.
         seed: of the random turns.
+        cameras: that see the points. They size a lone point, which has no gaps around it: a
+            hundredth of the scene's extent (:func:`extent_of`), or of one unit without cameras.
 
     Returns:
         float32 splats relative to an ``origin`` at the points' median.
@@ -114,8 +129,9 @@ def from_points(
     origin = np.median(xyz, axis=0)
     local = xyz - origin
     n = len(local)
-    size = np.full(n, 0.01 * max(1e-6, float(np.abs(local).max())))
-    if n > 1:
+    if n == 1:
+        size = np.array([LONE_SIZE * (extent_of(cameras, xyz) if cameras else 1.0)])
+    else:
         distance, _ = cKDTree(local).query(local, k=min(NEIGHBOURS + 1, n))
         size = np.sqrt((distance[:, 1:] ** 2).mean(1))
     quats = torch.zeros(n, 4)

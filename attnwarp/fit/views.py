@@ -16,6 +16,7 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.io import Dataset, FileFormatError, read_image
+from attnwarp.io.images import weighted_by_alpha
 
 HELD_OUT_EVERY = 8
 """One image of so many is held out where a data set names no split (LLFF's habit)."""
@@ -170,16 +171,11 @@ def _shrink(image: npt.NDArray[Any], longest: int) -> npt.NDArray[Any]:
 
     factor = longest / max(image.shape[:2])
     width, height = (max(1, round(factor * side)) for side in (image.shape[1], image.shape[0]))
-    if image.shape[2] == 3:
-        return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
-    # Colour of transparent pixels has no meaning and must not bleed into their neighbours.
-    values: npt.NDArray[Any] = image.astype(np.float32) / _top(image)
-    values[..., :3] *= values[..., 3:]
-    small = np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
-    small = np.concatenate(
-        [small[..., :3] / np.maximum(small[..., 3:], 1e-6), small[..., 3:]], axis=2
-    )
-    return np.round(np.clip(small, 0, 1) * _top(image)).astype(image.dtype)
+
+    def averaged(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
+
+    return averaged(image) if image.shape[2] == 3 else weighted_by_alpha(image, averaged)
 
 
 def hold_out(dataset: Dataset, every: int = HELD_OUT_EVERY) -> tuple[Dataset, Dataset | None]:

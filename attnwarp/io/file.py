@@ -92,7 +92,11 @@ def existing_file(path: str | os.PathLike[str]) -> Path:
 
 
 def write_atomically(
-    path: str | os.PathLike[str], write: Callable[[BinaryIO], object], *, durable: bool = True
+    path: str | os.PathLike[str],
+    write: Callable[[BinaryIO], object],
+    *,
+    durable: bool = True,
+    follow_link: bool = False,
 ) -> None:
     """Call ``write`` on a temporary file beside ``path`` and rename it to ``path``.
 
@@ -105,6 +109,8 @@ def write_atomically(
         write: called with the open temporary file.
         durable: whether the content survives a power cut too, which costs milliseconds. A file
             that carries a checksum and can be made again does without.
+        follow_link: where ``path`` is a link, write the file that it leads to. Without, the link is
+            replaced, so that nothing outside a program's own folder is written.
 
     Raises:
         FileNotFoundError: the folder does not exist.
@@ -118,12 +124,15 @@ def write_atomically(
         'whole'
     """
     path = Path(path)
+    if follow_link and path.is_symlink():
+        path = path.resolve()
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
     _sweep(path.parent.resolve(), os.getpid())
     # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner
-    # alone.
-    temporary = path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex}.tmp")
+    # alone. Of a long name a part, so that this one is not too long for the file system.
+    part = path.name[:NAME_PART]
+    temporary = path.with_name(f".{part}.{_host()}-{os.getpid()}-{uuid.uuid4().hex}.tmp")
     try:
         with temporary.open("xb") as stream:
             write(stream)
@@ -143,6 +152,10 @@ ABANDONED_SECONDS = 24 * 3600
 """A temporary file of another machine counts as abandoned when nothing was written to it for this
 long: whether its process is alive cannot be asked from here.
 """
+
+NAME_PART = 40
+"""Characters of a file's name in that of its temporary one: at most 160 bytes, where a file system
+takes 255."""
 
 _TEMPORARY = re.compile(r"\..+\.(?P<host>[0-9a-f]{8})-(?P<process>[0-9]{1,10})-[0-9a-f]{32}\.tmp")
 

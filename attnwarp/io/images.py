@@ -105,6 +105,30 @@ def encode_png(rgb: npt.NDArray[Any]) -> bytes:
     return bytes(data.tobytes())
 
 
+def weighted_by_alpha(
+    image: npt.NDArray[Any], resample: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+) -> npt.NDArray[Any]:
+    """A picture with straight alpha, resampled with its colours weighted by alpha.
+
+    The colour of transparent pixels has no meaning and must not bleed into their neighbours.
+
+    Args:
+        image: (H, W, 4) uint8 or uint16.
+        resample: makes the new (h, w, 4) of (H, W, 4) float32 in [0, 1].
+
+    Returns:
+        (h, w, 4) of the same dtype; black where it is transparent.
+    """
+    top = float(np.iinfo(image.dtype).max)
+    values: npt.NDArray[Any] = image.astype(np.float32) / top
+    values[..., :3] *= values[..., 3:]
+    values = resample(values)
+    values = np.concatenate(
+        [values[..., :3] / np.maximum(values[..., 3:], 1e-6), values[..., 3:]], axis=2
+    )
+    return np.round(np.clip(values, 0, 1) * top).astype(image.dtype)
+
+
 def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
     """What ``use`` makes of the picture opened by Pillow, with its errors in one line.
 

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from attnwarp import check
 from attnwarp.camera import Camera
+from attnwarp.io.images import weighted_by_alpha
 
 Array = npt.NDArray[np.float64]
 
@@ -198,7 +199,8 @@ def undistorted_image(
     """A picture resampled (bilinearly) to what ``target``, a pinhole at the same pose, sees.
 
     Args:
-        image: (H, W, C) uint8 or uint16, taken by ``camera`` through ``lens``.
+        image: (H, W, C) uint8 or uint16, taken by ``camera`` through ``lens``; a fourth channel is
+            straight alpha.
         camera, lens: of the picture.
         target: what to resample to.
 
@@ -229,13 +231,17 @@ def undistorted_image(
     )  # fmt: skip
     rows = np.where(outside, 0.0, xy[..., 1] - 0.5)
     columns = np.where(outside, 0.0, xy[..., 0] - 0.5)
-    result = np.empty((target.height, target.width, image.shape[2]), image.dtype)
-    for channel in range(image.shape[2]):
-        values = map_coordinates(
-            image[..., channel].astype(np.float64), [rows, columns], order=1, mode="nearest"
-        )
-        result[..., channel] = np.where(outside, 0, np.rint(values))
-    return result
+
+    def resampled(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        channels = [
+            map_coordinates(values[..., k], [rows, columns], order=1, mode="nearest")
+            for k in range(values.shape[2])
+        ]
+        return np.where(outside[..., None], 0, np.stack(channels, axis=-1))
+
+    if image.shape[2] == 4:
+        return weighted_by_alpha(image, resampled)
+    return np.rint(resampled(image.astype(np.float64))).astype(image.dtype)
 
 
 def _pixels(camera: Camera, xy: Array) -> Array:

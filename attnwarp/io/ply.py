@@ -243,7 +243,7 @@ def write_ply(
     else:
         comments += [f"SplatRenderMode: {'mip' if g.antialiased else 'default'}"]
     data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments)
-    write_atomically(path, data.write)
+    write_atomically(path, data.write, follow_link=True)
 
 
 def read_points(path: str | os.PathLike[str]) -> tuple[Array, npt.NDArray[np.uint8] | None]:
@@ -325,7 +325,8 @@ def write_points(
     if rgb is not None:
         for i, name in enumerate(("red", "green", "blue")):
             rows[name] = rgb[:, i]
-    write_atomically(path, PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write)
+    data = PlyData([PlyElement.describe(rows, "vertex")], byte_order="<")
+    write_atomically(path, data.write, follow_link=True)
 
 
 # --------------------------------------------------------------------------------------------------

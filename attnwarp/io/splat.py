@@ -95,7 +95,7 @@ def write_splat(
         np.round(255 * np.concatenate([color, opacity[:, None]], axis=1)), 0, 255
     )
     rows["quat"] = np.clip(np.round(128 + 128 * quats), 0, 255)
-    write_atomically(path, lambda stream: stream.write(rows[order].tobytes()))
+    write_atomically(path, lambda stream: stream.write(rows[order].tobytes()), follow_link=True)
 
 
 def read_splat(path: str | os.PathLike[str]) -> Gaussians:

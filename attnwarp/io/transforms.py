@@ -232,9 +232,7 @@ def write_transforms(
             raise ValueError(
                 f"dataset: camera {i} ({camera.name}) has a lens; undistort the images first"
             )
-        name = (
-            camera.name if image is None else Path(os.path.relpath(image, path.parent)).as_posix()
-        )
+        name = camera.name if image is None else _relative(Path(image), path.parent)
         if not name:
             raise ValueError(f"dataset: camera {i} has neither an image nor a name for file_path")
         K = camera.K
@@ -270,10 +268,19 @@ def write_transforms(
         data["ply_file_path"] = points_name
     data["frames"] = frames
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
-    write_atomically(path, lambda stream: stream.write(text.encode()))
+    write_atomically(path, lambda stream: stream.write(text.encode()), follow_link=True)
 
 
 # --------------------------------------------------------------------------------------------------
+
+
+def _relative(image: Path, folder: Path) -> str:
+    """The way from a folder to an image, which holds where either lies behind a link too."""
+    way = Path(os.path.relpath(image, folder))
+    # Behind a link, ".." leads to the parent of what it links to.
+    if (folder / way).resolve() != image.resolve():
+        way = Path(os.path.relpath(image.parent.resolve() / image.name, folder.resolve()))
+    return way.as_posix()
 
 
 def _scaled(path: Path, name: str, scale: int) -> str:

@@ -8,6 +8,7 @@ it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -247,6 +248,16 @@ def _directions(camera: Camera, pixel_centers: str) -> Tensor:
     if pixel_centers == "integer":
         xy = xy - 0.5
     return torch.from_numpy(camera.directions(xy))
+
+
+def check_proportions(size: Sequence[int], camera: Camera, name: str) -> None:
+    """Raise ValueError unless a map of ``size`` (h, w) can show a camera's whole view."""
+    check.same_aspect(
+        (size[0], size[1]),
+        (camera.height, camera.width),
+        name,
+        "transpose a map of (w, h), and leave no part of the view out",
+    )
 
 
 def positions_in(correspondence: Correspondence, width: int, height: int) -> Tensor:

@@ -18,8 +18,8 @@ from attnwarp.camera import Camera
 from attnwarp.render import _pool
 from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp._kernels import pair, sampling
-from attnwarp.warp.correspondence import Correspondence
-from attnwarp.warp.depth import Array
+from attnwarp.warp.correspondence import Correspondence, check_proportions
+from attnwarp.warp.depth import Array, as_tensor
 from attnwarp.warp.masks import axis_weights
 from attnwarp.warp.settings import DepthInterpolation, MaskResize, NormalTest, WarpSettings
 from attnwarp.warp.surface import Surface, needed
@@ -49,7 +49,7 @@ def correspond_and_mask(
     """
     size = (target.height, target.width)
     names = ["defined", "in_bounds"]
-    seen, other = _parts(target_surface, source_surface, settings, size)
+    seen, other = _parts(source, target_surface, source_surface, settings, size)
     for name, on in (
         ("in_front", settings.in_front),
         ("opaque", settings.opaque is not None),
@@ -151,9 +151,18 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
 
 
 def blend_tokens(
-    source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float, *, in_place: bool = False
+    source: Tensor,
+    new: Tensor,
+    taps: Taps,
+    mask: Tensor,
+    alpha: float | Tensor,
+    *,
+    in_place: bool = False,
 ) -> Tensor:
-    """:func:`attnwarp.warp.sampling.blend_tokens` by kernels; to ``new`` itself if ``in_place``."""
+    """:func:`attnwarp.warp.sampling.blend_tokens` by kernels; to ``new`` itself if ``in_place``.
+
+    A gradient flows back to ``source`` and ``new``, and none to ``alpha``.
+    """
     if in_place and new.is_contiguous():
         _blend(_values(source), _values(new), taps, mask, alpha)
         return new
@@ -212,7 +221,7 @@ class _SampleTokens(torch.autograd.Function):
 class _BlendTokens(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float
+        ctx: Any, source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float | Tensor
     ) -> Tensor:
         own = _values(new)
         result = _pool.empty(own.shape, own.dtype)
@@ -238,7 +247,9 @@ class _BlendTokens(torch.autograd.Function):
         return source, own, None, None, None
 
 
-def _blend(source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float) -> None:
+def _blend(
+    source: np.ndarray, result: np.ndarray, taps: Taps, mask: Tensor, alpha: float | Tensor
+) -> None:
     index, weight = taps.arrays
     shares = weight.dtype.type(alpha), weight.dtype.type(1 - alpha)
     run_jobs(
@@ -344,7 +355,11 @@ def _correspondence(
 
 
 def _parts(
-    target: Surface, source: Surface | None, settings: WarpSettings, size: tuple[int, int]
+    source_camera: Camera,
+    target: Surface,
+    source: Surface | None,
+    settings: WarpSettings,
+    size: tuple[int, int],
 ) -> tuple[pair.View, pair.View]:
     """What the rules read of both surfaces: all float32, or all float64."""
     wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {"target_depth": (target.depth, size)}
@@ -368,6 +383,8 @@ def _parts(
     arrays = {name: _floating(value, name) for name, (value, _) in wanted.items()}
     for name, (_, expected) in wanted.items():
         check.shape(arrays[name], expected, name)
+        if name in ("source_depth", "source_alpha"):
+            check_proportions(arrays[name].shape, source_camera, name)
     single = all(array.dtype == np.float32 for array in arrays.values())
     kind = np.float32 if single else np.float64
 
@@ -393,12 +410,5 @@ def _parts(
 
 
 def _floating(value: Array, name: str) -> np.ndarray:
-    # torch takes no array that may not be written.
-    tensor = (
-        value.detach()
-        if isinstance(value, Tensor)
-        else torch.from_numpy(np.require(value, requirements="W"))
-    )
-    if not tensor.dtype.is_floating_point:
-        raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
+    tensor = as_tensor(value, name)
     return (tensor.float() if tensor.dtype in _STORED else tensor).cpu().numpy()

@@ -68,16 +68,31 @@ def resize_depth(
     return blend_depth(source, xy, interpolation, spread)
 
 
-def as_float64(value: Array, name: str) -> Tensor:
-    """A detached float64 CPU copy of floating values.
+def as_tensor(value: Array, name: str) -> Tensor:
+    """Floating values as a detached tensor, which shares their memory where torch can read it.
 
     Raises:
         ValueError: the values are not of a floating type.
     """
-    tensor = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.array(value))
+    if isinstance(value, Tensor):
+        tensor = value.detach()
+    else:
+        # torch takes no array that is flipped, of the other byte order or may not be written.
+        array = np.asarray(value)
+        native = array.dtype.newbyteorder("=")
+        tensor = torch.from_numpy(np.require(array, native, ("C", "W")))
     if not tensor.dtype.is_floating_point:
         raise ValueError(f"{name}: got {tensor.dtype}, expected a floating type")
-    return tensor.to(device="cpu", dtype=torch.float64)
+    return tensor
+
+
+def as_float64(value: Array, name: str) -> Tensor:
+    """Floating values as a detached float64 tensor on the CPU.
+
+    Raises:
+        ValueError: the values are not of a floating type.
+    """
+    return as_tensor(value, name).to(device="cpu", dtype=torch.float64)
 
 
 def valid_depth(value: Array, name: str) -> Tensor:

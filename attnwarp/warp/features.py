@@ -99,7 +99,7 @@ class FeatureWarp:
         return self._engine(source).sample_tokens(source, taps).to(source.dtype)
 
     def blend_tokens(
-        self, source: Tensor, new: Tensor, alpha: float, *, in_place: bool = False
+        self, source: Tensor, new: Tensor, alpha: float | Tensor, *, in_place: bool = False
     ) -> Tensor:
         """Warp, mask and blend: a (M warp(source) + (1 - M) new) + (1 - a) new, M = ``mask``.
 
@@ -107,7 +107,8 @@ class FeatureWarp:
             source: (B, h*w, C) or (1, h*w, C) recorded tokens of the source's grid, converted to
                 the type of ``new``.
             new: (B, H*W, C) the target's own tokens, floating.
-            alpha: a, in [0, 1].
+            alpha: a, in [0, 1]. Where it is a () tensor with a gradient, that flows back too, and
+                torch computes the blend.
             in_place: write the result to ``new``. Not where a gradient is recorded.
 
         Returns:
@@ -138,7 +139,9 @@ class FeatureWarp:
         self._check_blend(source, new, alpha, in_place)
         source = source.to(new.dtype)
         taps, mask = self._tokens_taps(source), self._mask_on(new.device)
-        if self._engine(new) is sampling:
+        # The kernels give no gradient of the weight.
+        learned = isinstance(alpha, Tensor) and alpha.requires_grad
+        if learned or self._engine(new) is sampling:
             result = sampling.blend_tokens(source, new, taps, mask, alpha)
             return new.copy_(result) if in_place else result
         from attnwarp.warp import cpu
@@ -165,7 +168,9 @@ class FeatureWarp:
 
         return cpu
 
-    def _check_blend(self, source: Tensor, new: Tensor, alpha: float, in_place: bool) -> None:
+    def _check_blend(
+        self, source: Tensor, new: Tensor, alpha: float | Tensor, in_place: bool
+    ) -> None:
         target = self.correspondence.target
         check.instance(new, Tensor, "new", "torch.Tensor")
         check.shape(new, ("B", target.height * target.width, "C"), "new")
@@ -178,9 +183,12 @@ class FeatureWarp:
             raise ValueError(f"new: got {new.dtype}, expected a floating type")
         if source.device != new.device:
             raise ValueError(f"source: lies on {source.device}, new on {new.device}")
+        if isinstance(alpha, Tensor):
+            check.shape(alpha, (), "alpha")
         if not isinstance(alpha, Real | Tensor) or not 0 <= alpha <= 1:
             raise ValueError(f"alpha: got {alpha!r}, expected a number in [0, 1]")
-        if in_place and torch.is_grad_enabled() and (source.requires_grad or new.requires_grad):
+        recorded = any(getattr(part, "requires_grad", False) for part in (source, new, alpha))
+        if in_place and torch.is_grad_enabled() and recorded:
             raise ValueError(
                 "in_place: got True where a gradient is recorded; use torch.no_grad() or"
                 " in_place=False"

@@ -14,7 +14,7 @@ from torch import Tensor
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians
-from attnwarp.warp.correspondence import Correspondence
+from attnwarp.warp.correspondence import Correspondence, check_proportions
 from attnwarp.warp.depth import TAP_SPREAD, Array, as_float64, depth_slope
 from attnwarp.warp.sampling import sample, sample_depth
 from attnwarp.warp.settings import GaussianFilter
@@ -63,7 +63,7 @@ def opaque(
             pixel passes.
 
     Raises:
-        ValueError: an alpha of another shape or type.
+        ValueError: an alpha of another shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -85,6 +85,7 @@ def opaque(
     if source_alpha is not None:
         alpha = as_float64(source_alpha, "source_alpha")
         check.shape(alpha, ("H", "W"), "source_alpha")
+        check_proportions(alpha.shape, correspondence.source, "source_alpha")
         sampled, inside = sample(alpha[None], correspondence)
         mask &= (sampled[0] >= minimum) & inside
     return mask
@@ -111,7 +112,7 @@ def depth_agrees(
         spread: as in :func:`attnwarp.warp.depth.resize_depth`.
 
     Raises:
-        ValueError: a depth of another shape or type.
+        ValueError: a depth of another shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -148,7 +149,7 @@ def photometric(
         limit: the largest difference that passes.
 
     Raises:
-        ValueError: an image of another shape or type.
+        ValueError: an image of another shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -166,6 +167,7 @@ def photometric(
     source = as_float64(source_image, "source_image")
     target = as_float64(target_image, "target_image")
     check.shape(source, ("H", "W", "C"), "source_image")
+    check_proportions(source.shape[:2], correspondence.source, "source_image")
     check.shape(target, (*correspondence.z.shape, source.shape[2]), "target_image")
     warped, _ = sample(source.permute(2, 0, 1), correspondence)
     difference = (warped.permute(1, 2, 0) - target).abs().mean(dim=-1)

@@ -12,7 +12,12 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
-from attnwarp.warp.correspondence import Correspondence, in_bounds, positions_in
+from attnwarp.warp.correspondence import (
+    Correspondence,
+    check_proportions,
+    in_bounds,
+    positions_in,
+)
 from attnwarp.warp.depth import TAP_SPREAD, Array, blend_depth, valid_depth
 from attnwarp.warp.settings import DepthInterpolation
 from attnwarp.warp.taps import Taps, clamp_index, taps_of
@@ -27,9 +32,9 @@ def sample(
     """A source feature map, warped to the target's grid.
 
     Args:
-        features: (C, h, w) or (B, C, h, w) on the source's image, of any size: a position u becomes
-            u * w / W (for integer centres u * (w - 1) / (W - 1) on indices, which is what
-            align_corners=True does). Its gradient flows back through the result.
+        features: (C, h, w) or (B, C, h, w) on the source's image, of any size of its aspect ratio:
+            a position u becomes u * w / W (for integer centres u * (w - 1) / (W - 1) on indices,
+            which is what align_corners=True does). Its gradient flows back through the result.
         correspondence: H x W positions, float64; moved to the features' device.
         mode: "bilinear" for floating types: weights and sums in float32 for half precision, in the
             features' own type otherwise. "nearest" for any type, labels included.
@@ -41,7 +46,8 @@ def sample(
         mask: (H, W) bool, the position lies inside the source image (:func:`in_bounds`).
 
     Raises:
-        ValueError: another number of axes, a type that cannot be blended, an unknown mode.
+        ValueError: another number of axes or aspect ratio, a type that cannot be blended, an
+            unknown mode.
 
     Example:
         >>> import numpy as np
@@ -61,6 +67,7 @@ def sample(
         raise ValueError(
             f"features: got shape {tuple(features.shape)}, expected (C, h, w) or (B, C, h, w)"
         )
+    check_proportions(features.shape[-2:], correspondence.source, "features")
     xy = positions_in(correspondence, features.shape[-1], features.shape[-2])
     return sample_at(features, xy, mode=mode), in_bounds(correspondence).to(features.device)
 
@@ -155,14 +162,16 @@ def sample_tokens(tokens: Tensor, taps: Taps) -> Tensor:
     return total
 
 
-def blend_tokens(source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float) -> Tensor:
+def blend_tokens(
+    source: Tensor, new: Tensor, taps: Taps, mask: Tensor, alpha: float | Tensor
+) -> Tensor:
     """a (M warp(source) + (1 - M) new) + (1 - a) new, in the type of ``new``, rounded once.
 
     Args:
         source: (B or 1, h*w, C), new: (B, N, C), of one type.
         taps: as in :func:`sample_maps`.
         mask: (N,) bool. Where it is False the result has the bits of ``new``.
-        alpha: in [0, 1].
+        alpha: in [0, 1]; a () tensor has a gradient too.
     """
     warped = sample_tokens(source, taps)
     mixed = alpha * warped + (1 - alpha) * new.to(warped.dtype)
@@ -179,11 +188,15 @@ def sample_depth(
     """The source's own depth at the positions of a correspondence.
 
     Args:
-        source_depth: (h, w) depth along the source's optical axis, of any size.
+        source_depth: (h, w) depth along the source's optical axis, of any size of the source's
+            aspect ratio.
         interpolation, spread: as in :func:`resize_depth`.
 
     Returns:
         (H, W) float64, NaN outside the source image and where the taps do not answer.
+
+    Raises:
+        ValueError: a depth of another shape, aspect ratio or type.
 
     Example:
         >>> import numpy as np
@@ -198,6 +211,7 @@ def sample_depth(
         [2.0, 2.0, nan, nan]
     """
     depth = valid_depth(source_depth, "source_depth")
+    check_proportions(depth.shape, correspondence.source, "source_depth")
     xy = positions_in(correspondence, depth.shape[1], depth.shape[0])
     inside = in_bounds(correspondence)
     sampled = blend_depth(depth, torch.where(inside[..., None], xy, 0.5), interpolation, spread)

@@ -163,6 +163,20 @@ def test_fit_and_render_do_what_they_say(data, tmp_path):
     assert depth.shape == (32, 32) and 2 < np.nanmedian(depth) < 4
 
 
+def test_a_fit_of_other_settings_names_the_options_that_begin_again(data, tmp_path):
+    arguments = ("fit", data, "--out", tmp_path, "--max-size", 16, "--hold-out", 0)
+    assert in_process(*arguments, "--iterations", 1).exit_code == 0
+    result = in_process(*arguments, "--iterations", 2)
+    assert result.exit_code == 2
+    assert "iterations: 1, now 2" in result.stderr
+    assert f"remove {tmp_path / 'checkpoint.pt'}" in result.stderr
+    # What it advises is what it has.
+    assert "--restart" in result.stderr and "--start SPLATS.ply" in result.stderr
+    (tmp_path / "checkpoint.pt").write_bytes(b"damaged")
+    assert "--restart" in in_process(*arguments, "--iterations", 2).stderr
+    assert in_process(*arguments, "--iterations", 2, "--restart").exit_code == 0
+
+
 def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
     """Oracle: the held-out PSNR at which the first fit ended, through a PLY in float32."""
 

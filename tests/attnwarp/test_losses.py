@@ -89,6 +89,15 @@ def test_ssim_below_its_window_is_refused(shape):
         losses.ssim(torch.zeros(shape), torch.zeros(shape))
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.uint8])
+def test_ssim_of_another_type_is_refused_by_name(dtype):
+    image, target = pictures(dtype=torch.float32)
+    with pytest.raises(ValueError, match=f"image: got {dtype}, expected float32 or float64"):
+        losses.ssim(image.to(dtype), target)
+    with pytest.raises(ValueError, match=f"target: got {dtype}"):
+        losses.ssim_terms(image, target.to(dtype))
+
+
 def test_pictures_of_different_shapes_are_refused():
     with pytest.raises(ValueError, match=r"target: got shape \(8, 9, 3\)"):
         losses.l1(torch.zeros(9, 9, 3), torch.zeros(8, 9, 3))
@@ -108,6 +117,15 @@ def test_psnr_is_that_of_scikit_image_and_infinite_for_equal_pictures():
     expected = peak_signal_noise_ratio(image.numpy(), target.numpy(), data_range=1.0)
     assert losses.psnr(image, target) == pytest.approx(expected, abs=1e-9)
     assert losses.psnr(image, image) == math.inf
+
+
+def test_psnr_of_nan_is_nan_as_in_scikit_image():
+    from skimage.metrics import peak_signal_noise_ratio
+
+    image, target = pictures()
+    image[3, 5, 1] = math.nan
+    assert math.isnan(peak_signal_noise_ratio(image.numpy(), target.numpy(), data_range=1.0))
+    assert math.isnan(losses.psnr(image, target))
 
 
 def plane(angle, size=0.12, half=12):

@@ -377,7 +377,7 @@ def psnr_of_mse(error: float) -> float:
     """
     from attnwarp import losses
 
-    return math.nan if math.isnan(error) else losses.psnr_of_mse(error)
+    return losses.psnr_of_mse(error)
 
 
 def _terms(image: Array, target: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from attnwarp import Gaussians
+from attnwarp import Camera, Gaussians
 from attnwarp.fit import FitSettings, Views, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import read_ply
@@ -224,6 +224,60 @@ def test_no_seconds_left_means_no_iteration(scene):
     assert (result.stopped, result.iteration, len(result.history)) == ("time", 0, 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_seconds", -1),
+        ("max_seconds", float("nan")),
+        ("checkpoint_seconds", -1),
+        ("checkpoint_seconds", None),
+    ],
+)
+def test_seconds_that_cannot_be_are_refused_by_name(scene, name, value):
+    start, settings = begin(scene, iterations=1, sh_degree=0)
+    with pytest.raises(ValueError, match=f"{name}: got {value}, expected seconds >= 0"):
+        fit(start, scene[0], settings, **{name: value})
+
+
+def test_a_held_out_view_that_renders_as_nan_is_no_equal_picture(scene, monkeypatch):
+    def broken(gaussians, camera, **options):
+        view = render(gaussians, camera, **options)
+        if camera in scene[1].cameras:
+            view.color[0, 0, 0] = float("nan")
+        return view
+
+    monkeypatch.setattr("attnwarp.fit.loop.render", broken)
+    start, settings = begin(scene, iterations=1, sh_degree=0)
+    with pytest.raises(RuntimeError, match="after 0 iterations: the held-out view '00.png'"):
+        fit(start, scene[0], settings, held_out=scene[1])
+
+
+@pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
+def test_views_from_one_place_are_fitted_alike_in_any_unit(unit):
+    """Powers of two leave every digit as it is."""
+    far, grey = ring(1)[0].position, np.full((32, 32, 3), 0.2)
+    settings = FitSettings(kind="3d", iterations=5, sh_degree=0, densify=False)
+
+    def fitted(k):
+        start = dataclasses.replace(blobs(), scales=k * blobs().scales, means=k * blobs().means)
+        seen = Camera.look_at(k * far, (0, 0, 0), width=32, height=32, fov_y=40)
+        return fit(start, Views([seen], [grey]), settings).gaussians
+
+    one, other = fitted(1.0), fitted(unit)
+    assert float((one.sh - blobs().sh).abs().max()) > 0.005  # 5 steps of 0.0025
+    torch.testing.assert_close(other.sh, one.sh, rtol=0, atol=1e-5)
+    torch.testing.assert_close(other.means / unit, one.means, rtol=0, atol=1e-5)
+    torch.testing.assert_close(other.scales / unit, one.scales, rtol=1e-4, atol=0)
+
+
+def test_scales_without_a_learning_rate_stay_however_large_or_small(scene):
+    start, settings = begin(scene, kind="3d", iterations=3, lr_scales=0, sh_degree=0, densify=False)
+    start.scales[0], start.scales[1] = 1e5, 1e-9  # of an extent of 3
+    result = fit(start, scene[0], settings)
+    # They are kept as logarithms of float32.
+    torch.testing.assert_close(result.gaussians.scales, start.scales, rtol=1e-5, atol=0)
+
+
 def test_patience_ends_a_fit_that_no_longer_gains(scene):
     start, settings = begin(
         scene,
@@ -258,8 +312,11 @@ def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
 def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_path):
     start, settings = begin(scene, iterations=5, sh_degree=0)
     fit(start, scene[0], settings, folder=tmp_path)
-    with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)"):
+    with pytest.raises(ValueError, match=r"other settings \(ssim: 0.2, now 0.3\)") as caught:
         fit(start, scene[0], dataclasses.replace(settings, ssim=0.3), folder=tmp_path)
+    # The library names the file; options are the command line's to advise.
+    assert f"remove {tmp_path / CHECKPOINT} to begin again" in str(caught.value)
+    assert "--" not in str(caught.value)
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
     moved = dataclasses.replace(start, means=start.means + 0.01)
@@ -317,6 +374,7 @@ def test_settings_survive_json():
         ({"antialiased": True}, "antialiased: applies to kind '3d' only"),
         ({"distortion_form": "l2"}, "distortion_form: got 'l2'"),
         ({"iterations": True}, "iterations: got True"),
+        ({"reset_opacity": 1}, "reset_opacity: got 1, expected a number in"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(changes, message):

@@ -61,8 +61,17 @@ def test_points_at_one_place_become_one_splat():
     torch.testing.assert_close(g.scales, torch.ones(2, 3))
 
 
-def test_one_point_alone_is_a_splat():
-    assert len(from_points([[1e6, 2e6, 3e6]], kind="2d")) == 1
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_one_point_alone_is_a_hundredth_of_the_scene_in_any_unit(unit):
+    view = dict(width=8, height=8, fov_y=40)
+    place = np.array([1e6, 2e6, 3e6])
+    camera = Camera.look_at(place + unit * np.array([0, 4, 0]), place, **view)
+    alone = from_points([place], kind="2d", cameras=[camera])
+    torch.testing.assert_close(alone.scales, torch.full((1, 2), 0.04 * unit), rtol=1e-6, atol=0)
+    # Cameras 4 units from their middle: 1.1 times that is the extent.
+    ends = [Camera.look_at(place + unit * np.array([x, 1, 0]), place, **view) for x in (-4, 4)]
+    among = from_points([place], kind="3d", cameras=ends)
+    torch.testing.assert_close(among.scales, torch.full((1, 3), 0.044 * unit), rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize(
@@ -97,13 +106,20 @@ def test_random_points_lie_in_front_of_parallel_cameras():
     assert points[:, 1].mean() > 0.5
 
 
-def test_extent_is_that_of_3dgs_and_one_for_a_single_camera():
+def test_extent_is_that_of_3dgs_and_a_single_cameras_is_its_distance_from_what_it_sees():
     cameras = ring(4)
     centers = np.stack([c.position for c in cameras])
     assert extent_of(cameras) == pytest.approx(
         1.1 * np.linalg.norm(centers - centers.mean(0), axis=1).max()
     )
     assert extent_of(cameras[:1]) == 1
+    away = np.array([[0.0, 0, 2], [0, 7, 0], [5, 0, 0]])
+    for unit in (1e-3, 1.0, 1e4):
+        one = Camera.look_at((3, 1, 2), (0, 0, 0), width=8, height=8, fov_y=40)
+        assert extent_of([one, one], one.position + unit * away) == pytest.approx(5 * unit)
+        # Where cameras stand apart, they decide alone.
+        assert extent_of(cameras, unit * away) == extent_of(cameras)
+    assert extent_of([one], np.empty((0, 3))) == extent_of([one], one.position[None]) == 1
 
 
 def camera(width=6, height=4, name="a.png"):

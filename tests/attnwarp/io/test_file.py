@@ -6,9 +6,11 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from plyfile import PlyData
 
-from attnwarp.io import file
+from attnwarp.io import file, write_points
 from attnwarp.io.file import write_atomically
 
 KILLED = """
@@ -49,3 +51,24 @@ def test_a_write_that_raises_keeps_the_old_file(tmp_path):
     with pytest.raises(RuntimeError):
         write_atomically(tmp_path / "a", fail)
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [b"old"]
+
+
+def test_the_writers_of_a_persons_files_follow_a_link_and_the_others_replace_it(tmp_path):
+    (tmp_path / "big").mkdir()
+    (tmp_path / "big/old.ply").write_bytes(b"old")
+    points = np.eye(3)
+    for name in ("old.ply", "new.ply"):  # the second leads to a file that is not yet there
+        (tmp_path / name).symlink_to(f"big/{name}")
+        write_points(tmp_path / name, points)
+        assert str((tmp_path / name).readlink()) == f"big/{name}"
+        assert PlyData.read(tmp_path / "big" / name)["vertex"]["x"].tolist() == [1, 0, 0]
+    write_atomically(tmp_path / "old.ply", lambda stream: stream.write(b"own"))
+    assert not (tmp_path / "old.ply").is_symlink()
+    assert (tmp_path / "big/old.ply").read_bytes() != b"own"
+    assert {path.name for path in (tmp_path / "big").iterdir()} == {"new.ply", "old.ply"}
+
+
+@pytest.mark.parametrize("name", [255 * "n", 63 * "\N{GRINNING FACE}"], ids=["1 byte", "4 bytes"])
+def test_a_name_as_long_as_the_file_system_takes_can_be_written(tmp_path, name):
+    write_atomically(tmp_path / name, lambda stream: stream.write(b"whole"))
+    assert (tmp_path / name).read_bytes() == b"whole"

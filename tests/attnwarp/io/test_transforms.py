@@ -286,6 +286,19 @@ def test_what_is_written_is_read_back(tmp_path, focal):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize("folder", ["link", "link/inner", "data"])
+def test_what_is_written_through_a_link_is_read_back(tmp_path, folder):
+    """A folder that is a link, one inside it, and images that lie behind one."""
+    (tmp_path / "deep/er/inner").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("deep/er")
+    (tmp_path / "data").mkdir()
+    path = image(tmp_path / ("link/a.png" if folder == "data" else "imgs/a.png"))
+    camera = Camera.look_at((3, 1, 2), (0, 1, 0), width=8, height=6, fov_y=50)
+    write_transforms(tmp_path / folder, Dataset([camera], [path]))
+    (read,) = read_dataset(tmp_path / folder).image_paths
+    assert read.samefile(path)
+
+
 def test_the_written_file_says_what_other_readers_look_for(tmp_path):
     write_transforms(tmp_path / "transforms.json", dataset_of(tmp_path))
     data = json.loads((tmp_path / "transforms.json").read_text())

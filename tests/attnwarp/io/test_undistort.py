@@ -112,6 +112,24 @@ def test_the_undistorted_camera_sees_no_blank_pixel_and_could_not_be_larger(mode
     assert not seen.all(axis=0)[[0, -1]].all() or not seen.all(axis=1)[[0, -1]].all()
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_the_colour_of_transparent_pixels_does_not_bleed_into_their_neighbours(dtype):
+    camera, lens = camera_of("OPENCV"), Lens("brown", (-0.1,))
+    top = np.iinfo(dtype).max
+    image = np.full((SIZE[1], SIZE[0], 4), top, dtype)
+    image[..., 3] = 0
+    image[12:36, 16:48] = (top, 0, 0, top)  # red on transparent white
+    target = undistorted_camera(camera, lens)
+    seen = undistorted_image(image, camera, lens, target)
+    rim = seen[(seen[..., 3] > 0) & (seen[..., 3] < top)]
+    assert len(rim) > 50 and (rim[:, :3] == (top, 0, 0)).all()
+    # Alpha, and the picture over black, are resampled as they are without the other.
+    over_black = image[..., :3] * (image[..., 3:] > 0)
+    expected = undistorted_image(over_black.astype(dtype), camera, lens, target)
+    shown = seen[..., :3] * (seen[..., 3:].astype(float) / top)
+    np.testing.assert_allclose(shown, expected, atol=1)
+
+
 def test_coefficients_that_fold_the_picture_over_are_refused():
     with pytest.raises(ValueError, match=r"lens: .* fold the picture of camera 'a.png' over"):
         undistorted_camera(camera_of("OPENCV"), Lens("brown", (-3.0, 0.0)))

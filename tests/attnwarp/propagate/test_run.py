@@ -239,6 +239,16 @@ def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, edit
     assert released.edit_psnr["views"] == list(errors)[:3]
 
 
+def test_a_view_that_renders_as_nan_is_no_equal_picture(finished, scene, editor, monkeypatch):
+    """Of an edit that is complete but for what its folder says of the end."""
+    render = attnwarp.propagate.run.render_picture
+    monkeypatch.setattr(
+        attnwarp.propagate.run, "render_picture", lambda *args: np.nan * render(*args)
+    )
+    with pytest.raises(RuntimeError, match="after tuning: view '.*' renders as NaN"):
+        run(scene, editor, finished[1])
+
+
 def test_a_recording_on_disk_gives_the_same_bytes_and_goes_away(finished, scene, editor, tmp_path):
     run(scene, editor, tmp_path, store="disk")
     assert files(tmp_path) == files(finished[1])

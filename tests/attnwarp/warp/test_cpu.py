@@ -106,6 +106,36 @@ def test_views_and_their_parts_of_different_sizes_agree():
         assert view.mask.any()
 
 
+@pytest.mark.parametrize("part", ["depth", "alpha", "image"])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_part_of_the_source_with_other_proportions_is_refused_by_name(part, backend):
+    source, target = orbit(0, size=32, width=16, height=1), orbit(20, size=32, width=16, height=1)
+    seen, other = scene(target), scene(source)
+    turned = dataclasses.replace(other, **{part: np.swapaxes(getattr(other, part), 0, 1)})
+    with pytest.raises(ValueError, match=f"source_{part}: got 16 x 32 .* aspect ratio of 32 x 16"):
+        warp_surfaces(source, target, seen, turned, EVERYTHING, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_maps_that_are_flipped_or_of_the_other_byte_order_are_read_as_they_show(backend):
+    source, target = orbit(0, size=16, height=1), orbit(20, size=16, height=1)
+    plain = [scene(camera, np.float32) for camera in (target, source)]
+    settings = preset("corrected", normal_test="facing")
+    expected = warp_surfaces(source, target, *plain, settings, backend=backend).mask
+    assert expected.any() and not expected.all()
+    for change in (
+        lambda a: a[::-1, ::-1].copy()[::-1, ::-1],
+        lambda a: a.astype(a.dtype.newbyteorder()),
+        np.asfortranarray,
+    ):
+        views = [
+            Surface(*(change(part) for part in (view.depth, view.normal, view.alpha)))
+            for view in plain
+        ]
+        mask = warp_surfaces(source, target, *views, settings, backend=backend).mask
+        assert torch.equal(mask, expected)
+
+
 def test_points_at_and_behind_the_camera():
     # Hard case 4, with and without the test of the side.
     target = Camera(np.array([[1.0, 0, 2.5], [0, 1.0, 0.5], [0, 0, 1]]), np.eye(4), 5, 1)

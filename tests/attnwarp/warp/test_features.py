@@ -195,6 +195,20 @@ def test_gradients_are_those_of_torchs_own_sampling(layer):
                 assert (got - want).abs().max() < 1e-5
 
 
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_weight_that_is_a_tensor_gets_its_gradient(layer, backend):
+    layer = dataclasses.replace(layer, backend=backend)
+    maps, own, weigh = (random_maps(layer, dtype=torch.float64, seed=k) for k in range(3))
+    alpha = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
+    blended = layer.blend_tokens(tokens_of(maps), tokens_of(own), alpha)
+    (gradient,) = torch.autograd.grad((blended * tokens_of(weigh)).sum(), alpha)
+    # The blend is linear in a: new + a M (warped - new).
+    slope = layer.mask.double() * (grid_sampled(layer, maps) - own)
+    assert float(gradient) == pytest.approx(float((slope * weigh).sum()), rel=1e-5)
+    plain = layer.blend_tokens(tokens_of(maps), tokens_of(own), alpha.detach())
+    assert torch.equal(blended.detach(), plain)
+
+
 def test_one_source_for_all_gathers_the_gradient_of_all(layer):
     source = tokens_of(random_maps(layer, batch=1)).requires_grad_()
     new = tokens_of(random_maps(layer, batch=3, seed=1))
@@ -214,7 +228,7 @@ def test_one_source_for_all_gathers_the_gradient_of_all(layer):
         (lambda w, s, n: w.warp_tokens(s[:, 1:]), r"source: got shape \(2, 191, 5\)"),
         (lambda w, s, n: w.warp_tokens(s.long()), r"source: got torch\.int64, expected a floating"),
         (
-            lambda w, s, n: w.warp(s.long()[None]),
+            lambda w, s, n: w.warp(torch.ones(5, 12, 16, dtype=torch.int64)),
             r"features: got torch\.int64, expected a floating",
         ),
         (lambda w, s, n: w.warp(s[0]), r"features: got shape \(192, 5\)"),
@@ -230,6 +244,16 @@ def test_one_source_for_all_gathers_the_gradient_of_all(layer):
         (
             lambda w, s, n: w.blend_tokens(s.clone().requires_grad_(), n, 1, in_place=True),
             r"in_place: got True where a gradient is recorded",
+        ),
+        (
+            lambda w, s, n: w.blend_tokens(
+                s, n, torch.tensor(0.5, requires_grad=True), in_place=True
+            ),
+            r"in_place: got True where a gradient is recorded",
+        ),
+        (
+            lambda w, s, n: w.blend_tokens(s, n, torch.full((2,), 0.5)),
+            r"alpha: got shape \(2,\), expected \(\)",
         ),
     ],
 )

@@ -21,7 +21,8 @@ def test_features_of_any_size_are_read_at_u_times_s(size):
     full = correspond(source, target, depth)
     layer = correspond_at(source, target, depth, size)
     margin = 0.5 / min(h, w)  # nearer the border than half a pixel the ramp is clamped
-    for c in (full, layer):
+    # A stretched map belongs to a stretched view alone.
+    for c in (full, layer) if h == w else (layer,):
         warped, mask = sample(ramp, c)
         position = (c.xy / torch.tensor([c.source.width, c.source.height])).permute(2, 0, 1)
         inner = mask & (position > margin).all(0) & (position < 1 - margin).all(0)
@@ -132,7 +133,7 @@ def test_integer_centres_are_align_corners_on_indices():
     j, i = np.meshgrid(np.arange(64.0), np.arange(64.0))
     u, _ = source.project(target.unproject(np.stack([j, i], axis=-1), depth))
     assert np.abs(c.xy.numpy() - 0.5 - u).max() < 1e-9
-    for h, w in ((64, 64), (32, 48)):
+    for h, w in ((64, 64), (32, 33)):
         features = torch.randn(
             3, h, w, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
         )
@@ -160,6 +161,19 @@ def test_a_position_on_the_border_is_in_and_beyond_it_takes_the_borders_value():
     assert warped[0, 0].tolist() == [0, 15, 6, 3]
     assert in_bounds(moved, (8, 8))[0].tolist() == [True, True, False, False]
     assert in_bounds(moved, (2, 2)).sum() == 3  # the corner, and the two centres of the second row
+
+
+def test_maps_of_other_proportions_than_the_source_are_refused_by_name():
+    wide = orbit(0, size=16, width=32)
+    c = correspond(wide, wide, np.full((16, 32), 4.0))
+    for call, name in (
+        (lambda: sample(torch.ones(3, 32, 16), c), "features"),
+        (lambda: sample_depth(np.full((32, 16), 4.0), c), "source_depth"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: got 32 x 16 .* aspect ratio of 16 x 32"):
+            call()
+    # The picture of 16 x 32 reduced by three, each side rounded: 5 x 11.
+    assert sample(torch.ones(3, 5, 11), c)[0].min() == 1
 
 
 def test_the_sources_own_depth_answers_where_its_taps_do():
