@@ -257,10 +257,23 @@ class Latent:
         return self.raw_latents(ready) * self.vae.config.scaling_factor
 
     def decode(self, latents: Tensor) -> list[Image]:
-        """(H, W, 3) float32 pictures in [0, 1] of scaled latents."""
+        """(H, W, 3) float32 pictures in [0, 1] of scaled latents.
+
+        Raises:
+            ValueError: latents, or what the decoder makes of them, that are not finite.
+        """
         with torch.no_grad():
             scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
             sample = self.vae.decode(scaled, return_dict=False)[0]
+        # A NaN would become a black pixel.
+        for name, values in (("latents", latents), ("decoded latents", sample)):
+            finite = values.isfinite()
+            if not finite.all():
+                raise ValueError(
+                    f"{name}: {int((~finite).sum())} of {finite.numel()} values are not finite;"
+                    " lower the guidance, or load the editor in float32 if it runs in half"
+                    " precision"
+                )
         pictures = (sample.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
         return list(pictures.cpu().numpy())
 

@@ -23,7 +23,13 @@ from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.folder import load_parts
 from attnwarp.editing.pix2pix import InstructPix2Pix
-from attnwarp.editing.schedule import Schedule, following, steps_as_published, steps_from
+from attnwarp.editing.schedule import (
+    Schedule,
+    following,
+    stable_diffusion_alphas,
+    steps_as_published,
+    steps_from,
+)
 from attnwarp.editing.small import WEIGHTS, bundled
 from attnwarp.errors import InputError
 
@@ -199,6 +205,47 @@ def test_a_step_is_diffusers_step(prediction):
     for now, then in following(scheduler.timesteps.tolist()):
         theirs = scheduler.step(output, now, x).prev_sample
         assert torch.allclose(schedule.step(output, x, now, then), theirs, rtol=0, atol=1e-5)
+
+
+HALF = pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+
+
+@HALF
+@pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
+def test_a_step_in_half_precision_is_the_formula_in_float64_rounded_once(prediction, dtype):
+    alphas = stable_diffusion_alphas().float()
+    schedule = Schedule(alphas, prediction, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    x, output = (torch.randn((1, 4, 8, 8), generator=generator).to(dtype) for _ in range(2))
+    wide, out = x.double(), output.double()
+
+    def rounded_once(result, exact):
+        assert result.dtype == dtype
+        # Beside the rounding there is float32's error, over sqrt(1 - alpha-bar) >= 0.029.
+        allowed = torch.finfo(dtype).eps / 2 * exact.abs() + 1e-5
+        assert ((result.double() - exact).abs() <= allowed).all()
+
+    for now, then in ((981, 961), (20, 1), (1, 0), (1, None), (0, None)):
+        a, after = float(alphas[now]), 1.0 if then is None else float(alphas[then])
+        root, rest = a**0.5, (1 - a) ** 0.5
+        x0, noise = {
+            "epsilon": ((wide - rest * out) / root, out),
+            "sample": (out, (wide - root * out) / rest),
+            "v_prediction": (root * wide - rest * out, root * out + rest * wide),
+        }[prediction]
+        expected = after**0.5 * x0 + (1 - after) ** 0.5 * noise
+        rounded_once(schedule.step(output, x, now, then), expected)
+        rounded_once(schedule.add_noise(x, output, now), root * wide + rest * out)
+
+
+def test_latents_that_are_not_finite_are_refused_and_do_not_become_black():
+    editor = editor_of(pix2pix())
+    latents = torch.zeros(1, 4, 8, 12)
+    latents[0, 1, 2, 3] = float("nan")
+    with pytest.raises(ValueError, match=r"latents: 1 of 384 values are not finite; lower the"):
+        editor.decode(latents)
+    with pytest.raises(ValueError, match=r"decoded latents: \d+ of 1152 values are not finite"):
+        editor.decode(torch.full((1, 4, 8, 12), 3e38))
 
 
 def test_a_recorded_edit_injected_into_itself_changes_no_bit_with_every_editor():
