@@ -8,6 +8,7 @@ what their processors return, so every processor works, and none has to be repla
 from __future__ import annotations
 
 import functools
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -163,7 +164,7 @@ class RecordingPlan:
         views: pictures in a batch.
         dtype: of what is stored. Half precision halves the memory and rounds.
         store: "device" leaves features where they are made, "cpu" moves them to main memory, a
-            folder writes them there.
+            Path of a folder writes them there. Each recording has a folder of its own in it.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -190,6 +191,10 @@ class RecordingPlan:
             check.one_of(branch, self.branches, "keep")
         if not self.keep:
             raise ValueError("keep: got no branch, expected at least one")
+        if not isinstance(self.store, Path) and self.store not in ("device", "cpu"):
+            raise ValueError(
+                f"store: got {self.store!r}, expected 'device', 'cpu' or a folder as a Path"
+            )
         if min(self.steps, self.views, *self.latent_size) < 1:
             raise ValueError(
                 f"steps, views, latent_size: got {self.steps}, {self.views}, {self.latent_size},"
@@ -234,6 +239,13 @@ class Recording:
     plan: RecordingPlan
     timesteps: list[float] = field(default_factory=list)
     _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict, repr=False)
+
+    @functools.cached_property
+    def _folder(self) -> Path:
+        """A new folder, so that no other recording writes to the same files."""
+        store = Path(self.plan.store)
+        store.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix="recording-", dir=store))
 
     @property
     def bytes(self) -> int:
@@ -296,9 +308,7 @@ class Recording:
         else:
             from safetensors.torch import save_file
 
-            folder = Path(plan.store)
-            folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"{timestep:g}-{layer.name}.safetensors"
+            path = self._folder / f"{timestep:g}-{layer.name}.safetensors"
             save_file({"features": stored.cpu()}, path)
             self._features[key] = path
 

@@ -310,7 +310,24 @@ def test_the_memory_is_what_was_announced_and_features_come_back_from_where_they
         assert stored.dtype == dtype
         assert torch.equal(stored, full.features(981.0, layer, "image").to(dtype))
     if store == "disk":
-        assert len(list((tmp_path / "features").iterdir())) == 2 * len(plan.layers)
+        files = list((tmp_path / "features").rglob("*.safetensors"))
+        assert len(files) == 2 * len(plan.layers)
+
+
+def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
+    """Oracle: the same recordings in memory."""
+    net = unet(8)
+    plans = [plan_of(net, steps=1, store=store) for store in (tmp_path, "device")]
+    on_disk, in_memory = [], []
+    for seed in (0, 1):
+        for plan, into in zip(plans, (on_disk, in_memory), strict=True):
+            with record(net, plan) as recording:
+                run(net, seed=seed, timesteps=(500,))
+            into.append(recording)
+    for layer in plans[0].layers:
+        features = [[r.features(500.0, layer, "text") for r in kind] for kind in (on_disk, in_memory)]
+        assert all(map(torch.equal, *features))
+        assert not torch.equal(*features[0])
 
 
 def test_what_does_not_match_the_recording_is_refused_by_name():
@@ -358,5 +375,8 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         run(net, timesteps=(981, 981))
     with pytest.raises(ValueError, match="keep: got 'control'"):
         plan_of(net, keep=("control",))
+    for store in ("gpu", "disk", "a/folder"):  # no word is taken for a folder's name
+        with pytest.raises(ValueError, match=f"store: got '{store}', expected 'device', 'cpu' or"):
+            plan_of(net, store=store)
     with pytest.raises(ValueError, match="branch: got 'uncond'"):
         recording.features(981.0, recording.plan.layers[0], "uncond")
