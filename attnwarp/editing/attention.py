@@ -20,6 +20,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.warp import FeatureWarp, resize_mask
+from attnwarp.warp.sampling import work_type
 
 Kind = Literal["self", "cross"]
 Block = Literal["down", "mid", "up"]
@@ -563,7 +564,8 @@ def _blend_into(
                 f"size: the recording has {source_size} features, the target {size}; give a warp"
                 " between views of different sizes"
             )
-        result.copy_(alpha * source + (1 - alpha) * new)
+        work = work_type(new.dtype)  # half precision is rounded once, as by FeatureWarp
+        result.copy_(alpha * source.to(work) + (1 - alpha) * new.to(work))
         return
     layer = warp.at(size, source_size=source_size)
     if isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():

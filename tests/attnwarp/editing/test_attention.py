@@ -235,6 +235,41 @@ def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
     assert torch.equal(own[first.name][2], blended[first.name][2])  # the unconditional branch
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_blend_without_a_warp_in_half_precision_is_rounded_once(dtype):
+    """Oracle: the formula in float64. A second rounding would be another half step."""
+    net = unet(8).to(dtype)
+    plan = plan_of(net, steps=1)
+    first = plan.layers[0]
+    generator = torch.Generator().manual_seed(0)
+    kept = {}
+
+    def passed(name):
+        x = torch.randn((3, 8, *SIZE), generator=generator).to(dtype)
+        text = torch.randn((3, 5, 32), generator=generator).to(dtype)
+
+        def keep(layer, features, call):
+            kept[name] = features.clone()
+
+        with torch.no_grad(), hooked(net, [first], keep):
+            net(x, torch.tensor(500), encoder_hidden_states=text)
+        return x, text
+
+    with record(net, plan) as recording:
+        passed("source")
+    again = passed("new")
+    injection = inject(
+        net, recording, branches=PIX2PIX_BRANCHES, weight=constant(0.9), layers=[first]
+    )
+    with injection, hooked(net, [first], lambda _, features, __: kept.update(blend=features)):
+        with torch.no_grad():
+            net(again[0], torch.tensor(500), encoder_hidden_states=again[1])
+    expected = 0.9 * kept["source"].double() + (1 - 0.9) * kept["new"].double()
+    off = (kept["blend"].double() - expected)[:2].abs()  # the recorded branches
+    assert (off <= torch.finfo(dtype).eps / 2 * expected[:2].abs() + 1e-6).all()
+    assert kept["blend"].dtype == dtype
+
+
 def test_one_source_serves_several_views_each_with_its_own_warp():
     net = unet(8)
     with record(net, plan_of(net)) as recording:
