@@ -472,7 +472,7 @@ def inject(
         unet: the UNet that the features came from, or one of its shape.
         recording: features of the source view.
         branches: the guidance branches in the order of the batch; those that were recorded get
-            features.
+            features. One whose share of the guidance is 0 may be missing.
         warps: of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None for
             the identity.
         weight: a by (step number, number of steps); :func:`decay` if left out.
@@ -506,11 +506,11 @@ def inject(
     for layer in chosen:
         if layer not in plan.layers:
             raise ValueError(f"layers: {layer.name} was not recorded")
-    for branch in plan.keep:
-        if branch not in branches:
-            raise ValueError(
-                f"branches: {branch!r} was recorded, the batch has {', '.join(branches)}"
-            )
+    shared = [branch for branch in plan.keep if branch in branches]
+    if not shared:
+        raise ValueError(
+            f"branches: recorded are {', '.join(plan.keep)}, the batch has {', '.join(branches)}"
+        )
     if mask is not None and (mask.ndim != 2 or mask.dtype != torch.bool):
         raise ValueError(f"mask: got {mask.dtype} {tuple(mask.shape)}, expected bool (H, W)")
     views = len(warps)
@@ -530,7 +530,7 @@ def inject(
             return features
         size, source_size = layer.size(call.latent_size), layer.size(plan.latent_size)
         result = features.clone()
-        for branch in plan.keep:
+        for branch in shared:
             source = recording.features(call.timestep, layer, branch).to(
                 features.device, features.dtype
             )

@@ -179,6 +179,20 @@ def test_a_views_own_features_at_full_weight_with_the_identity_change_no_bit():
             assert not torch.equal(run(net, seed=1), plain)
 
 
+def test_a_recorded_branch_that_the_batch_lacks_leaves_the_others_their_features():
+    """Where text and image guidance are equal, the branch of the picture alone does not run.
+    Oracle: a recording without that branch."""
+    net = unet(8)
+    outputs = []
+    for keep in (("text", "image"), ("text",)):
+        with record(net, plan_of(net, keep=keep)) as recording:
+            run(net)
+        with inject(net, recording, branches=("text",), weight=constant(0.5)):
+            outputs.append(run(net, seed=1, rows=1))
+    assert torch.equal(*outputs)
+    assert not torch.equal(outputs[0], run(net, seed=1, rows=1))
+
+
 def test_weight_zero_changes_no_bit():
     net = unet(8)
     with record(net, plan_of(net)) as recording:
@@ -379,9 +393,9 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
     with pytest.raises(ValueError, match="timestep: got 980, recorded are 981, 481"):
         again(passes={"timesteps": (980,)})
     with pytest.raises(
-        ValueError, match="branches: 'image' was recorded, the batch has uncond, text"
+        ValueError, match="branches: recorded are text, image, the batch has uncond, txt"
     ):
-        again(branches=CONTROLNET_BRANCHES)
+        again(branches=("uncond", "txt"))
     with pytest.raises(ValueError, match=r"batch: got 2 rows, expected 3: 1 views in 3 branches"):
         again(passes={"rows": 2})
     with pytest.raises(
