@@ -524,6 +524,9 @@ def inject(
                 f"batch: got {call.batch} rows, expected {rows}: {views} views in"
                 f" {len(branches)} branches ({', '.join(branches)})"
             )
+        if mask is not None:
+            h, w = mask.shape
+            check.same_aspect((h, w), call.latent_size, "mask", "transpose a mask of (W, H)")
         alpha = weight(recording.step_of(call.timestep), plan.steps)
         _check_share(alpha, "weight")
         if alpha == 0:

@@ -406,6 +406,10 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         again(layers=[Layer("elsewhere", "self", 0, 16)])
     with pytest.raises(ValueError, match=r"mask: got torch.float32 \(2, 2\)"):
         again(mask=torch.ones(2, 2))
+    with pytest.raises(
+        ValueError, match=r"mask: got 48 x 36 .*, expected the aspect ratio of 6 x 8; transpose"
+    ):
+        again(mask=torch.ones((48, 36), dtype=torch.bool))
     with pytest.raises(ValueError, match=r"weight: got 1.2"):
         again(weight=lambda step, steps: 1.2)
     with (
