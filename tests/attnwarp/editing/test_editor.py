@@ -305,6 +305,32 @@ def test_editors_are_read_from_folders_in_diffusers_format(tmp_path):
         )
 
 
+def test_a_folder_with_weights_of_half_precision_alone_is_read(tmp_path):
+    """Oracle: diffusers' pipeline, which wrote the folder, cast to half and back."""
+    pipe = controlnet().to(torch.float16)
+    pipe.save_pretrained(tmp_path, variant="fp16")
+    assert len(list(tmp_path.rglob("*.fp16.safetensors"))) == 4
+    loaded = DepthControlNet.from_folder(str(tmp_path))
+    assert loaded.unet.dtype == torch.float32
+    for name in ("unet", "vae", "text_encoder", "controlnet"):
+        weights = getattr(loaded, name).state_dict()
+        for key, value in getattr(pipe, name).state_dict().items():
+            assert torch.equal(weights[key], value.to(weights[key].dtype)), (name, key)
+
+
+def test_a_view_that_sees_nothing_is_drawn_from_a_black_control_picture():
+    """Oracle: diffusers' pipeline, given black."""
+    pipe = controlnet()
+    noise = torch.randn((1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8))
+    theirs = pipe(
+        "a bear", image=torch.zeros(1, 3, H, W), num_inference_steps=2, guidance_scale=5.0, latents=noise,
+        output_type="np", height=H, width=W,
+    ).images[0]  # fmt: skip
+    nothing = np.full((H, W), np.nan)
+    ours = edit(editor_of(pipe), [nothing], "a bear", steps=2, noise=noise)
+    assert np.abs(ours.images[0] - theirs).max() < 1e-5
+
+
 @pytest.mark.parametrize(
     ("lost", "message"),
     [
