@@ -283,6 +283,13 @@ def test_what_does_not_fit_is_refused_by_name():
         ValueError, match=r"noise: got shape \(1, 4, 2, 2\), expected \(1, 4, 8, 12\)"
     ):
         edit(editor, [picture()], "a bear", noise=torch.zeros(1, 4, 2, 2))
+    for steps in (0, 2.5, 1001):
+        with pytest.raises(ValueError, match=f"steps: got {steps}, expected a whole number in"):
+            edit(editor, [picture()], "a bear", steps=steps)
+    latents = torch.zeros(1, 4, H // 2, W // 2)
+    for name, value in (("start", 700), ("noise", latents)):
+        with pytest.raises(ValueError, match=f"latents: got latents and {name}, expected one of"):
+            edit(editor, [picture()], "a bear", latents=latents, **{name: value})
     with pytest.raises(ValueError, match="has .* tokens, the text encoder takes 24; shorten it"):
         edit(editor, [picture()], "a bear " * 30)
     with pytest.raises(ValueError, match="depth: got -1"):
