@@ -115,9 +115,7 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
-    how: dict[str, Any] = (
-        {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
-    )
+    how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
     if _variants(folder) == ["fp16"]:
         how["variant"] = "fp16"
     try:

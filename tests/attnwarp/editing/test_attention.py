@@ -255,33 +255,27 @@ def test_a_blend_without_a_warp_in_half_precision_is_rounded_once(dtype):
     net = unet(8).to(dtype)
     plan = plan_of(net, steps=1)
     first = plan.layers[0]
-    generator = torch.Generator().manual_seed(0)
-    kept = {}
+    tokens = {}
 
-    def passed(name):
+    def run_half(name, seed):
+        generator = torch.Generator().manual_seed(seed)
         x = torch.randn((3, 8, *SIZE), generator=generator).to(dtype)
         text = torch.randn((3, 5, 32), generator=generator).to(dtype)
-
-        def keep(layer, features, call):
-            kept[name] = features.clone()
-
-        with torch.no_grad(), hooked(net, [first], keep):
+        keep = hooked(net, [first], lambda _, features, __: tokens.update({name: features.clone()}))
+        with torch.no_grad(), keep:
             net(x, torch.tensor(500), encoder_hidden_states=text)
-        return x, text
 
     with record(net, plan) as recording:
-        passed("source")
-    again = passed("new")
-    injection = inject(
-        net, recording, branches=PIX2PIX_BRANCHES, weight=constant(0.9), layers=[first]
-    )
-    with injection, hooked(net, [first], lambda _, features, __: kept.update(blend=features)):
-        with torch.no_grad():
-            net(again[0], torch.tensor(500), encoder_hidden_states=again[1])
-    expected = 0.9 * kept["source"].double() + (1 - 0.9) * kept["new"].double()
-    off = (kept["blend"].double() - expected)[:2].abs()  # the recorded branches
-    assert (off <= torch.finfo(dtype).eps / 2 * expected[:2].abs() + 1e-6).all()
-    assert kept["blend"].dtype == dtype
+        run_half("source", seed=0)
+    run_half("new", seed=1)
+    how = {"branches": PIX2PIX_BRANCHES, "weight": constant(0.9), "layers": [first]}
+    with inject(net, recording, **how):
+        run_half("blend", seed=1)
+    source, new, blend = (tokens[name][:2] for name in ("source", "new", "blend"))
+    expected = 0.9 * source.double() + (1 - 0.9) * new.double()
+    allowed = torch.finfo(dtype).eps / 2 * expected.abs() + 1e-6
+    assert ((blend.double() - expected).abs() <= allowed).all()
+    assert blend.dtype == dtype
 
 
 def test_one_source_serves_several_views_each_with_its_own_warp():
@@ -374,7 +368,9 @@ def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
                 run(net, seed=seed, timesteps=(500,))
             into.append(recording)
     for layer in plans[0].layers:
-        features = [[r.features(500.0, layer, "text") for r in kind] for kind in (on_disk, in_memory)]
+        features = [
+            [r.features(500.0, layer, "text") for r in kind] for kind in (on_disk, in_memory)
+        ]
         assert all(map(torch.equal, *features))
         assert not torch.equal(*features[0])
 
