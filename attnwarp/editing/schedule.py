@@ -58,7 +58,7 @@ class Schedule:
         """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the type of ``x``."""
         clean = widened(x)
         a = self.alphas[timestep].to(clean)
-        return (a.sqrt() * clean + (1 - a).sqrt() * noise).to(x.dtype)
+        return (a.sqrt() * clean + (1 - a).sqrt() * widened(noise)).to(x.dtype)
 
     def split(self, output: Tensor, x: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """The predicted x_0 and noise, from a network's output at x; float32 of half precision."""
