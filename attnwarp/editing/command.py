@@ -178,7 +178,7 @@ def _orientation(path: Path) -> int:
         with Pillow.open(path) as image:
             # OpenCV turns TIFF itself.
             if image.format != "TIFF":
-                turn = image.getexif().get(Base.Orientation)
+                turn = image.getexif().get(Base.Orientation, 1)
                 return turn if turn in range(1, 9) else 1
     return 1
 
