@@ -89,7 +89,7 @@ class _ByView:
                 work.instruction,
                 steps=s.steps,
                 start=start,
-                pictures=[work.picture(view) for view in group],
+                pictures=None if start is None else [work.picture(view) for view in group],
                 noise=work.noise(number, group),
                 watch=lambda step, steps, latents: watch(),
             )

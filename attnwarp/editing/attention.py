@@ -8,6 +8,7 @@ what their processors return, so every processor works, and none has to be repla
 from __future__ import annotations
 
 import functools
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.warp import FeatureWarp, resize_mask
+from attnwarp.warp.sampling import work_type
 
 Kind = Literal["self", "cross"]
 Block = Literal["down", "mid", "up"]
@@ -163,7 +165,7 @@ class RecordingPlan:
         views: pictures in a batch.
         dtype: of what is stored. Half precision halves the memory and rounds.
         store: "device" leaves features where they are made, "cpu" moves them to main memory, a
-            folder writes them there.
+            Path of a folder writes them there. Each recording has a folder of its own in it.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -190,6 +192,10 @@ class RecordingPlan:
             check.one_of(branch, self.branches, "keep")
         if not self.keep:
             raise ValueError("keep: got no branch, expected at least one")
+        if not isinstance(self.store, Path) and self.store not in ("device", "cpu"):
+            raise ValueError(
+                f"store: got {self.store!r}, expected 'device', 'cpu' or a folder as a Path"
+            )
         if min(self.steps, self.views, *self.latent_size) < 1:
             raise ValueError(
                 f"steps, views, latent_size: got {self.steps}, {self.views}, {self.latent_size},"
@@ -234,6 +240,13 @@ class Recording:
     plan: RecordingPlan
     timesteps: list[float] = field(default_factory=list)
     _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict, repr=False)
+
+    @functools.cached_property
+    def _folder(self) -> Path:
+        """A new folder, so that no other recording writes to the same files."""
+        store = Path(self.plan.store)
+        store.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix="recording-", dir=store))
 
     @property
     def bytes(self) -> int:
@@ -296,9 +309,7 @@ class Recording:
         else:
             from safetensors.torch import save_file
 
-            folder = Path(plan.store)
-            folder.mkdir(parents=True, exist_ok=True)
-            path = folder / f"{timestep:g}-{layer.name}.safetensors"
+            path = self._folder / f"{timestep:g}-{layer.name}.safetensors"
             save_file({"features": stored.cpu()}, path)
             self._features[key] = path
 
@@ -461,7 +472,7 @@ def inject(
         unet: the UNet that the features came from, or one of its shape.
         recording: features of the source view.
         branches: the guidance branches in the order of the batch; those that were recorded get
-            features.
+            features. One whose share of the guidance is 0 may be missing.
         warps: of the pictures of a batch, one each: :class:`attnwarp.warp.WarpedView` or None for
             the identity.
         weight: a by (step number, number of steps); :func:`decay` if left out.
@@ -495,11 +506,11 @@ def inject(
     for layer in chosen:
         if layer not in plan.layers:
             raise ValueError(f"layers: {layer.name} was not recorded")
-    for branch in plan.keep:
-        if branch not in branches:
-            raise ValueError(
-                f"branches: {branch!r} was recorded, the batch has {', '.join(branches)}"
-            )
+    shared = [branch for branch in plan.keep if branch in branches]
+    if not shared:
+        raise ValueError(
+            f"branches: recorded are {', '.join(plan.keep)}, the batch has {', '.join(branches)}"
+        )
     if mask is not None and (mask.ndim != 2 or mask.dtype != torch.bool):
         raise ValueError(f"mask: got {mask.dtype} {tuple(mask.shape)}, expected bool (H, W)")
     views = len(warps)
@@ -513,13 +524,16 @@ def inject(
                 f"batch: got {call.batch} rows, expected {rows}: {views} views in"
                 f" {len(branches)} branches ({', '.join(branches)})"
             )
+        if mask is not None:
+            h, w = mask.shape
+            check.same_aspect((h, w), call.latent_size, "mask", "transpose a mask of (W, H)")
         alpha = weight(recording.step_of(call.timestep), plan.steps)
         _check_share(alpha, "weight")
         if alpha == 0:
             return features
         size, source_size = layer.size(call.latent_size), layer.size(plan.latent_size)
         result = features.clone()
-        for branch in plan.keep:
+        for branch in shared:
             source = recording.features(call.timestep, layer, branch).to(
                 features.device, features.dtype
             )
@@ -553,7 +567,8 @@ def _blend_into(
                 f"size: the recording has {source_size} features, the target {size}; give a warp"
                 " between views of different sizes"
             )
-        result.copy_(alpha * source + (1 - alpha) * new)
+        work = work_type(new.dtype)  # half precision is rounded once, as by FeatureWarp
+        result.copy_(alpha * source.to(work) + (1 - alpha) * new.to(work))
         return
     layer = warp.at(size, source_size=source_size)
     if isinstance(layer, FeatureWarp) and not torch.is_grad_enabled():

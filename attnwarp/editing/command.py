@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -86,6 +87,10 @@ def edit_image(
             raise IsADirectoryError(f"{path}: is a folder, expected a PNG file")
         if path is not None:
             check_other(path, picture, "the picture to edit")
+    outputs = [("--out", out), ("--sheet", sheet), ("--mask", mask_out)]
+    for (first, one), (second, other) in combinations(outputs, 2):
+        if one is not None and other is not None and one.resolve() == other.resolve():
+            raise ValueError(f"{first}, {second}: got {one} for both, expected a file for each")
     image = _read(picture)
 
     import numpy as np
@@ -138,25 +143,44 @@ def _stderr() -> Any:
     return sys.stderr
 
 
+FLIPS = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}
+"""Axes to flip by EXIF's orientation, after rows and columns have changed places from 5 on."""
+
+
 def _read(path: Path) -> Image:
-    """(H, W, 3) sRGB in [0, 1]; transparent pixels are laid over black, as in a scene's edit."""
-    import cv2
+    """(H, W, 3) sRGB in [0, 1], turned as its EXIF tag asks; transparent pixels are laid over
+    black, as in a scene's edit.
+    """
     import numpy as np
 
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: is a folder, expected a PNG or JPEG picture")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a PNG or JPEG picture")
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if pixels is None:
-        raise ValueError(f"{path}: cannot be read as a picture; expected PNG or JPEG")
-    rgb = pixels[..., ::-1].astype(np.float32) / np.float32(255)
-    # The first reading turns a picture by its EXIF tag, and drops the alpha that this one keeps.
-    stored: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.dtype.kind != "u" or stored.shape != (*rgb.shape[:2], 4):
-        return rgb
-    alpha = stored[..., 3:].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
-    return np.asarray(rgb * alpha)
+    from attnwarp.io import read_image
+
+    stored = read_image(path)
+    turn = _orientation(path)
+    if turn >= 5:
+        stored = stored.swapaxes(0, 1)
+    stored = np.ascontiguousarray(np.flip(stored, FLIPS.get(turn, ())))
+    values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    return values[..., :3] * values[..., 3:] if stored.shape[2] == 4 else values
+
+
+def _orientation(path: Path) -> int:
+    """EXIF's orientation of a picture that can be read, 1 to 8; 1 is as stored."""
+    import contextlib
+    import warnings
+
+    from PIL import Image as Pillow
+    from PIL.ExifTags import Base
+
+    # A tag that cannot be read turns nothing; Pillow raises whatever its damage leads to.
+    with contextlib.suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with Pillow.open(path) as image:
+            # OpenCV turns TIFF itself.
+            if image.format != "TIFF":
+                turn = image.getexif().get(Base.Orientation, 1)
+                return turn if turn in range(1, 9) else 1
+    return 1
 
 
 def _fit(image: Image, longest: int, multiple: int) -> Image:

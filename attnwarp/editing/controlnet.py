@@ -22,6 +22,7 @@ def control_image(depth: npt.NDArray[Any]) -> Image:
 
     Args:
         depth: (H, W) along the optical axis; where it is NaN the picture is 0, as of nothing near.
+            A view that sees no surface has a black picture.
 
     Example:
         >>> control_image(np.array([[1.0, 2.0, np.nan]]))[0, :, 0].round(3).tolist()
@@ -30,7 +31,7 @@ def control_image(depth: npt.NDArray[Any]) -> Image:
     check.shape(depth, ("H", "W"), "depth")
     defined = np.isfinite(depth)
     if not defined.any():
-        raise ValueError("depth: no pixel is defined")
+        return np.zeros((*depth.shape, 3), np.float32)
     if depth[defined].min() <= 0:
         raise ValueError(f"depth: got {depth[defined].min():g}, expected positive numbers")
     near = np.where(defined, 1 / (np.where(defined, depth, 1) + 1e-5), 0)
@@ -72,7 +73,7 @@ class DepthControlNet(Latent):
 
     @classmethod
     def from_folder(
-        cls, folder: Path, controlnet: Path | None = None, **settings: Any
+        cls, folder: str | Path, controlnet: str | Path | None = None, **settings: Any
     ) -> DepthControlNet:
         """An editor from local folders in diffusers' format; nothing is downloaded.
 
@@ -88,7 +89,7 @@ class DepthControlNet(Latent):
 
         device, dtype = settings.pop("device", "cpu"), settings.pop("dtype", torch.float32)
         parts = load_parts(folder, device=device, dtype=dtype)
-        place = folder / "controlnet" if controlnet is None else controlnet
+        place = Path(folder) / "controlnet" if controlnet is None else controlnet
         return cls(
             **parts, controlnet=load_controlnet(place, device=device, dtype=dtype), **settings
         )

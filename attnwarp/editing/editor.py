@@ -138,7 +138,8 @@ def edit(
             pure noise.
         pictures: (H, W, 3) that ``start`` begins from; ``guides`` if left out.
         noise: (B, C, h, w) in place of the seed's.
-        latents: (B, C, h, w) to begin from as they are, such as those of an inversion.
+        latents: (B, C, h, w) to begin from as they are, such as those of an inversion; neither
+            ``start`` nor ``noise`` goes with them.
         watch: called with the step, the number of steps and the latents after each step.
         estimate: called with the step and the (B, C, h, w) clean latents that are predicted there;
             what it returns takes their place.
@@ -147,7 +148,8 @@ def edit(
         The edited views.
 
     Raises:
-        ValueError: sizes or numbers that do not fit; the message names the argument.
+        ValueError: sizes or numbers that do not fit, or arguments that would be ignored; the
+            message names them.
 
     Example:
         >>> import numpy as np
@@ -157,6 +159,12 @@ def edit(
         >>> result.images[0].shape, result.latents.shape, len(result.timesteps)
         ((32, 32, 3), torch.Size([2, 48, 8, 8]), 2)
     """
+    check.number(steps, 1, len(editor.schedule.alphas), "steps", whole=True)
+    for name, value in (("start", start), ("noise", noise)):
+        if latents is not None and value is not None:
+            raise ValueError(f"latents: got latents and {name}, expected one of them")
+    if pictures is not None and start is None:
+        raise ValueError("pictures: got pictures without start, which alone begins from them")
     task = editor.task(guides, prompt)
     device, dtype = editor.unet.device, editor.unet.dtype
     timesteps = (
@@ -169,8 +177,6 @@ def edit(
     check.shape(noise, task.shape, "noise")
     noise = noise.to(device, dtype)
     if latents is not None:
-        if start is not None:
-            raise ValueError("latents: got latents and start, expected one of them")
         check.shape(latents, task.shape, "latents")
         x = latents.to(device, dtype)
     elif start is None:
@@ -257,10 +263,23 @@ class Latent:
         return self.raw_latents(ready) * self.vae.config.scaling_factor
 
     def decode(self, latents: Tensor) -> list[Image]:
-        """(H, W, 3) float32 pictures in [0, 1] of scaled latents."""
+        """(H, W, 3) float32 pictures in [0, 1] of scaled latents.
+
+        Raises:
+            ValueError: latents, or what the decoder makes of them, that are not finite.
+        """
         with torch.no_grad():
             scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
             sample = self.vae.decode(scaled, return_dict=False)[0]
+        # A NaN would become a black pixel.
+        for name, values in (("latents", latents), ("decoded latents", sample)):
+            finite = values.isfinite()
+            if not finite.all():
+                raise ValueError(
+                    f"{name}: {int((~finite).sum())} of {finite.numel()} values are not finite;"
+                    " lower the guidance, or load the editor in float32 if it runs in half"
+                    " precision"
+                )
         pictures = (sample.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
         return list(pictures.cpu().numpy())
 

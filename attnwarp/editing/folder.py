@@ -14,7 +14,11 @@ from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 
 WEIGHTS = ("diffusion_pytorch_model", "model", "pytorch_model")
-ENDINGS = (".safetensors", ".bin", ".fp16.safetensors")
+ENDINGS = {None: (".safetensors", ".bin"), "fp16": (".fp16.safetensors",)}
+"""Of weights in one file, by diffusers' variant; None is the plain one."""
+
+INDICES = {None: "*.index.json", "fp16": "*.index.fp16.json"}
+"""Of weights that are split."""
 
 
 def require_diffusers() -> None:
@@ -27,7 +31,7 @@ def require_diffusers() -> None:
         ) from None
 
 
-def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict[str, Any]:
+def load_parts(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> dict[str, Any]:
     """UNet, autoencoder, text encoder, tokenizer and a DDIM scheduler of a folder.
 
     Raises:
@@ -81,7 +85,7 @@ def load_parts(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> dict
     return parts
 
 
-def load_controlnet(folder: Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
+def load_controlnet(folder: str | Path, *, device: str = "cpu", dtype: torch.dtype) -> Any:
     """The ControlNet of a folder.
 
     Raises:
@@ -111,7 +115,9 @@ def load_network(kind: Any, folder: Path, device: str, dtype: torch.dtype) -> An
     bars = logging.is_progress_bar_enabled()
     logging.disable_progress_bar()
     # Without accelerate, diffusers loads in the plain way, and warns unless that is asked for.
-    how = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
+    how: dict[str, Any] = {} if issubclass(kind, PreTrainedModel) else {"low_cpu_mem_usage": False}
+    if _variants(folder) == ["fp16"]:
+        how["variant"] = "fp16"
     try:
         with readable(folder):
             # Quietly filling what a file lacks with random numbers would look like a bad editor.
@@ -151,8 +157,16 @@ def readable(folder: Path) -> Iterator[None]:
 def _missing(folder: Path) -> list[str]:
     name = folder.name
     lost = [] if (folder / "config.json").is_file() else [f"{name}/config.json"]
-    files = [folder / f"{stem}{ending}" for stem in WEIGHTS for ending in ENDINGS]
-    split = any(folder.glob("*.index.json"))
-    if not split and not any(path.is_file() for path in files):
+    if not _variants(folder):
         lost.append(f"{name}/{'model' if name == 'text_encoder' else WEIGHTS[0]}.safetensors")
     return lost
+
+
+def _variants(folder: Path) -> list[str | None]:
+    """Variants of the weights that a folder has."""
+    return [
+        variant
+        for variant, endings in ENDINGS.items()
+        if any((folder / f"{stem}{ending}").is_file() for stem in WEIGHTS for ending in endings)
+        or any(folder.glob(INDICES[variant]))
+    ]

@@ -65,8 +65,8 @@ def ddim_invert(
         for timestep in reversed(timesteps):
             x0, noise = schedule.split(predict(x, timestep), x, last)
             last = schedule.alpha(timestep)
-            a = last.to(x)
-            x = a.sqrt() * x0 + (1 - a).sqrt() * noise
+            a = last.to(x0)
+            x = (a.sqrt() * x0 + (1 - a).sqrt() * noise).to(x.dtype)
     return x
 
 
@@ -78,7 +78,7 @@ class NoiseMaps:
         timesteps: falling.
         start: (B, C, h, w) latents at the first of them.
         maps: (steps, B, C, h, w) noise of each step, in units of its standard deviation. Where that
-            is 0, what the step itself lacks.
+            is 0, what the step itself lacks. Float32 where the latents have half precision.
     """
 
     timesteps: list[int]
@@ -137,7 +137,7 @@ def edit_friendly_invert(
             noise = (states[step + 1] - mean) / scale
             maps.append(noise)
             # From the map just found, so that rounding does not add up.
-            x = mean + scale * noise
+            x = (mean + scale * noise).to(x.dtype)
     return NoiseMaps(list(timesteps), start, torch.stack(maps))
 
 
@@ -162,7 +162,8 @@ def replay(
     with torch.no_grad():
         for step, (now, then) in enumerate(following(noise.timesteps)):
             mean, sigma = _mean(schedule, predict(x, now), x, now, then)
-            x = mean + (sigma if sigma > 0 else torch.ones_like(sigma)) * noise.maps[step]
+            scale = sigma if sigma > 0 else torch.ones_like(sigma)
+            x = (mean + scale * noise.maps[step]).to(x.dtype)
             if watch is not None:
                 watch(step, len(noise.timesteps), x)
     return x
@@ -171,8 +172,8 @@ def replay(
 def _mean(
     schedule: Schedule, output: Tensor, x: Tensor, now: int, then: int | None
 ) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation of the next state, eta 1."""
+    """Mean and standard deviation of the next state, eta 1; float32 of half precision."""
     x0, noise = schedule.split(output, x, schedule.alpha(now))
-    sigma = schedule.sigma(now, then).to(x)
-    a = schedule.alpha(then).to(x)
+    sigma = schedule.sigma(now, then).to(x0)
+    a = schedule.alpha(then).to(x0)
     return a.sqrt() * x0 + (1 - a - sigma**2).clamp_min(0).sqrt() * noise, sigma

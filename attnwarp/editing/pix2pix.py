@@ -45,7 +45,7 @@ class InstructPix2Pix(Latent):
         self.text_guidance, self.image_guidance = text_guidance, image_guidance
 
     @classmethod
-    def from_folder(cls, folder: Path, **settings: Any) -> InstructPix2Pix:
+    def from_folder(cls, folder: str | Path, **settings: Any) -> InstructPix2Pix:
         """An editor from a local folder in diffusers' format; nothing is downloaded.
 
         Args:

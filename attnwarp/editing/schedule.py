@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from attnwarp import check
+from attnwarp.warp.sampling import work_type
 
 Prediction = Literal["epsilon", "sample", "v_prediction"]
 
@@ -27,6 +28,9 @@ step of the editor's own schedule. Manifests and studies record it, so that no r
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """What a diffusion model was trained with.
+
+    Steps of half precision are computed in float32 and rounded once: float16 has no number between
+    0.9995 and 1, where alpha-bar of the last steps lies, and 1 - alpha-bar would be 0.
 
     Args:
         alphas: (N,) float32 alpha-bar of the training steps: x_t = sqrt(alpha-bar) x_0 +
@@ -51,12 +55,14 @@ class Schedule:
         return torch.tensor(self.final_alpha) if timestep is None else self.alphas[timestep]
 
     def add_noise(self, x: Tensor, noise: Tensor, timestep: int) -> Tensor:
-        """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise."""
-        a = self.alphas[timestep].to(x)
-        return a.sqrt() * x + (1 - a).sqrt() * noise
+        """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, in the type of ``x``."""
+        clean = widened(x)
+        a = self.alphas[timestep].to(clean)
+        return (a.sqrt() * clean + (1 - a).sqrt() * widened(noise)).to(x.dtype)
 
     def split(self, output: Tensor, x: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-        """The predicted x_0 and noise, from a network's output at x."""
+        """The predicted x_0 and noise, from a network's output at x; float32 of half precision."""
+        x, output = widened(x), widened(output)
         a = alpha.to(x)
         match self.prediction:
             case "epsilon":
@@ -81,20 +87,28 @@ class Schedule:
             following: the step that follows, None after the last.
             change: takes the predicted x_0 and returns what stands in its place; the noise is then
                 what that x_0 leaves of ``x``.
+
+        Returns:
+            What follows, in the type of ``x``.
         """
-        now = self.alpha(timestep)
+        before = widened(x)
+        now, then = self.alpha(timestep).to(before), self.alpha(following).to(before)
         x0, noise = self.split(output, x, now)
         if change is not None:
             changed = change(x0)
             if changed is not x0:
-                x0, noise = changed, (x - now.to(x).sqrt() * changed) / (1 - now.to(x)).sqrt()
-        a = self.alpha(following).to(x)
-        return a.sqrt() * x0 + (1 - a).sqrt() * noise
+                x0, noise = changed, (before - now.sqrt() * changed) / (1 - now).sqrt()
+        return (then.sqrt() * x0 + (1 - then).sqrt() * noise).to(x.dtype)
 
     def sigma(self, timestep: int, following: int | None) -> Tensor:
         """() standard deviation of the noise of a DDIM step with eta 1 (eq. 16)."""
         now, then = self.alpha(timestep), self.alpha(following)
         return ((1 - then) / (1 - now) * (1 - now / then)).clamp_min(0).sqrt()
+
+
+def widened(x: Tensor) -> Tensor:
+    """``x`` in the type that a step is computed in."""
+    return x.to(work_type(x.dtype))
 
 
 def steps_from(start: int, steps: int) -> list[int]:

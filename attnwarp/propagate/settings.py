@@ -66,7 +66,7 @@ class PropagateSettings:
             (:func:`attnwarp.editing.schedule.steps_as_published`).
         start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
         text_guidance: s_T of the first stage; None for the editor's own.
-        guidance_drop: what each further stage takes off s_T.
+        guidance_drop: what each further stage takes off s_T, which may fall to 0 and not below.
         source_text_guidance: s_T of the source; None for the first stage's.
         batch: target views that go through the network together. Another batch gives other bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
@@ -183,6 +183,12 @@ class PropagateSettings:
             if value is not None or name not in _OPTIONAL:
                 check.number(value, low, high, name, whole=name in _WHOLE)
         _check_start(self.start)
+        last = self.guidance(self.stages - 1)
+        if last is not None and last < -1e-9:  # 0.3 - 3 * 0.1 is not below 0
+            raise ValueError(
+                f"text_guidance, guidance_drop: got {self.text_guidance:g} and"
+                f" {self.guidance_drop:g}, so stage {self.stages} has {last:g}, expected at least 0"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""

@@ -13,6 +13,7 @@ from attnwarp.camera import Camera
 from attnwarp.warp import FeatureWarp, WarpedView, depth_slope, sample, sample_depth
 from attnwarp.warp.depth import as_float64
 from attnwarp.warp.masks import axis_weights
+from attnwarp.warp.sampling import work_type
 from attnwarp.warp.surface import needed
 
 Size = tuple[int, int]
@@ -201,16 +202,19 @@ class SoftWarp:
         return self.hard.warp_tokens(source)
 
     def blend_tokens(self, source: Tensor, new: Tensor, alpha: float) -> Tensor:
-        """a C warp(source) + (1 - a C) new with the weight C.
+        """a C warp(source) + (1 - a C) new with the weight C, in float32 for half precision and
+        rounded once.
 
         Args:
             source: (1, h w, C) recorded tokens.
             new: (1, H W, C) the target's own.
             alpha: a, in [0, 1].
         """
-        warped = self.hard.warp_tokens(source.to(new.dtype))
-        share = (alpha * self.weight).reshape(-1, 1).to(new)
-        return torch.where(share > 0, share * warped + (1 - share) * new, new)
+        work = work_type(new.dtype)
+        warped = self.hard.warp_tokens(source.to(work))
+        share = (alpha * self.weight).reshape(-1, 1).to(new.device, work)
+        mixed = share * warped + (1 - share) * new.to(work)
+        return torch.where(share > 0, mixed.to(new.dtype), new)
 
 
 def averaged(values: Tensor, size: Size) -> Tensor:

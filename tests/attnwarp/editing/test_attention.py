@@ -179,6 +179,20 @@ def test_a_views_own_features_at_full_weight_with_the_identity_change_no_bit():
             assert not torch.equal(run(net, seed=1), plain)
 
 
+def test_a_recorded_branch_that_the_batch_lacks_leaves_the_others_their_features():
+    """Where text and image guidance are equal, the branch of the picture alone does not run.
+    Oracle: a recording without that branch."""
+    net = unet(8)
+    outputs = []
+    for keep in (("text", "image"), ("text",)):
+        with record(net, plan_of(net, keep=keep)) as recording:
+            run(net)
+        with inject(net, recording, branches=("text",), weight=constant(0.5)):
+            outputs.append(run(net, seed=1, rows=1))
+    assert torch.equal(*outputs)
+    assert not torch.equal(outputs[0], run(net, seed=1, rows=1))
+
+
 def test_weight_zero_changes_no_bit():
     net = unet(8)
     with record(net, plan_of(net)) as recording:
@@ -233,6 +247,35 @@ def test_injected_features_are_the_written_out_blend_at_each_layers_own_size():
                     x,
                 )
     assert torch.equal(own[first.name][2], blended[first.name][2])  # the unconditional branch
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_blend_without_a_warp_in_half_precision_is_rounded_once(dtype):
+    """Oracle: the formula in float64. A second rounding would be another half step."""
+    net = unet(8).to(dtype)
+    plan = plan_of(net, steps=1)
+    first = plan.layers[0]
+    tokens = {}
+
+    def run_half(name, seed):
+        generator = torch.Generator().manual_seed(seed)
+        x = torch.randn((3, 8, *SIZE), generator=generator).to(dtype)
+        text = torch.randn((3, 5, 32), generator=generator).to(dtype)
+        keep = hooked(net, [first], lambda _, features, __: tokens.update({name: features.clone()}))
+        with torch.no_grad(), keep:
+            net(x, torch.tensor(500), encoder_hidden_states=text)
+
+    with record(net, plan) as recording:
+        run_half("source", seed=0)
+    run_half("new", seed=1)
+    how = {"branches": PIX2PIX_BRANCHES, "weight": constant(0.9), "layers": [first]}
+    with inject(net, recording, **how):
+        run_half("blend", seed=1)
+    source, new, blend = (tokens[name][:2] for name in ("source", "new", "blend"))
+    expected = 0.9 * source.double() + (1 - 0.9) * new.double()
+    allowed = torch.finfo(dtype).eps / 2 * expected.abs() + 1e-6
+    assert ((blend.double() - expected).abs() <= allowed).all()
+    assert blend.dtype == dtype
 
 
 def test_one_source_serves_several_views_each_with_its_own_warp():
@@ -310,7 +353,26 @@ def test_the_memory_is_what_was_announced_and_features_come_back_from_where_they
         assert stored.dtype == dtype
         assert torch.equal(stored, full.features(981.0, layer, "image").to(dtype))
     if store == "disk":
-        assert len(list((tmp_path / "features").iterdir())) == 2 * len(plan.layers)
+        files = list((tmp_path / "features").rglob("*.safetensors"))
+        assert len(files) == 2 * len(plan.layers)
+
+
+def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
+    """Oracle: the same recordings in memory."""
+    net = unet(8)
+    plans = [plan_of(net, steps=1, store=store) for store in (tmp_path, "device")]
+    on_disk, in_memory = [], []
+    for seed in (0, 1):
+        for plan, into in zip(plans, (on_disk, in_memory), strict=True):
+            with record(net, plan) as recording:
+                run(net, seed=seed, timesteps=(500,))
+            into.append(recording)
+    for layer in plans[0].layers:
+        features = [
+            [r.features(500.0, layer, "text") for r in kind] for kind in (on_disk, in_memory)
+        ]
+        assert all(map(torch.equal, *features))
+        assert not torch.equal(*features[0])
 
 
 def test_what_does_not_match_the_recording_is_refused_by_name():
@@ -327,9 +389,9 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
     with pytest.raises(ValueError, match="timestep: got 980, recorded are 981, 481"):
         again(passes={"timesteps": (980,)})
     with pytest.raises(
-        ValueError, match="branches: 'image' was recorded, the batch has uncond, text"
+        ValueError, match="branches: recorded are text, image, the batch has uncond, txt"
     ):
-        again(branches=CONTROLNET_BRANCHES)
+        again(branches=("uncond", "txt"))
     with pytest.raises(ValueError, match=r"batch: got 2 rows, expected 3: 1 views in 3 branches"):
         again(passes={"rows": 2})
     with pytest.raises(
@@ -340,6 +402,10 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         again(layers=[Layer("elsewhere", "self", 0, 16)])
     with pytest.raises(ValueError, match=r"mask: got torch.float32 \(2, 2\)"):
         again(mask=torch.ones(2, 2))
+    with pytest.raises(
+        ValueError, match=r"mask: got 48 x 36 .*, expected the aspect ratio of 6 x 8; transpose"
+    ):
+        again(mask=torch.ones((48, 36), dtype=torch.bool))
     with pytest.raises(ValueError, match=r"weight: got 1.2"):
         again(weight=lambda step, steps: 1.2)
     with (
@@ -358,5 +424,8 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         run(net, timesteps=(981, 981))
     with pytest.raises(ValueError, match="keep: got 'control'"):
         plan_of(net, keep=("control",))
+    for store in ("gpu", "disk", "a/folder"):  # no word is taken for a folder's name
+        with pytest.raises(ValueError, match=f"store: got '{store}', expected 'device', 'cpu' or"):
+            plan_of(net, store=store)
     with pytest.raises(ValueError, match="branch: got 'uncond'"):
         recording.features(981.0, recording.plan.layers[0], "uncond")

@@ -3,11 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 from tiny_editors import pix2pix
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
 from attnwarp.cli.main import app
+from attnwarp.editing.command import _read
 from attnwarp.editing.editor import edit
 from attnwarp.editing.segment import GroundedSam
 from attnwarp.editing.small import load_editor
@@ -89,6 +91,22 @@ def test_transparent_pixels_are_laid_over_black(folder, photo, tmp_path):
     assert results[0] == results[1]
 
 
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("shape", [(4, 6), (5, 5)])
+def test_colour_and_alpha_are_turned_together_as_exif_asks(turn, shape, tmp_path):
+    """Oracle: Pillow's own turning, of a picture that was laid over black by hand."""
+    random = np.random.default_rng(turn)
+    rgba = random.integers(0, 256, (*shape, 4), dtype=np.uint8)
+    rgba[..., 3] = 255 * random.integers(0, 2, shape)
+    tag = Image.Exif()
+    tag[0x112] = turn
+    Image.fromarray(rgba).save(tmp_path / "turned.png", exif=tag)
+    with Image.open(tmp_path / "turned.png") as stored:
+        seen = np.asarray(ImageOps.exif_transpose(stored))
+    expected = seen[..., :3] / 255 * (seen[..., 3:] > 0)
+    assert np.allclose(_read(tmp_path / "turned.png"), expected, rtol=0, atol=1e-6)
+
+
 def test_words_edit_what_they_name_alone(folder, tmp_path):
     """Oracle: SAM and Grounding DINO called directly, and the edit without a mask."""
     models = tmp_path / "dino", tmp_path / "sam"
@@ -127,21 +145,28 @@ def test_words_that_the_picture_does_not_show_are_one_clear_line(folder, tmp_pat
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"picture": "nowhere.png"}, "nowhere.png: no such file; expected a PNG or JPEG picture"),
-        ({"picture": "text.png"}, "text.png: cannot be read as a picture"),
+        ({"picture": "nowhere.png"}, "nowhere.png: no such file"),
+        ({"picture": "text.png"}, "text.png: cannot be read as an image"),
+        ({"picture": "half.jpg"}, "half.jpg: the picture is damaged (image file is truncated"),
         ({"out": "red.jpg"}, "red.jpg: expected a name that ends in .png"),
         ({"editor": "smal-plain"}, "editor 'smal-plain': neither bundled"),
         ({"more": ("--segmenter", "clip-parts")}, "--segmenter: needs --where, the words that it"),
-        ({"picture": "."}, "is a folder, expected a PNG or JPEG picture"),
+        ({"picture": "."}, "is a folder, expected a file"),
         ({"out": "photo.png"}, "photo.png: is the picture to edit; choose another name"),
+        ({"more": ("--sheet", "a.png")}, "a.png for both, expected a file for each"),
         ({"instruction": " "}, "instruction: is empty, expected words such as 'make it red'"),
         ({"instruction": "make it red " * 40}, "prompt: 'make it red make it red"),
         ({"more": ("--device", "gpu")}, "device 'gpu': unknown, expected cpu or cuda"),
         ({"more": ("--text-guidance", "nan")}, "text_guidance: got nan, expected a number"),
     ],
 )
-def test_what_cannot_be_used_is_one_clear_line(change, message, folder, photo, tmp_path):
+def test_what_cannot_be_used_is_one_clear_line(
+    change, message, folder, photo, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "text.png").write_text("no picture")
+    whole = cv2.imencode(".jpg", cv2.imread(str(photo[0])))[1].tobytes()
+    (tmp_path / "half.jpg").write_bytes(whole[: len(whole) // 2])
     picture = tmp_path / change["picture"] if "picture" in change else photo[0]
     before = photo[0].read_bytes()
     result = run(

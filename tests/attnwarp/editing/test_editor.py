@@ -23,7 +23,13 @@ from attnwarp.editing.controlnet import DepthControlNet, control_image
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.folder import load_parts
 from attnwarp.editing.pix2pix import InstructPix2Pix
-from attnwarp.editing.schedule import Schedule, following, steps_as_published, steps_from
+from attnwarp.editing.schedule import (
+    Schedule,
+    following,
+    stable_diffusion_alphas,
+    steps_as_published,
+    steps_from,
+)
 from attnwarp.editing.small import WEIGHTS, bundled
 from attnwarp.errors import InputError
 
@@ -201,6 +207,47 @@ def test_a_step_is_diffusers_step(prediction):
         assert torch.allclose(schedule.step(output, x, now, then), theirs, rtol=0, atol=1e-5)
 
 
+HALF = pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+
+
+@HALF
+@pytest.mark.parametrize("prediction", ["epsilon", "sample", "v_prediction"])
+def test_a_step_in_half_precision_is_the_formula_in_float64_rounded_once(prediction, dtype):
+    alphas = stable_diffusion_alphas().float()
+    schedule = Schedule(alphas, prediction, 1.0)
+    generator = torch.Generator().manual_seed(0)
+    x, output = (torch.randn((1, 4, 8, 8), generator=generator).to(dtype) for _ in range(2))
+    wide, out = x.double(), output.double()
+
+    def rounded_once(result, exact):
+        assert result.dtype == dtype
+        # Beside the rounding there is float32's error, over sqrt(1 - alpha-bar) >= 0.029.
+        allowed = torch.finfo(dtype).eps / 2 * exact.abs() + 1e-5
+        assert ((result.double() - exact).abs() <= allowed).all()
+
+    for now, then in ((981, 961), (20, 1), (1, 0), (1, None), (0, None)):
+        a, after = float(alphas[now]), 1.0 if then is None else float(alphas[then])
+        root, rest = a**0.5, (1 - a) ** 0.5
+        x0, noise = {
+            "epsilon": ((wide - rest * out) / root, out),
+            "sample": (out, (wide - root * out) / rest),
+            "v_prediction": (root * wide - rest * out, root * out + rest * wide),
+        }[prediction]
+        expected = after**0.5 * x0 + (1 - after) ** 0.5 * noise
+        rounded_once(schedule.step(output, x, now, then), expected)
+        rounded_once(schedule.add_noise(x, output, now), root * wide + rest * out)
+
+
+def test_latents_that_are_not_finite_are_refused_and_do_not_become_black():
+    editor = editor_of(pix2pix())
+    latents = torch.zeros(1, 4, 8, 12)
+    latents[0, 1, 2, 3] = float("nan")
+    with pytest.raises(ValueError, match=r"latents: 1 of 384 values are not finite; lower the"):
+        editor.decode(latents)
+    with pytest.raises(ValueError, match=r"decoded latents: \d+ of 1152 values are not finite"):
+        editor.decode(torch.full((1, 4, 8, 12), 3e38))
+
+
 def test_a_recorded_edit_injected_into_itself_changes_no_bit_with_every_editor():
     for pipe, guide in ((pix2pix(), picture()), (controlnet(), depth_map())):
         editor = editor_of(pipe)
@@ -236,6 +283,15 @@ def test_what_does_not_fit_is_refused_by_name():
         ValueError, match=r"noise: got shape \(1, 4, 2, 2\), expected \(1, 4, 8, 12\)"
     ):
         edit(editor, [picture()], "a bear", noise=torch.zeros(1, 4, 2, 2))
+    for steps in (0, 2.5, 1001):
+        with pytest.raises(ValueError, match=f"steps: got {steps}, expected a whole number in"):
+            edit(editor, [picture()], "a bear", steps=steps)
+    latents = torch.zeros(1, 4, H // 2, W // 2)
+    for name, value in (("start", 700), ("noise", latents)):
+        with pytest.raises(ValueError, match=f"latents: got latents and {name}, expected one of"):
+            edit(editor, [picture()], "a bear", latents=latents, **{name: value})
+    with pytest.raises(ValueError, match="pictures: got pictures without start"):
+        edit(editor, [picture()], "a bear", pictures=[picture()])
     with pytest.raises(ValueError, match="has .* tokens, the text encoder takes 24; shorten it"):
         edit(editor, [picture()], "a bear " * 30)
     with pytest.raises(ValueError, match="depth: got -1"):
@@ -256,6 +312,32 @@ def test_editors_are_read_from_folders_in_diffusers_format(tmp_path):
         assert np.array_equal(
             loaded.images[0], edit(editor_of(pipe), [guide], "a bear", steps=2).images[0]
         )
+
+
+def test_a_folder_with_weights_of_half_precision_alone_is_read(tmp_path):
+    """Oracle: diffusers' pipeline, which wrote the folder, cast to half and back."""
+    pipe = controlnet().to(torch.float16)
+    pipe.save_pretrained(tmp_path, variant="fp16")
+    assert len(list(tmp_path.rglob("*.fp16.safetensors"))) == 4
+    loaded = DepthControlNet.from_folder(str(tmp_path))
+    assert loaded.unet.dtype == torch.float32
+    for name in ("unet", "vae", "text_encoder", "controlnet"):
+        weights = getattr(loaded, name).state_dict()
+        for key, value in getattr(pipe, name).state_dict().items():
+            assert torch.equal(weights[key], value.to(weights[key].dtype)), (name, key)
+
+
+def test_a_view_that_sees_nothing_is_drawn_from_a_black_control_picture():
+    """Oracle: diffusers' pipeline, given black."""
+    pipe = controlnet()
+    noise = torch.randn((1, 4, H // 2, W // 2), generator=torch.Generator().manual_seed(8))
+    theirs = pipe(
+        "a bear", image=torch.zeros(1, 3, H, W), num_inference_steps=2, guidance_scale=5.0, latents=noise,
+        output_type="np", height=H, width=W,
+    ).images[0]  # fmt: skip
+    nothing = np.full((H, W), np.nan)
+    ours = edit(editor_of(pipe), [nothing], "a bear", steps=2, noise=noise)
+    assert np.abs(ours.images[0] - theirs).max() < 1e-5
 
 
 @pytest.mark.parametrize(

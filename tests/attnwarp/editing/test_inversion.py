@@ -8,7 +8,7 @@ from PIL import Image
 from tiny_editors import parts, unet
 
 from attnwarp.editing.inversion import ddim_invert, edit_friendly_invert, replay
-from attnwarp.editing.schedule import Schedule, following
+from attnwarp.editing.schedule import Schedule, following, stable_diffusion_alphas
 
 
 def network(net, seed=2, *, strength=1.0):
@@ -134,6 +134,27 @@ def test_replaying_the_maps_gives_the_picture_back_to_float_error(changes):
     assert float((other - latents()).abs().max()) > 1e-3  # another prompt makes another picture
     again = edit_friendly_invert(schedule, predict, latents(), scheduler.timesteps.tolist(), seed=1)
     assert torch.equal(again.maps, noise.maps)
+
+
+def test_inversions_in_half_precision_keep_their_coefficients():
+    """bfloat16 rounds the last steps' alpha-bar to 1. Oracle: with a network that predicts noise 1
+    everywhere, one step of inversion adds exactly that; and the picture is led back to."""
+    alphas = stable_diffusion_alphas().float()
+    x = latents().bfloat16()
+    inverted = ddim_invert(
+        Schedule(alphas, "epsilon", 1.0), lambda x, timestep: torch.ones_like(x), x, [1]
+    )
+    a = float(alphas[1])
+    exact = a**0.5 * x.double() + (1 - a) ** 0.5
+    assert inverted.dtype == torch.bfloat16
+    assert ((inverted.double() - exact).abs() <= 2**-8 * exact.abs() + 1e-6).all()
+
+    def predict(x, timestep):
+        return 0.3 * x
+
+    picture = Schedule(alphas, "sample", 1.0)
+    maps = edit_friendly_invert(picture, predict, x, [900, 500, 100, 1])
+    assert torch.equal(replay(picture, predict, maps), x)
 
 
 def test_a_picture_edited_by_hand_can_be_the_source():

@@ -67,11 +67,20 @@ def test_settings_survive_json(name):
         ({"confidence": 1}, "confidence: got 1, expected true or false"),
         ({"sources": 0}, "sources: got 0, expected a whole number >= 1"),
         ({"estimate": 1.5}, "estimate: got 1.5, expected a number in"),
+        (
+            {"text_guidance": 1.5, "guidance_drop": 1.0, "stages": 3},
+            "text_guidance, guidance_drop: got 1.5 and 1, so stage 3 has -0.5, expected at least 0",
+        ),
     ],
 )
 def test_a_wrong_setting_is_named(change, message):
     with pytest.raises(ValueError, match=message):
         preset("corrected", **change)
+
+
+def test_guidance_may_fall_to_zero():
+    falling = preset("corrected", text_guidance=0.3, guidance_drop=0.1, stages=4)
+    assert falling.guidance(3) == pytest.approx(0)
 
 
 @pytest.mark.parametrize(("views", "each"), [(10, 3), (10, 4), (64, None), (200, None), (2, 5)])

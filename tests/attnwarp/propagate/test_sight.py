@@ -122,6 +122,20 @@ def test_features_are_blended_by_confidence_in_float64():
     assert ((share > 0.05) & (share < 0.55)).sum() > 5
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_a_blend_by_confidence_in_half_precision_is_rounded_once(dtype):
+    """Oracle: the formula in float64. A second rounding would be another half step."""
+    layer = Sight([warp(SIDE)], soft=True).warp(0).at((8, 8), source_size=(8, 8))
+    random = torch.Generator().manual_seed(0)
+    source, new = (torch.randn((1, 64, 50), generator=random).to(dtype) for _ in range(2))
+    share = 0.9 * layer.weight.reshape(-1, 1)
+    expected = share * layer.warp_tokens(source.double()) + (1 - share) * new.double()
+    result = layer.blend_tokens(source, new, 0.9)
+    allowed = torch.finfo(dtype).eps / 2 * expected.abs() + 1e-6
+    assert ((result.double() - expected).abs() <= allowed).all()
+    assert result.dtype == dtype and (share > 0.05).any()
+
+
 def test_a_chain_goes_outward_and_each_is_covered_by_those_before():
     """Oracle: points on a ring as sets; a view sees a window of them."""
     views, count = 12, 360
