@@ -277,8 +277,9 @@ class _Run:
                 f" of {multiple}"
             )
         if len(self.plan.stages) < asked.stages:
+            on_sources = "" if self.plan.stages[0] else " that tunes on the sources alone"
             announce(
-                f"stages: {len(self.plan.stages)} in place of {asked.stages}, as"
+                f"stages: {len(self.plan.stages)}{on_sources} in place of {asked.stages}, as"
                 f" {len(self.scene.cameras)} views leave no more to edit"
             )
 

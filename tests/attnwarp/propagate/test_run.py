@@ -356,6 +356,34 @@ def test_a_picture_edited_by_hand_is_the_source(scene, editor):
         assert not np.array_equal(by_hand.edited[view], plain.edited[view])
 
 
+def test_a_picture_by_hand_may_have_any_type_that_images_have(scene, editor):
+    """Oracle: a depth of 16 bits holds a depth of 8 bits exactly, as 257 of its steps."""
+    picture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    settings = replace(QUICK, iterations=0, stages=1, views_per_stage=1)
+    deep = picture.astype(np.uint16) * np.uint16(257)
+    one, other = (run(scene, editor, settings=settings, source_picture=p) for p in (picture, deep))
+    for view, pixels in one.edited.items():
+        assert np.array_equal(pixels, other.edited[view])
+    with pytest.raises(ValueError, match="source_picture: got int64, expected uint8, uint16 or"):
+        run(scene, editor, settings=settings, source_picture=picture.astype(np.int64))
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_where_all_views_are_sources_the_splats_are_tuned_on_them(views, scene, editor, tmp_path):
+    model, cameras, images = scene
+    part = model, cameras[:views], images[:views]
+    settings = replace(QUICK, steps=1, sources=views)
+    lines = []
+    result = run(part, editor, tmp_path, settings, announce=lines.append)
+    assert sorted(result.edited) == list(range(views))
+    tuned = json.loads((tmp_path / "result.json").read_text())["tuned"]
+    assert tuned == {f"v{view}": 3 // views for view in range(views)}
+    assert result.counters["iterations"] == 3
+    assert not torch.equal(result.gaussians.sh, model.sh)
+    (line,) = [line for line in lines if line.startswith("stages")]
+    assert line.startswith("stages: 1 that tunes on the sources alone in place of 2, as ")
+
+
 def test_fresh_noise_is_each_views_own_and_shared_noise_is_one(scene, editor):
     from attnwarp.propagate.editing import Target, ViewEditor
 
