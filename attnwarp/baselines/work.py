@@ -129,9 +129,10 @@ class Work:
         """(h, w) depth of the splats before the edit; NaN where undefined."""
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
-        return np.asarray(
-            render_surface(self.frozen, camera, WarpSettings(), backend=self.backend).depth
+        surface = render_surface(
+            self.frozen, camera, WarpSettings(), near=self.near, backend=self.backend
         )
+        return np.asarray(surface.depth)
 
     def guide(self, view: int) -> Guide:
         """What the editor takes of a view: its picture or its depth."""

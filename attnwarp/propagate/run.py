@@ -507,6 +507,7 @@ class _Run:
             s.warp,
             **reads,
             source_surface=self._surface(source, before),
+            near=self.near,
             backend=self.backend,
             warn_empty=False,
         )
@@ -538,10 +539,14 @@ class _Run:
         if model is self.frozen and view in self._frozen_surfaces:
             return self._frozen_surfaces[view]
         camera = self.scene.cameras[view]
-        surface = render_surface(model, camera, self.settings.warp, backend=self.backend)
+        surface = self._rendered_surface(model, camera)
         if model is self.frozen:
             self._frozen_surfaces[view] = surface
         return surface
+
+    def _rendered_surface(self, model: Gaussians, camera: Camera) -> Surface:
+        warp = self.settings.warp
+        return render_surface(model, camera, warp, near=self.near, backend=self.backend)
 
     def _guide(self, view: int, model: Gaussians) -> Guide:
         if self.editor.guide == "picture":
@@ -549,8 +554,7 @@ class _Run:
         before = self.frozen if self.settings.depth_from == "frozen" else model
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
-        depth = render_surface(before, camera, self.settings.warp, backend=self.backend).depth
-        return np.asarray(depth)
+        return np.asarray(self._rendered_surface(before, camera).depth)
 
     def _start_picture(self, view: int, model: Gaussians) -> Image | None:
         if self.view_editor.timestep is None:
