@@ -516,7 +516,7 @@ class _Run:
     def _masked(self, warp: WarpedView) -> WarpedView:
         if self.settings.mask:
             return warp
-        return replace(warp, mask=torch.ones_like(warp.mask), _at={})
+        return replace(warp, mask=warp.rules["defined"].clone(), _at={})
 
     def _warps_digest(self, warps: Warps) -> str:
         """SHA-256 of every warp there may be: a function has no other identity."""
