@@ -55,7 +55,7 @@ def edit_dataset(
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)
-    with progress_display(title=out.name) as progress:
+    with progress_display(title=out.name) as watch:
         return METHODS[method](
             splats,
             views.cameras,
@@ -65,5 +65,5 @@ def edit_dataset(
             settings,
             folder=out,
             budget=budget,
-            progress=progress,
+            watch=watch,
         )
