@@ -13,6 +13,7 @@ from attnwarp.fit import load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset
 from attnwarp.propagate.progress import progress_display
+from attnwarp.propagate.scene import images_of
 
 
 def edit_dataset(
@@ -48,8 +49,7 @@ def edit_dataset(
         InputError: no such editor; a folder of another run.
     """
     views = load_views(dataset, max_size=max_size)
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views))]
+    images = images_of(views)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))

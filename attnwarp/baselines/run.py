@@ -327,7 +327,7 @@ class _Run:
         camera = self.work.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
         if self.work.settings.detail == "change":
-            picture = enlarged_change(self.work.scene.pictures[view], edited)
+            picture = enlarged_change(self.work.scene.picture(view), edited)
             return TrainingView(view, camera, picture)
         h, w = self.work.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)
@@ -370,7 +370,7 @@ class _Run:
             if count > SHEET_VIEWS
             else [*range(count)]
         )
-        h, w = self.work.scene.pictures[views[0]].shape[:2]
+        h, w = self.work.scene.images[views[0]].shape[:2]
 
         def tile(name: str) -> Bytes:
             if not self.folder.has(name):

@@ -117,7 +117,7 @@ class Work:
 
     def picture(self, view: int) -> Image:
         """(h, w, 3) of a view before the edit, at the size of its edit."""
-        return resized(self.scene.pictures[view], self.sizes[view])
+        return resized(self.scene.picture(view), self.sizes[view])
 
     def render(self, view: int, model: Gaussians) -> Image:
         """(h, w, 3) of a view of the splats, at the size of its edit."""

@@ -26,6 +26,7 @@ from attnwarp.propagate.page import write_page
 from attnwarp.propagate.pictures import check_source_picture
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
+from attnwarp.propagate.scene import images_of, to_float
 from attnwarp.propagate.settings import PropagateSettings
 
 FIT_FOLDER = "fit"
@@ -109,8 +110,7 @@ def edit_dataset(
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views))]
+    images = images_of(views)
     segments = None if masks is None else _masks(masks, views.cameras, say)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
@@ -118,7 +118,7 @@ def edit_dataset(
         by_words = load_segmenter(segmenter, device=device)
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
         segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
-        segments = [segment(k, image) for k, image in enumerate(images)]
+        segments = [segment(k, to_float(image)) for k, image in enumerate(images)]
         say(_coverage(segments, views.cameras))
     by_hand = None
     if source_picture is not None:
@@ -266,7 +266,7 @@ def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
         raise InputError(
             f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
         )
-    bright = pixels[..., :3].mean(axis=-1) / top
+    bright = pixels.mean(axis=-1) / top
     size = (camera.width, camera.height)
     if bright.shape != size[::-1]:
         bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
