@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,16 @@ def digest(*parts: Any) -> str:
         True
         >>> digest(np.zeros(2)) == digest(np.zeros(2, np.float32))  # the type counts
         False
+    """
+    return digest_each(parts)
+
+
+def digest_each(parts: Iterable[Any]) -> str:
+    """:func:`digest` of parts that are made one at a time, so that none needs to be kept.
+
+    Example:
+        >>> digest_each(number for number in (1, 2)) == digest(1, 2)
+        True
     """
     total = hashlib.sha256()
     for part in parts:

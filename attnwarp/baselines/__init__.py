@@ -1,7 +1,7 @@
 """The methods that an edit through attention warping is compared with. See docs/baselines.md.
 
 All have the same arguments, ``method(gaussians, cameras, images, editor, instruction, settings,
-folder=..., budget=..., progress=...)``, and return a :class:`Baseline`.
+folder=..., budget=..., watch=...)``, and return a :class:`Baseline`.
 """
 
 from __future__ import annotations

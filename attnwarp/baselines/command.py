@@ -13,6 +13,7 @@ from attnwarp.fit import load_views
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import Dataset
 from attnwarp.propagate.progress import progress_display
+from attnwarp.propagate.scene import images_of
 
 
 def edit_dataset(
@@ -48,14 +49,13 @@ def edit_dataset(
         InputError: no such editor; a folder of another run.
     """
     views = load_views(dataset, max_size=max_size)
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views))]
+    images = images_of(views)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
     torch.set_num_threads(thread_count(editor, threads))
     if settings.size is None:
         settings = settings.changed(size=editor.unet.config.sample_size * editor.factor)
-    with progress_display(title=out.name) as progress:
+    with progress_display(title=out.name) as watch:
         return METHODS[method](
             splats,
             views.cameras,
@@ -65,5 +65,5 @@ def edit_dataset(
             settings,
             folder=out,
             budget=budget,
-            progress=progress,
+            watch=watch,
         )

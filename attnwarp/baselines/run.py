@@ -57,12 +57,12 @@ class Options(TypedDict, total=False):
         folder: of all results, created if need be. A killed run resumes from it. All files but
             ``times.json`` then get the bytes of an uninterrupted run, on one machine, with the same
             number of threads and without a budget in seconds.
-        budget: limits of the run, :class:`Budget`.
+        budget: limits of the run, :class:`Budget`; None for a whole run.
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. The original stays outside.
         checkpoint_seconds: between two checkpoints of tuning (30).
         backend: of :func:`attnwarp.render.render` ("auto").
-        progress: told how the run stands,
+        watch: told how the run stands,
             :func:`attnwarp.propagate.progress.progress_display`.
 
     Example:
@@ -72,11 +72,11 @@ class Options(TypedDict, total=False):
     """
 
     folder: Path | str | None
-    budget: Budget
+    budget: Budget | None
     segments: Segments | None
     checkpoint_seconds: float
     backend: str
-    progress: Callable[[Step], object] | None
+    watch: Callable[[Step], object] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +162,9 @@ class _Run:
         self, name: str, method: Method, work: Work, folder: Path, options: Options
     ) -> None:
         self.name, self.method, self.work = name, method, work
-        self.budget = options.get("budget", Budget())
+        self.budget = options.get("budget") or Budget()
         self.checkpoint_seconds = options.get("checkpoint_seconds", 30.0)
-        self.progress = options.get("progress")
+        self.watch = options.get("watch")
         rounds = range(1, len(method.rounds) + 1)
         folders = (*FOLDERS, *(f"rounds/{number}" for number in rounds))
         self.folder = Folder(folder, work.scene.cameras, folders)
@@ -327,7 +327,7 @@ class _Run:
         camera = self.work.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
         if self.work.settings.detail == "change":
-            picture = enlarged_change(self.work.scene.pictures[view], edited)
+            picture = enlarged_change(self.work.scene.picture(view), edited)
             return TrainingView(view, camera, picture)
         h, w = self.work.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)
@@ -370,7 +370,7 @@ class _Run:
             if count > SHEET_VIEWS
             else [*range(count)]
         )
-        h, w = self.work.scene.pictures[views[0]].shape[:2]
+        h, w = self.work.scene.images[views[0]].shape[:2]
 
         def tile(name: str) -> Bytes:
             if not self.folder.has(name):
@@ -410,5 +410,5 @@ class _Run:
 
     def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
         self.done = self.done + steps if done is None else done
-        if self.progress is not None:
-            self.progress(Step(min(self.done, self.total), self.total, text))
+        if self.watch is not None:
+            self.watch(Step(min(self.done, self.total), self.total, text))

@@ -117,7 +117,7 @@ class Work:
 
     def picture(self, view: int) -> Image:
         """(h, w, 3) of a view before the edit, at the size of its edit."""
-        return resized(self.scene.pictures[view], self.sizes[view])
+        return resized(self.scene.picture(view), self.sizes[view])
 
     def render(self, view: int, model: Gaussians) -> Image:
         """(h, w, 3) of a view of the splats, at the size of its edit."""
@@ -129,9 +129,10 @@ class Work:
         """(h, w) depth of the splats before the edit; NaN where undefined."""
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
-        return np.asarray(
-            render_surface(self.frozen, camera, WarpSettings(), backend=self.backend).depth
+        surface = render_surface(
+            self.frozen, camera, WarpSettings(), near=self.near, backend=self.backend
         )
+        return np.asarray(surface.depth)
 
     def guide(self, view: int) -> Guide:
         """What the editor takes of a view: its picture or its depth."""

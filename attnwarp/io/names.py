@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from attnwarp.camera import Camera
 
 def file_stems(cameras: Sequence[Camera]) -> list[str]:
     """A file name without suffix for each camera: the last part of its own name, numbered where
-    several are the same.
+    several are the same. No two cameras get one name.
 
     Example:
         >>> from attnwarp import Camera
@@ -20,7 +21,13 @@ def file_stems(cameras: Sequence[Camera]) -> list[str]:
         ['0000-1', '0001-1', '2']
     """
     stems = [Path(camera.name).stem or "view" for camera in cameras]
-    return [
-        stem if stems.count(stem) == 1 else f"{index:04d}-{stem}"
-        for index, stem in enumerate(stems)
-    ]
+    counts = Counter(stems)
+    alone = {stem for stem, count in counts.items() if count == 1}
+    result = []
+    for index, stem in enumerate(stems):
+        name = stem
+        # A numbered name may be that of another view.
+        while counts[stem] > 1 and (name == stem or name in alone):
+            name = f"{index:04d}-{name}"
+        result.append(name)
+    return result

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from attnwarp.errors import InputError, suggest
 from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, progress, random_points
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
+from attnwarp.io.names import file_stems
 from attnwarp.process import asked_to_stop
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
 from attnwarp.propagate.pictures import check_source_picture
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
+from attnwarp.propagate.scene import images_of, to_float
 from attnwarp.propagate.settings import PropagateSettings
 
 FIT_FOLDER = "fit"
@@ -107,8 +110,7 @@ def edit_dataset(
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
-    black = torch.zeros(3)
-    images = [views.target(k, black).numpy() for k in range(len(views))]
+    images = images_of(views)
     segments = None if masks is None else _masks(masks, views.cameras, say)
     editor = load_editor(editor_name, device=device)
     check_instruction(editor_name, editor, instruction)
@@ -116,11 +118,12 @@ def edit_dataset(
         by_words = load_segmenter(segmenter, device=device)
         say(f"masks of {words!r} by {segmenter}: {out / SEGMENTS_FOLDER}")
         segment = segments_of(by_words, words, [camera.name for camera in views.cameras])
-        segments = [segment(k, image) for k, image in enumerate(images)]
+        segments = [segment(k, to_float(image)) for k, image in enumerate(images)]
         say(_coverage(segments, views.cameras))
     by_hand = None
     if source_picture is not None:
-        by_hand = _rgb(read_image(source_picture))
+        pixels, top = read_over_black(source_picture)
+        by_hand = (pixels / top).astype(np.float32)
         h, w, _ = by_hand.shape
         # Again in the edit, but here before a fit spends its minutes.
         check_source_picture((h, w), views.cameras[index], f"--source-picture: {source_picture}")
@@ -204,12 +207,8 @@ def _view_of(cameras: Any, name: str | None) -> int:
 
 def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.NDArray[np.bool_]]:
     """(H, W) bool of each view from NAME.png: white is edited."""
-    masks = []
-    for camera in cameras:
-        path = folder / f"{Path(camera.name).stem}.png"
-        if not path.is_file():
-            raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
-        masks.append(_mask(path, camera))
+    paths = mask_files(folder, cameras)
+    masks = [read_mask(path, camera) for path, camera in zip(paths, cameras, strict=True)]
     black = [camera.name for mask, camera in zip(masks, cameras, strict=True) if not mask.any()]
     if len(black) == len(masks):
         raise InputError(
@@ -224,6 +223,30 @@ def _masks(folder: Path, cameras: Any, say: Callable[[str], None]) -> list[npt.N
     return masks
 
 
+def mask_files(folder: Path, cameras: Any) -> list[Path]:
+    """The file of each view's mask: by the view's name and folders, or by its name alone where no
+    other view has it, or numbered as an edit writes it."""
+    names = [Path(*(p for p in PurePath(c.name).parts if p not in ("..", "/"))) for c in cameras]
+    plain = [name.parent / name.stem for name in names]
+    counts, stems = Counter(plain), Counter(name.stem for name in names)
+    paths = []
+    for name, short, numbered in zip(names, plain, file_stems(cameras), strict=True):
+        own = [f"{name}.png", *([f"{short}.png"] if counts[short] == 1 else ())]
+        found = [folder / file for file in (*own, f"{numbered}.png") if (folder / file).is_file()]
+        if not found:
+            alone = stems[name.stem] == 1
+            path = folder / (f"{numbered}.png" if alone else own[-1])
+            shared = folder / f"{name.stem}.png"
+            if not alone and shared.is_file():
+                first, second = [n for n in names if n.stem == name.stem][:2]
+                raise InputError(
+                    f"--masks: {shared} could be that of {first} or of {second}; expected {path}"
+                )
+            raise InputError(f"--masks: {path} is missing; expected one PNG for each view")
+        paths.append(found[0])
+    return paths
+
+
 def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
     """One line: of which views masks cover the least and the most."""
     shares = [float(mask.mean()) for mask in masks]
@@ -234,23 +257,26 @@ def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
     )
 
 
-def _mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
+    """(H, W) bool of a picture: what is white and opaque."""
     import cv2
 
-    pixels = read_image(path)
-    top = np.iinfo(pixels.dtype).max
-    if np.ptp(pixels[..., :3], axis=-1).max() > COLORED * top:
+    pixels, top = read_over_black(path)
+    if np.ptp(pixels, axis=-1).max() > COLORED * top:
         raise InputError(
             f"--masks: {path} is coloured, expected a grey picture: white is edited, black is not"
         )
-    bright = pixels[..., :3].mean(axis=-1) / top
+    bright = pixels.mean(axis=-1) / top
     size = (camera.width, camera.height)
     if bright.shape != size[::-1]:
         bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
     return np.asarray(bright > 0.5)
 
 
-def _rgb(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """(H, W, 3) float32 in [0, 1]."""
-    top = np.iinfo(pixels.dtype).max
-    return (pixels[..., :3] / top).astype(np.float32)
+def read_over_black(path: Path) -> tuple[npt.NDArray[Any], int]:
+    """(H, W, 3) of a picture over black where it is transparent, and the value of white."""
+    pixels = read_image(path)
+    top = int(np.iinfo(pixels.dtype).max)
+    if pixels.shape[2] == 3:
+        return pixels, top
+    return pixels[..., :3] * (pixels[..., 3:] / top), top

@@ -18,7 +18,7 @@ import torch
 
 from attnwarp import check, losses
 from attnwarp.camera import Camera
-from attnwarp.digest import digest
+from attnwarp.digest import digest, digest_each
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
@@ -46,9 +46,11 @@ from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
     Segments,
+    checked_image,
     editor_digest,
     near_of,
     render_picture,
+    to_float,
 )
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
@@ -139,9 +141,10 @@ def propagate(
         instruction: an instruction or a prompt, as the editor takes it.
         settings: every choice of the method, see :class:`PropagateSettings`.
         source: number of the source view.
-        source_picture: (h, w, 3) the source view edited elsewhere, such as by hand. It is resized
-            to the editor's size, so it has the view's aspect ratio. Its features are
-            recorded while its own noise is replayed (edit-friendly inversion).
+        source_picture: (h, w, 3) the source view edited elsewhere, such as by hand, of a type that
+            ``images`` may have. It is resized to the editor's size, so it has the view's aspect
+            ratio. Its features are recorded while its own noise is replayed (edit-friendly
+            inversion).
         segments: what is edited: (H, W) bool masks of the views, or a function of a view's number
             and picture. See ``composite`` of the settings and ``segment`` of their warp.
         warps: the warp from the source to a target, by their numbers, such as one from exact depth;
@@ -187,7 +190,8 @@ def propagate(
     scene = Scene.checked(cameras, images, segments)
     by_hand = None
     if source_picture is not None:
-        by_hand = _by_hand(source_picture)
+        check.shape(np.asarray(source_picture), ("H", "W", 3), "source_picture")
+        by_hand = to_float(checked_image(source_picture, "source_picture"))
         h, w, _ = by_hand.shape
         check_source_picture((h, w), cameras[source], "source_picture")
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
@@ -277,8 +281,9 @@ class _Run:
                 f" of {multiple}"
             )
         if len(self.plan.stages) < asked.stages:
+            on_sources = "" if self.plan.stages[0] else " that tunes on the sources alone"
             announce(
-                f"stages: {len(self.plan.stages)} in place of {asked.stages}, as"
+                f"stages: {len(self.plan.stages)}{on_sources} in place of {asked.stages}, as"
                 f" {len(self.scene.cameras)} views leave no more to edit"
             )
 
@@ -375,7 +380,7 @@ class _Run:
             layer, features = self._shown(source.recording)
             size = layer.size(source.recording.plan.latent_size)
             picture = self._principal.picture(features, size)
-            shape = self.scene.pictures[view].shape
+            shape = self.scene.images[view].shape
             self.folder.write_picture("features.png", enlarged(picture, (shape[0], shape[1])))
         self.folder.write_json(
             "source.json",
@@ -477,7 +482,7 @@ class _Run:
             warped = grid.warp_tokens(features[None].cpu())[0]
             parts.append(self._principal.picture(warped, size, grid.mask))
         # A pixel takes one source at most, and is black in the others' pictures.
-        return enlarged(np.maximum.reduce(parts), self.scene.pictures[view].shape[:2])
+        return enlarged(np.maximum.reduce(parts), self.scene.images[view].shape[:2])
 
     def _sight(self, view: int, model: Gaussians, sources: int) -> Sight | None:
         """How the first sources see a view; None where nothing is warped."""
@@ -495,8 +500,8 @@ class _Run:
         before = self.frozen if s.depth_from == "frozen" else model
         reads: dict[str, Any] = {}
         if s.warp.photometric is not None:
-            reads["source_image"] = self.scene.pictures[source]
-            reads["target_image"] = self.scene.pictures[target]
+            reads["source_image"] = self.scene.picture(source)
+            reads["target_image"] = self.scene.picture(target)
         if s.warp.segment and self.scene.segments is not None:
             reads["target_segment"] = self.scene.segments[target]
         warp = warp_view(
@@ -506,6 +511,7 @@ class _Run:
             s.warp,
             **reads,
             source_surface=self._surface(source, before),
+            near=self.near,
             backend=self.backend,
             warn_empty=False,
         )
@@ -514,7 +520,7 @@ class _Run:
     def _masked(self, warp: WarpedView) -> WarpedView:
         if self.settings.mask:
             return warp
-        return replace(warp, mask=torch.ones_like(warp.mask), _at={})
+        return replace(warp, mask=warp.rules["defined"].clone(), _at={})
 
     def _warps_digest(self, warps: Warps) -> str:
         """SHA-256 of every warp there may be: a function has no other identity."""
@@ -524,45 +530,53 @@ class _Run:
             for target in self.plan.edited
             if target != source
         ]
-        given = [warps(source, target) for source, target in pairs]
-        for (source, target), warp in zip(pairs, given, strict=True):
-            camera = self.scene.cameras[target]
-            name = f"warps({source}, {target}).mask"
-            check.shape(warp.mask, (camera.height, camera.width), name)
-        return digest(
-            *(w.correspondence.xy.numpy() for w in given), *(w.mask.numpy() for w in given)
-        )
+
+        def parts() -> Iterator[npt.NDArray[Any]]:
+            # A warp is large, so none is kept; its mask is a hundredth of it.
+            masks = []
+            for source, target in pairs:
+                warp, camera = warps(source, target), self.scene.cameras[target]
+                name = f"warps({source}, {target}).mask"
+                check.shape(warp.mask, (camera.height, camera.width), name)
+                masks.append(warp.mask.numpy())
+                yield warp.correspondence.xy.numpy()
+            yield from masks
+
+        return digest_each(parts())
 
     def _surface(self, view: int, model: Gaussians) -> Surface:
         if model is self.frozen and view in self._frozen_surfaces:
             return self._frozen_surfaces[view]
         camera = self.scene.cameras[view]
-        surface = render_surface(model, camera, self.settings.warp, backend=self.backend)
+        surface = self._rendered_surface(model, camera)
         if model is self.frozen:
             self._frozen_surfaces[view] = surface
         return surface
 
+    def _rendered_surface(self, model: Gaussians, camera: Camera) -> Surface:
+        warp = self.settings.warp
+        return render_surface(model, camera, warp, near=self.near, backend=self.backend)
+
     def _guide(self, view: int, model: Gaussians) -> Guide:
         if self.editor.guide == "picture":
-            return resized(self.scene.pictures[view], self.sizes[view])
+            return resized(self.scene.picture(view), self.sizes[view])
         before = self.frozen if self.settings.depth_from == "frozen" else model
         h, w = self.sizes[view]
         camera = self.scene.cameras[view].resize(w, h)
-        depth = render_surface(before, camera, self.settings.warp, backend=self.backend).depth
-        return np.asarray(depth)
+        return np.asarray(self._rendered_surface(before, camera).depth)
 
     def _start_picture(self, view: int, model: Gaussians) -> Image | None:
         if self.view_editor.timestep is None:
             return None
         h, w = self.sizes[view]
         if self.settings.start_picture == "original":
-            return resized(self.scene.pictures[view], (h, w))
+            return resized(self.scene.picture(view), (h, w))
         return render_picture(model, self.scene.cameras[view].resize(w, h), self.near, self.backend)
 
     def _composite(self, view: int, picture: Image) -> Image:
         if self.scene.segments is None:
             return picture
-        original = resized(self.scene.pictures[view], self.sizes[view])
+        original = resized(self.scene.picture(view), self.sizes[view])
         s = self.settings
         return composite(
             picture, original, self.scene.segments[view], s.composite, s.composite_blur
@@ -601,7 +615,7 @@ class _Run:
         camera = self.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
         if self.settings.detail == "change":
-            picture = enlarged_change(self.scene.pictures[view], edited)
+            picture = enlarged_change(self.scene.picture(view), edited)
             return TrainingView(view, camera, picture)
         h, w = self.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)
@@ -699,14 +713,3 @@ class _Run:
         self.done = self.done + steps if done is None else done
         if self.watch is not None:
             self.watch(Step(min(self.done, self.total), self.total, text))
-
-
-def _by_hand(picture: npt.NDArray[Any]) -> Image:
-    array = np.asarray(picture)
-    check.shape(array, ("H", "W", 3), "source_picture")
-    if array.dtype == np.uint8:
-        return array.astype(np.float32) / np.float32(255)
-    check.finite(array, "source_picture")
-    if array.dtype.kind != "f" or array.min() < 0 or array.max() > 1:
-        raise ValueError("source_picture: expected uint8, or floating values in [0, 1]")
-    return array.astype(np.float32)

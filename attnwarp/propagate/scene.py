@@ -12,8 +12,8 @@ import torch
 
 from attnwarp import check
 from attnwarp.camera import Camera
-from attnwarp.digest import digest
-from attnwarp.fit import FitSettings, extent_of
+from attnwarp.digest import digest, digest_each
+from attnwarp.fit import FitSettings, Views, extent_of
 from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.pictures import Image, Mask
 from attnwarp.render import render
@@ -29,12 +29,13 @@ class Scene:
 
     Attributes:
         cameras: one for each view.
-        pictures: (H, W, 3) float32 sRGB in [0, 1].
+        images: (H, W, 3) sRGB, uint8, uint16 or float32 in [0, 1]. Photographs keep their type in
+            memory; :meth:`picture` converts one.
         segments: (H, W) bool, or None where all is edited.
     """
 
     cameras: list[Camera]
-    pictures: list[Image]
+    images: list[npt.NDArray[Any]]
     segments: list[Mask] | None
 
     @classmethod
@@ -52,14 +53,15 @@ class Scene:
         """
         if len(images) != len(cameras):
             raise ValueError(f"images: got {len(images)}, expected {len(cameras)}, as cameras")
-        pictures = [
-            _picture(image, camera, f"images[{k}] ({camera.name})")
-            for k, (image, camera) in enumerate(zip(images, cameras, strict=True))
-        ]
+        stored = []
+        for k, (image, camera) in enumerate(zip(images, cameras, strict=True)):
+            name = f"images[{k}] ({camera.name})"
+            check.shape(np.asarray(image), (camera.height, camera.width, 3), name)
+            stored.append(checked_image(image, name))
         if segments is None:
-            return cls(list(cameras), pictures, None)
+            return cls(list(cameras), stored, None)
         given = (
-            [segments(k, picture) for k, picture in enumerate(pictures)]
+            [segments(k, to_float(image)) for k, image in enumerate(stored)]
             if callable(segments)
             else segments
         )
@@ -75,30 +77,54 @@ class Scene:
             masks.append(mask)
         if not any(mask.any() for mask in masks):
             raise ValueError("segments: every one is empty, so nothing may change; True is edited")
-        return cls(list(cameras), pictures, masks)
+        return cls(list(cameras), stored, masks)
+
+    def picture(self, view: int) -> Image:
+        """(H, W, 3) float32 in [0, 1] of a view."""
+        return to_float(self.images[view])
 
     def digest(self) -> dict[str, str | None]:
         """SHA-256 of cameras, pictures and segments."""
         cameras = [{**camera.to_dict(), "name": camera.name} for camera in self.cameras]
         return {
             "cameras": digest(cameras),
-            "images": digest(*self.pictures),
+            "images": digest_each(map(to_float, self.images)),
             "segments": None if self.segments is None else digest(*self.segments),
         }
 
 
-def _picture(image: npt.NDArray[Any], camera: Camera, name: str) -> Image:
-    """(H, W, 3) float32 in [0, 1] of 8 bits, 16 bits or floating values."""
+def checked_image(image: npt.NDArray[Any], name: str) -> npt.NDArray[Any]:
+    """A picture of 8 or 16 bits as it is, one of floating values as float32.
+
+    Raises:
+        ValueError: another type, or values beyond [0, 1]; the message has the name.
+    """
     array = np.asarray(image)
-    check.shape(array, (camera.height, camera.width, 3), name)
     if array.dtype in (np.uint8, np.uint16):
-        return array.astype(np.float32) / np.float32(np.iinfo(array.dtype).max)
+        return array
     if array.dtype.kind != "f":
         raise ValueError(f"{name}: got {array.dtype}, expected uint8, uint16 or floating")
     check.finite(array, name)
     if array.min() < 0 or array.max() > 1:
         raise ValueError(f"{name}: got values in [{array.min()}, {array.max()}], expected [0, 1]")
-    return array.astype(np.float32)
+    # What is float32 already is not copied, unless torch could not share it.
+    return np.require(array, np.float32, ["C", "W"])
+
+
+def to_float(image: npt.NDArray[Any]) -> Image:
+    """(H, W, 3) float32 in [0, 1] of a checked image."""
+    if image.dtype.kind == "f":
+        return image
+    return image.astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+
+
+def images_of(views: Views) -> list[npt.NDArray[Any]]:
+    """(H, W, 3) of each view as it is stored; transparent ones over black, as float32."""
+    black = torch.zeros(3)
+    return [
+        image if image.shape[2] == 3 else views.target(k, black).numpy()
+        for k, image in enumerate(views.images)
+    ]
 
 
 def near_of(cameras: Sequence[Camera]) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -20,7 +20,8 @@ class Plan:
     Attributes:
         source: number of the source view.
         stages: numbers of the views that each stage edits, in the order of editing. No view is in
-            two of them, and no source in any.
+            two of them, and no source in any. Where all views are sources, one stage without views
+            is left, which tunes on the sources.
         chain: numbers of the further sources, in the order of editing.
 
     Example:
@@ -51,12 +52,15 @@ class Plan:
         rest = [view for view in range(views) if view not in (source, *chain)]
         each = settings.views_per_stage
         if each is None:
-            each = max(1, min(MOST_VIEWS, math.ceil(len(rest) / settings.stages)))
-        # A prefix of one permutation is a draw without replacement.
+            shares = np.array_split(rest, settings.stages)
+            sizes = [min(MOST_VIEWS, len(share)) for share in shares]
+        else:
+            sizes = [each] * settings.stages
+        # Parts of one permutation are draws without replacement.
         generator = torch.Generator().manual_seed(settings.seed)
-        order = [rest[k] for k in torch.randperm(len(rest), generator=generator).tolist()]
-        parts = [tuple(order[each * k : each * (k + 1)]) for k in range(settings.stages)]
-        return cls(source, tuple(part for part in parts if part), tuple(chain))
+        order = iter([rest[k] for k in torch.randperm(len(rest), generator=generator).tolist()])
+        parts = [tuple(islice(order, size)) for size in sizes]
+        return cls(source, tuple(part for part in parts if part) or ((),), tuple(chain))
 
     @property
     def sources(self) -> tuple[int, ...]:
@@ -75,8 +79,9 @@ class Plan:
 
     def training(self, stage: int, choice: str) -> list[int]:
         """Numbers of the views that a stage tunes on, see
-        :class:`~attnwarp.propagate.PropagateSettings`."""
-        if choice == "all":
+        :class:`~attnwarp.propagate.PropagateSettings`. A stage without views tunes on the
+        sources."""
+        if choice == "all" or not self.stages[stage]:
             return [*self.sources, *(view for part in self.stages[: stage + 1] for view in part)]
         return [*(self.chain if stage == 0 else ()), *self.stages[stage]]
 

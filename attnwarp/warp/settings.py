@@ -122,11 +122,7 @@ class WarpSettings:
             value = getattr(self, name)
             if value is None and name in ("opaque", "photometric", "depth_spread"):
                 continue
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise ValueError(f"{name}: got {value!r}, expected a number")
-            largest = limits.get(name, float("inf"))
-            if not 0 <= value <= largest:
-                raise ValueError(f"{name}: got {value}, expected a number in [0, {largest:g}]")
+            check.number(value, 0, limits.get(name, float("inf")), name)
             object.__setattr__(self, name, float(value))
 
     def to_dict(self) -> dict[str, Any]:

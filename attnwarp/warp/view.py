@@ -265,6 +265,7 @@ def warp_view(
     target_image: Array | None = None,
     target_segment: Array | None = None,
     source_surface: Surface | None = None,
+    near: float | None = None,
     backend: str = "auto",
     warp_backend: Backend = "auto",
     warn_empty: bool = True,
@@ -286,6 +287,7 @@ def warp_view(
             ``segment``.
         source_surface: the source's render if it is at hand, :func:`render_surface`; one source
             serves many targets.
+        near: as in :func:`render_surface`.
         backend: of the renderer, as in :func:`attnwarp.render.render`.
         warp_backend, warn_empty: of the warp, as in :func:`warp_surfaces`.
 
@@ -316,17 +318,18 @@ def warp_view(
         gaussians, source, target, settings.gaussian_filter, settings.normal_angle
     )
     filtered = gaussians if bool(keep.all()) else gaussians.select(keep.to(gaussians.means.device))
-    seen = render_surface(filtered, target, settings, backend=backend)
+    seen = render_surface(filtered, target, settings, near=near, backend=backend)
     if settings.photometric is not None:
         if target_image is None and filtered is not gaussians:
-            target_image = render_surface(gaussians, target, settings, backend=backend).image
+            whole = render_surface(gaussians, target, settings, near=near, backend=backend)
+            target_image = whole.image
         if target_image is not None:
             seen = replace(seen, image=target_image)
     needs_source = (
         settings.depth_agreement or settings.photometric is not None or settings.opaque is not None
     )
     if source_surface is None and needs_source:
-        source_surface = render_surface(gaussians, source, settings, backend=backend)
+        source_surface = render_surface(gaussians, source, settings, near=near, backend=backend)
     if source_surface is not None and source_image is not None:
         source_surface = replace(source_surface, image=source_image)
     view = warp_surfaces(
@@ -350,18 +353,19 @@ def render_surface(
     camera: Camera,
     settings: WarpSettings = PRESETS["corrected"],
     *,
+    near: float | None = None,
     backend: str = "auto",
 ) -> Surface:
     """Depth, normals, alpha and colour of splats, rendered as ``settings`` demand.
-
-    The near plane is the renderer's default, or a hundredth of the splats' median distance where
-    that is less. So a world in small units has a surface too.
 
     Args:
         gaussians: to render.
         camera: whose view is rendered; (H, W) is its size.
         settings: their ``depth`` and ``depth_statistic`` choose the depth. 3D splats have "peak"
             depth in place of "intersection".
+        near: nothing nearer than this depth is seen, in scene units. By default the renderer's
+            own, or a hundredth of the splats' median distance where that is less: a world in small
+            units has a surface too.
         backend: of :func:`attnwarp.render.render`.
 
     Returns:
@@ -384,8 +388,8 @@ def render_surface(
     depth = settings.depth
     how = "peak" if depth == "intersection" and gaussians.kind == "3d" else depth
     with torch.no_grad():
-        near = _near_plane(gaussians, camera)
-        seen = render(gaussians, camera, backend=backend, depth=how, near=near)
+        plane = _near_plane(gaussians, camera) if near is None else near
+        seen = render(gaussians, camera, backend=backend, depth=how, near=plane)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
     return Surface(
         z.cpu(), seen.normal.cpu(), seen.alpha.cpu(), seen.color.cpu(), dict(seen.counters)

@@ -12,7 +12,7 @@ from tiny_baselines import QUICK, close, rows_of
 from tiny_editors import nearest_steps
 from tiny_scenes import cameras
 
-from attnwarp import Camera, baselines
+from attnwarp import Camera, Gaussians, baselines
 from attnwarp.baselines import (
     METHODS,
     ByViewSettings,
@@ -184,6 +184,26 @@ def test_timesteps_are_drawn_evenly_with_both_ends(scene, editor):
     assert torch.equal(noises[1], work.noise(0, [0, 1])[1])  # whoever is beside it
     correlations = np.corrcoef(noises.flatten(1).numpy())
     assert np.abs(correlations - np.eye(4)).max() < 0.2  # 1024 values: 6 sigma
+
+
+def test_depth_shows_no_splat_that_no_picture_shows(editor):
+    """Oracle: the plane of the wall. A disc hangs 0.1 before the first of two cameras 40 apart."""
+    from attnwarp.baselines.work import Work
+    from attnwarp.propagate.scene import Scene
+
+    view = {"width": 32, "height": 32, "fov_y": 40, "up": (0, 1, 0)}
+    views = [Camera.look_at((x, 0, 20), (x, 0, 0), **view) for x in (-20.0, 20.0)]
+    discs = Gaussians(
+        "2d",
+        torch.tensor([[0, 0, 0], [-20, 0, 19.9]]),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        torch.tensor([[500.0, 500.0], [0.02, 0.02]]),
+        torch.ones(2),
+        torch.zeros(2, 1, 3),
+    )
+    scene = Scene.checked(views, [np.zeros((32, 32, 3), np.uint8)] * 2, None)
+    work = Work(discs, scene, editor, "a bear", ByViewSettings(), "auto")
+    assert np.allclose(work.depth(0), 20, rtol=1e-4)
 
 
 def test_the_published_numbers():

@@ -76,9 +76,9 @@ def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth
 def killed_at(run, name, folder, moment):
     """Die at a step of progress or at a write, before it or after it; whether it came so far."""
     with pytest.MonkeyPatch.context() as patch:
-        progress, _ = events(patch, moment)
+        watch, _ = events(patch, moment)
         try:
-            run(name, folder=folder, progress=progress, checkpoint_seconds=0)
+            run(name, folder=folder, watch=watch, checkpoint_seconds=0)
         except Killed:
             return True
     return False
@@ -127,6 +127,12 @@ def test_no_more_rows_go_through_the_network_than_the_budget_has(
     rows, again = rows_of(network, lambda: run(name, folder=tmp_path, budget=limited))
     assert not rows
     assert again.counters == result.counters
+
+
+def test_no_budget_is_a_whole_run(whole, run):
+    result, full = run("by_view", budget=None), whole("by_view")[2]
+    assert result.cut is None
+    assert result.counters == full.counters
 
 
 def test_a_damaged_edit_of_a_run_that_was_cut_is_made_again(whole, run, tmp_path):
@@ -197,6 +203,8 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
         run("dge", IGS2GSSettings())
     with pytest.raises(ValueError, match="option: got 'foldr'.*folder"):
         run("by_view", foldr=tmp_path)
+    with pytest.raises(ValueError, match="option: got 'progress'.*'watch'"):
+        run("by_view", progress=print)
     with pytest.raises(ValueError, match="image_guidance: this editor has none"):
         run("gaussctrl", GaussCtrlSettings(image_guidance=1.5))
     wide = [*views[:2], Camera.look_at((0, 0, 3), (0, 0, 0), width=64, height=32, fov_y=40, up=(0, 1, 0))]  # fmt: skip

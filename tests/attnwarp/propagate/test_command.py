@@ -21,11 +21,13 @@ from tiny_scenes import cameras, pictures, splats
 from tiny_segmenters import save_dino, save_sam
 from typer.testing import CliRunner
 
-from attnwarp import propagate
+from attnwarp import Camera, propagate
 from attnwarp.cli import edit
 from attnwarp.cli.main import app
+from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
+from attnwarp.propagate.command import mask_files, read_mask, read_over_black
 
 runner = CliRunner()
 QUICK = (
@@ -204,6 +206,62 @@ def test_masks_by_words_are_those_that_the_same_files_give(place, tmp_path):
     assert result.exit_code == 0, result.output
     for name in ("source.png", "edited.ply"):
         assert (tmp_path / "words" / name).read_bytes() == (tmp_path / "files" / name).read_bytes()
+
+
+MASKS = {
+    "with their folders": ("train/r_0", "test/r_0", "frame.001", "frame.002"),
+    "numbered": ("0000-r_0", "0001-r_0", "0002-frame", "0003-frame"),
+}
+"""Names of masks of the views below."""
+
+
+def views_of_one_name():
+    names = ("./train/r_0", "../test/r_0", "frame.001", "frame.002")
+    view = {"width": 32, "height": 32, "fov_y": 40}
+    return [Camera.look_at((3, 0, 0), (0, 0, 0), name=name, **view) for name in names]
+
+
+@pytest.mark.parametrize("how", MASKS)
+def test_views_of_one_name_have_masks_of_their_own(how, tmp_path):
+    """Oracle: each file has another number of white rows."""
+    for k, name in enumerate(MASKS[how]):
+        rows = np.zeros((32, 32, 3), np.uint8)
+        rows[: k + 1] = 255
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.png").write_bytes(encode_png(rows))
+    views = views_of_one_name()
+    files = mask_files(tmp_path, views)
+    masks = [read_mask(file, view) for file, view in zip(files, views, strict=True)]
+    assert [mask.sum() for mask in masks] == [32, 64, 96, 128]
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [
+        (0, r"r_0\.png could be that of train/r_0 or of test/r_0; expected .*train/r_0\.png"),
+        (2, r"frame\.png could be that of frame.001 or of frame.002; expected .*frame\.001\.png"),
+    ],
+)
+def test_a_mask_that_could_be_that_of_two_views_is_refused_with_both(first, message, tmp_path):
+    for name in ("r_0", "frame"):
+        (tmp_path / f"{name}.png").write_bytes(encode_png(np.zeros((32, 32, 3), np.uint8)))
+    with pytest.raises(InputError, match=message):
+        mask_files(tmp_path, views_of_one_name()[first:])
+
+
+def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
+    """Oracle: the alpha, in numbers that 8 bits hold exactly."""
+    colour = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    alpha = np.repeat(np.repeat(np.uint8([0, 51, 204, 255]), 8)[None], 32, axis=0)
+    (tmp_path / "hand.png").write_bytes(encode_png(np.dstack([colour, alpha])))
+    pixels, white = read_over_black(tmp_path / "hand.png")
+    share = np.repeat([0, 0.2, 0.8, 1], 8)[None, :, None]
+    assert np.allclose(pixels / white, colour / 255 * share, rtol=0, atol=1e-12)
+    # White everywhere, and opaque enough in its right half alone.
+    mask = np.dstack([np.full((32, 32, 3), 255, np.uint8), alpha])
+    (tmp_path / "mask.png").write_bytes(encode_png(mask))
+    edited = read_mask(tmp_path / "mask.png", cameras(1)[0])
+    assert edited[:, 16:].all() and not edited[:, :16].any()
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """Oracles: the editor's own loop, a float64 pass written out with its geometry, counts by hooks, bytes of files."""
 
 import copy
+import hashlib
 import json
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +75,71 @@ def test_a_warp_from_outside_takes_the_place_of_the_splats_own(scene, editor, tm
     )
     with pytest.raises(ValueError, match=r"warps\(0, 1\)\.mask: got shape \(16, 16\)"):
         run(pair, editor, settings=settings, warps=lambda source, target: small)
+
+
+def test_of_warps_from_outside_one_is_held_at_a_time_while_they_are_hashed(scene, editor, tmp_path):
+    """Oracles: references that do not hold their objects, hashlib."""
+    views = scene[1]
+    flat = Surface(np.full((32, 32), 2.0), np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    alive, most, made = weakref.WeakSet(), 0, {}
+
+    def warps(source, target):
+        nonlocal most
+        most = max(most, len(alive))
+        warp = warp_surfaces(views[source], views[target], flat, flat)
+        alive.add(warp)
+        made[target] = warp.correspondence.xy.numpy().copy(), warp.mask.numpy().copy()
+        return warp
+
+    result = run(scene, editor, tmp_path, replace(QUICK, iterations=0, batch=1), warps=warps)
+    assert most <= 1
+    expected = hashlib.sha256()
+    for part, shape in ((0, "float64(32, 32, 2)"), (1, "bool(32, 32)")):
+        for view in result.plan.targets:
+            expected.update(shape.encode() + made[view][part].tobytes())
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["inputs"]["warps"] == expected.hexdigest()
+
+
+def test_without_a_mask_features_go_where_the_target_has_a_depth(scene, editor, tmp_path):
+    views = scene[1]
+    depth = np.full((32, 32), 2.0)
+    depth[:, 8:] = np.nan
+    part = Surface(depth, np.broadcast_to([0.0, 0, -1], (32, 32, 3)))
+    # The segment leaves no pixel, so by its mask the view would get no features.
+    rules = attnwarp.warp.preset("corrected", segment=True)
+    nothing = np.zeros((32, 32), bool)
+    warp = warp_surfaces(views[0], views[0], part, part, rules, target_segment=nothing)
+    settings = replace(QUICK, stages=1, iterations=0, mask=False, a0=1.0)
+    result = run(scene, editor, tmp_path, settings, warps=lambda source, target: warp)
+    assert result.counters["injected"] == 0.25
+    for view in result.plan.targets:
+        mask = read_image(tmp_path / "masks" / f"v{view}.png")
+        assert (mask[:, :8] == 255).all() and (mask[:, 8:] == 0).all()
+
+
+def test_a_splat_that_no_picture_shows_changes_no_edit(scene, editor):
+    """Oracle: the edit of the scene without it."""
+    model, views, images = scene
+    # Twenty times as large: 0.1 is nearer than any picture shows, and beyond the renderer's 0.01.
+    large = replace(model, means=20 * model.means, scales=20 * model.scales)
+    poses = [camera.world_to_camera.copy() for camera in views]
+    for pose in poses:
+        pose[:3, 3] *= 20
+    far = [Camera(c.K, p, 32, 32, c.name) for c, p in zip(views, poses, strict=True)]
+    before = torch.tensor(np.array([c.position + 0.1 * c.rotation[2] for c in far])).float()
+    floaters = replace(large.select(torch.arange(5)), means=before, scales=torch.full((5, 2), 0.02))
+    parts = ("means", "quats", "scales", "opacities", "sh")
+    joined = replace(
+        large, **{p: torch.cat([getattr(large, p), getattr(floaters, p)]) for p in parts}
+    )
+    settings = replace(QUICK, stages=1, iterations=0)
+    one, other = (
+        run((splats, far, images), editor, settings=settings) for splats in (large, joined)
+    )
+    assert one.counters["injected"] == other.counters["injected"] > 0.5
+    for view, picture in one.edited.items():
+        assert np.array_equal(picture, other.edited[view])
 
 
 def test_weight_zero_is_each_view_alone_bit_for_bit(scene, editor, tmp_path):
@@ -364,6 +431,34 @@ def test_a_picture_edited_by_hand_is_the_source(scene, editor):
     plain = run(scene, editor, settings=settings)
     for view in plain.plan.stages[0]:
         assert not np.array_equal(by_hand.edited[view], plain.edited[view])
+
+
+def test_a_picture_by_hand_may_have_any_type_that_images_have(scene, editor):
+    """Oracle: a depth of 16 bits holds a depth of 8 bits exactly, as 257 of its steps."""
+    picture = np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    settings = replace(QUICK, iterations=0, stages=1, views_per_stage=1)
+    deep = picture.astype(np.uint16) * np.uint16(257)
+    one, other = (run(scene, editor, settings=settings, source_picture=p) for p in (picture, deep))
+    for view, pixels in one.edited.items():
+        assert np.array_equal(pixels, other.edited[view])
+    with pytest.raises(ValueError, match="source_picture: got int64, expected uint8, uint16 or"):
+        run(scene, editor, settings=settings, source_picture=picture.astype(np.int64))
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_where_all_views_are_sources_the_splats_are_tuned_on_them(views, scene, editor, tmp_path):
+    model, cameras, images = scene
+    part = model, cameras[:views], images[:views]
+    settings = replace(QUICK, steps=1, sources=views)
+    lines = []
+    result = run(part, editor, tmp_path, settings, announce=lines.append)
+    assert sorted(result.edited) == list(range(views))
+    tuned = json.loads((tmp_path / "result.json").read_text())["tuned"]
+    assert tuned == {f"v{view}": 3 // views for view in range(views)}
+    assert result.counters["iterations"] == 3
+    assert not torch.equal(result.gaussians.sh, model.sh)
+    (line,) = [line for line in lines if line.startswith("stages")]
+    assert line.startswith("stages: 1 that tunes on the sources alone in place of 2, as ")
 
 
 def test_fresh_noise_is_each_views_own_and_shared_noise_is_one(scene, editor):

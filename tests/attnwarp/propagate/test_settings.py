@@ -4,6 +4,7 @@ import json
 from dataclasses import fields, replace
 
 import pytest
+import torch
 
 import attnwarp.warp
 from attnwarp.propagate import PRESETS, Plan, PropagateSettings, preset
@@ -98,6 +99,35 @@ def test_stages_are_disjoint_seeded_subsets_without_the_source(views, each):
     assert plan == Plan.draw(views, 1, settings)
     if views > 2:
         assert plan != Plan.draw(views, 1, replace(settings, seed=8))
+
+
+@pytest.mark.parametrize(
+    ("targets", "sizes"),
+    [
+        (1, [1]),
+        (4, [2, 1, 1]),
+        (6, [2, 2, 2]),
+        (7, [3, 2, 2]),
+        (10, [4, 3, 3]),
+        (119, [40, 40, 39]),
+        (130, [40] * 3),
+    ],
+)
+def test_an_equal_share_leaves_no_stage_out(targets, sizes):
+    plan = Plan.draw(targets + 1, 0, PropagateSettings(seed=3))
+    assert [len(stage) for stage in plan.stages] == sizes
+    order = torch.randperm(targets, generator=torch.Generator().manual_seed(3)) + 1
+    drawn = [view for stage in plan.stages for view in stage]
+    assert drawn == order[: sum(sizes)].tolist()
+
+
+@pytest.mark.parametrize("choice", ["all", "stage", "modulo"])
+def test_where_all_views_are_sources_one_stage_tunes_on_them(choice):
+    alone = Plan.draw(1, 0, PropagateSettings())
+    assert (alone.stages, alone.edited, alone.training(0, choice)) == (((),), (0,), [0])
+    chain = Plan.draw(4, 1, PropagateSettings(views_per_stage=2), chain=(3, 0, 2))
+    assert (chain.stages, chain.edited) == (((),), (1, 3, 0, 2))
+    assert chain.training(0, choice) == [1, 3, 0, 2]
 
 
 def test_a_view_is_drawn_first_as_often_as_any_other():

@@ -37,6 +37,13 @@ def test_the_presets_are_the_table_of_the_docs():
     assert set(documented) <= {field.name for field in dataclasses.fields(WarpSettings)}
 
 
+@pytest.mark.parametrize("name", ["depth_spread", "depth_relative", "depth_slope", "opaque"])
+@pytest.mark.parametrize("value", [float("inf"), float("nan"), -1.0, True, "1"])
+def test_a_limit_that_no_file_could_hold_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"{name}: got .*, expected a number"):
+        preset("corrected", **{name: value})
+
+
 def test_every_field_changes_what_it_says():
     """A field that nothing reads could hold any value: each changed alone moves a result."""
     splats, source, target = shell(3000), orbit(0, size=40), orbit(50, size=40, height=0.8)

@@ -83,6 +83,31 @@ def test_a_world_in_millimetres_has_the_depth_of_its_plane(backend):
     assert view.mask[middle].all()
 
 
+def test_nothing_nearer_than_the_near_plane_that_is_asked_for_is_seen():
+    # A disc at depth 20 and, on the source's axis alone, one at depth 0.1.
+    camera = Camera(np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]), np.eye(4), 32, 32)
+    beside = np.eye(4)
+    beside[0, 3] = 20 * 4 / 32  # 4 px at depth 20
+    target = Camera(camera.K, beside, 32, 32)
+    discs = Gaussians(
+        "2d",
+        torch.tensor([[0, 0, 20.0], [0, 0, 0.1]]),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        torch.tensor([[50.0, 50.0], [0.02, 0.02]]),
+        torch.ones(2),
+        Gaussians.sh_from_rgb(torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])),
+    )
+    far, default = (render_surface(discs, camera, near=near) for near in (1.0, None))
+    assert default.depth[16, 16].item() == pytest.approx(0.1, rel=1e-5)
+    assert far.depth.numpy() == pytest.approx(np.full((32, 32), 20.0), rel=1e-5)
+    assert far.image[16, 16].tolist() == pytest.approx([1, 0, 0], abs=0.02)
+    settings = preset("corrected", photometric=0.2)
+    seen = warp_view(discs, camera, target, settings, near=1.0)
+    # The floater hides the wall from the source, by depth and by colour.
+    assert seen.mask[:, 8:24].all()
+    assert not warp_view(discs, camera, target, settings).mask[12:20, 16:24].any()
+
+
 def test_at_yaw_150_bounds_alone_accept_nothing_but_points_behind_the_source():
     # A background at depth 20.
     source, target = orbit(0, size=128), orbit(150, size=128)
