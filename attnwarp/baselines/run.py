@@ -146,7 +146,7 @@ def run(
         raise ValueError("instruction: is empty, expected words such as 'make it red'")
     backend, folder = options.get("backend", "auto"), options.get("folder")
     if images is None:
-        near = near_of(cameras)
+        near = near_of(cameras, gaussians)
         images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
     scene = Scene.checked(cameras, images, options.get("segments"))
     work = Work(gaussians, scene, editor, instruction, chosen, backend)

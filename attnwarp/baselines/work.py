@@ -113,7 +113,7 @@ class Work:
             edit_size(camera.height, camera.width, settings.size, multiple)
             for camera in scene.cameras
         ]
-        self.near = near_of(scene.cameras)
+        self.near = near_of(scene.cameras, gaussians)
 
     def picture(self, view: int) -> Image:
         """(h, w, 3) of a view before the edit, at the size of its edit."""

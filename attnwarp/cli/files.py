@@ -85,7 +85,7 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     from attnwarp.propagate.scene import near_of
     from attnwarp.render import render
 
-    near = near_of(cameras)
+    near = near_of(cameras, splats)
     with torch.no_grad():
         for camera in cameras:
             factor = min(1.0, LOOK_SIZE / max(camera.width, camera.height))

@@ -176,7 +176,14 @@ def _fitted(
     else:
         say(f"no points in the data: the fit begins with {FIRST_POINTS} random ones")
         points, colors = random_points(views.cameras, FIRST_POINTS, seed=seed)
-    start = from_points(points, colors, kind=settings.kind, sh_degree=settings.sh_degree, seed=seed)
+    start = from_points(
+        points,
+        colors,
+        kind=settings.kind,
+        sh_degree=settings.sh_degree,
+        seed=seed,
+        cameras=views.cameras,
+    )
     say(f"no --ply: fitting splats to {len(views)} views first: {folder}")
     if len(start) > plan.max_splats:
         say(progress.more_points(len(start), plan.max_splats))

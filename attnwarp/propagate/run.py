@@ -185,7 +185,7 @@ def propagate(
     if not instruction.strip():
         raise ValueError("instruction: is empty, expected words such as 'make it red'")
     if images is None:
-        near = near_of(cameras)
+        near = near_of(cameras, gaussians)
         images = [render_picture(gaussians, camera, near, backend) for camera in cameras]
     scene = Scene.checked(cameras, images, segments)
     by_hand = None
@@ -237,7 +237,7 @@ class _Run:
         disk = folder / RECORDING
         place: Store = disk if store == "disk" else "device" if store == "device" else "cpu"
         self.view_editor = ViewEditor(editor, instruction, settings, store=place, announce=announce)
-        self.near = near_of(scene.cameras)
+        self.near = near_of(scene.cameras, gaussians)
         self._frozen_surfaces: dict[int, Surface] = {}
         self.seconds: dict[str, float] = {}
         if self.folder.has("times.json"):

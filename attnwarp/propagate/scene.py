@@ -127,9 +127,9 @@ def images_of(views: Views) -> list[npt.NDArray[Any]]:
     ]
 
 
-def near_of(cameras: Sequence[Camera]) -> float:
-    """Nothing nearer is drawn, as in the tuning."""
-    return FitSettings().near * extent_of(cameras)
+def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
+    """Nothing nearer is drawn, as in the tuning of these splats."""
+    return FitSettings().near * extent_of(cameras, gaussians.world_means())
 
 
 def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:

@@ -90,7 +90,7 @@ class Tuning:
             lr_scales=g * rates.lr_scales,
             lr_quats=g * rates.lr_quats,
         )
-        self.model = Model(start, self.fit, extent_of(cameras))
+        self.model = Model(start, self.fit, extent_of(cameras, start.world_means()))
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
         self.iteration = 0

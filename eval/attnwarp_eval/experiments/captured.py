@@ -214,7 +214,7 @@ def _write_pictures(
     from attnwarp.propagate.pictures import enlarged_change
     from attnwarp.propagate.scene import near_of, render_picture
 
-    near = near_of(cameras)
+    near = near_of(cameras, edited.gaussians)
     for k, camera in enumerate(cameras):
         picture = render_picture(edited.gaussians, camera, near, "auto")
         write_picture(folder / "renders" / f"{_name(k)}.png", _bytes(picture))

@@ -7,8 +7,10 @@ import pytest
 import torch
 from tiny_scenes import cameras, pictures, splats
 
+from attnwarp import Camera
 from attnwarp.encoders import load_encoder
 from attnwarp.propagate import preset
+from attnwarp.propagate.scene import near_of, render_picture
 from attnwarp.propagate.tune import TrainingView, Tuning
 from attnwarp.render import render
 
@@ -101,3 +103,34 @@ def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
         assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
     finally:
         net.net.float()
+
+
+@pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
+def test_views_from_one_place_are_drawn_and_tuned_alike_in_any_unit(unit):
+    """Powers of two leave every digit as it is."""
+    position = cameras(1)[0].position
+
+    def tuned(k):
+        start = replace(splats(), means=k * splats().means, scales=k * splats().scales)
+        view = Camera.look_at(k * position, (0, 0, 0), width=32, height=32, fov_y=40, up=(0, 1, 0))
+        target = TrainingView(0, view, np.zeros((32, 32, 3), np.float32))
+        tuning = Tuning(start, [view], replace(SETTINGS, iterations=3, perceptual=0.0), 1)
+        for _ in range(3):
+            tuning._iterate(0, [target], target)
+        return render_picture(start, view, near_of([view], start), "auto"), tuning.gaussians()
+
+    (drawn, one), (other_drawn, other) = tuned(1.0), tuned(unit)
+    assert drawn.max() > 0.2
+    np.testing.assert_allclose(other_drawn, drawn, atol=1e-5)
+    assert float((one.sh - splats().sh).abs().max()) > 1e-3
+    torch.testing.assert_close(other.sh, one.sh, rtol=0, atol=1e-5)
+    torch.testing.assert_close(other.means / unit, one.means, rtol=0, atol=1e-5)
+
+
+def test_geometry_of_rate_0_stays_however_large(tmp_path):
+    start, (view, *_) = replace(splats(), scales=splats().scales.clone()), views_of(1)
+    start.scales[0] = 1e7
+    settings = replace(SETTINGS, iterations=2, geometry_rate=0.0, perceptual=0.0)
+    tuning = Tuning(start, cameras(), settings, 1)
+    tuning.stage(0, [view], view, checkpoint=tmp_path / "c.pt")
+    torch.testing.assert_close(tuning.gaussians().scales, start.scales, rtol=1e-5, atol=0)

@@ -698,11 +698,11 @@ class _Measure:
         return row
 
     def _renders(self, model: Gaussians) -> dict[str, Image]:
-        from attnwarp.fit import FitSettings, extent_of
+        from attnwarp.propagate.scene import near_of
         from attnwarp.render import render
 
         cameras = [self.work.world.camera(name) for name in self.names]
-        near = FitSettings().near * extent_of(cameras)
+        near = near_of(cameras, self.before)
         with torch.no_grad():
             return {
                 name: np.asarray(render(model, camera, near=near).color.clamp(0, 1).float().numpy())
