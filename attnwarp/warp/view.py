@@ -416,7 +416,9 @@ def _check_pictures(
     for name, image in (("source_image", first), ("target_image", second)):
         # A render's colours may exceed 1 here and there, resampling may overshoot either end.
         # Tensors of 8 bits have no mean of their own.
-        values = torch.as_tensor(image).float()
+        # A copy of arrays, since torch reads neither flipped nor big-endian ones.
+        plain = image if isinstance(image, Tensor) else torch.from_numpy(np.array(image, "f4"))
+        values = plain.float()
         if values.min() < -OVERSHOOT or values.mean() > 1 + OVERSHOOT:
             raise ValueError(
                 f"{name}: got values in [{values.min():.3g}, {values.max():.3g}], expected sRGB in"
