@@ -223,7 +223,9 @@ def test_a_budget_of_network_rows_ends_a_method_after_so_many_views(folder, tmp_
     assert set(record.extra.answers["edit"]) == names
     assert record.cost.counters["network_rows"] == ROWS * views
     assert probe("editing").repeatable(record)
-    assert EditResult.from_json(record.extra.to_json()["edit"]) == record.extra
+    # Of the source alone there is no Edit PSNR; NaN equals nothing, so the texts are compared.
+    assert math.isnan(record.extra.edit_psnr) == (views == 1)
+    assert repr(EditResult.from_json(record.extra.to_json()["edit"])) == repr(record.extra)
 
 
 def test_a_method_that_finishes_says_so_and_a_record_without_a_budget_has_no_word_of_one(
