@@ -71,7 +71,8 @@ kernels-float64: lint
 	@$(BIN)/python -m scripts.compile_kernels float64
 
 collected: kernels-float64
-	@$(BIN)/python -m pytest --collect-only -qqq > /dev/null
+	@mkdir -p build
+	@$(BIN)/python -m pytest --collect-only -qq > build/collected.txt || { tail -60 build/collected.txt; exit 1; }
 
 venv:
 	@scripts/venv.sh

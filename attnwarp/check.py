@@ -111,6 +111,20 @@ def number(value: Any, low: float, high: float, name: str, *, whole: bool = Fals
         raise ValueError(f"{name}: got {value!r}, expected {kind} {bounds}")
 
 
+def seconds(value: Any, name: str) -> None:
+    """Raise ValueError unless ``value`` is a number of seconds >= 0, which may be infinite.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.seconds(None, "checkpoint_seconds")
+        Traceback (most recent call last):
+        ValueError: checkpoint_seconds: got None, expected seconds >= 0
+    """
+    right = isinstance(value, int | float) and not isinstance(value, bool)
+    if not right or not value >= 0:
+        raise ValueError(f"{name}: got {value!r}, expected seconds >= 0")
+
+
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:
     """Return ``value`` if it is among ``allowed``, else raise ValueError that lists what is."""
     if value not in allowed:

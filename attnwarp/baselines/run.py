@@ -164,6 +164,7 @@ class _Run:
         self.name, self.method, self.work = name, method, work
         self.budget = options.get("budget") or Budget()
         self.checkpoint_seconds = options.get("checkpoint_seconds", 30.0)
+        check.seconds(self.checkpoint_seconds, "checkpoint_seconds")
         self.watch = options.get("watch")
         rounds = range(1, len(method.rounds) + 1)
         folders = (*FOLDERS, *(f"rounds/{number}" for number in rounds))

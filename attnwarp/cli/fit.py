@@ -23,7 +23,6 @@ from attnwarp.process import asked_to_stop
 if TYPE_CHECKING:
     from attnwarp.fit import Fit, FitSettings, Views
     from attnwarp.gaussians import Gaussians
-    from attnwarp.io import Dataset
 
 
 OWN_OPTIONS = {
@@ -56,8 +55,9 @@ def fit(
         int | None, typer.Option(min=1, help="Do not grow the model beyond.")
     ] = None,
     points: Annotated[
-        int, typer.Option(min=1, help="Random first points, where DATA has none.")
-    ] = 10_000,
+        int | None,
+        typer.Option(min=1, help="Random first points, where DATA has none (default 10000)."),
+    ] = None,
     hold_out: Annotated[
         int, typer.Option(min=0, help="Hold out one view of so many; 0: none.")
     ] = 8,
@@ -87,6 +87,8 @@ def fit(
         # What needs nothing heavy is read first: a typing error is answered at once.
         changes = assignments(change or [], OWN_OPTIONS)
         check_out(out)
+        if start is not None and points is not None:
+            raise ValueError(f"--points: got {points}, but --start names the first splats")
         first = None if start is None else _read_start(start, out, kind)
         kind = kind or (Kind.three if first is not None and first.kind == "3d" else Kind.two)
         _check_third_scale(third_scale, kind)
@@ -149,7 +151,7 @@ def _fit(
     max_seconds: float | None,
     max_size: int | None,
     max_splats: int | None,
-    points: int,
+    points: int | None,
     every: int,
     seed: int,
     changes: dict[str, Any],
@@ -172,6 +174,7 @@ def _fit(
     import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT
     from attnwarp.fit.progress import more_points, progress_display
+    from attnwarp.fit.start import FIRST_POINTS, first_splats
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = read_views(data, reading)
@@ -182,7 +185,7 @@ def _fit(
         check_seen(start, first, train.cameras)
         first = first.with_sh_degree(settings.sh_degree)
     else:
-        first = _from_points(data, dataset, views, points, settings)
+        first = first_splats(dataset, views.cameras, settings, echo, random=points or FIRST_POINTS)
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)
@@ -203,26 +206,6 @@ def _fit(
         ) from error
     _write_results(out, result, held_out)
     return result
-
-
-def _from_points(
-    data: Path, dataset: Dataset, views: Views, random: int, settings: FitSettings
-) -> Gaussians:
-    """First splats at the data set's points, or at so many random ones where it has none."""
-    import attnwarp.fit
-
-    points, colors = dataset.points, dataset.colors
-    if points is None or not len(points):
-        typer.echo(f"{data} has no points: beginning with {random} random ones", err=True)
-        points, colors = attnwarp.fit.random_points(views.cameras, random, seed=settings.seed)
-    return attnwarp.fit.from_points(
-        points,
-        colors,
-        kind=settings.kind,
-        sh_degree=settings.sh_degree,
-        seed=settings.seed,
-        cameras=views.cameras,
-    )
 
 
 def _write_results(out: Path, result: Fit, held_out: Views | None) -> None:

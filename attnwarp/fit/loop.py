@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from attnwarp import losses
+from attnwarp import check, losses
 from attnwarp.fit import checkpoint
 from attnwarp.fit.densify import Density
 from attnwarp.fit.model import Model
@@ -29,6 +29,9 @@ Measure = Callable[[Gaussians], dict[str, float]]
 
 CHECKPOINT = "checkpoint.pt"
 SPLATS = "splats.ply"
+
+NAMED = {"start": "first splats", "held_out": "held-out views"}
+"""What messages call parts of a fit's identity."""
 
 SMOOTHING = 0.98
 """Share of the past in the loss and the PSNR that are shown while a fit runs."""
@@ -204,10 +207,9 @@ def fit(
         )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
-    if max_seconds is not None and not max_seconds >= 0:
-        raise ValueError(f"max_seconds: got {max_seconds}, expected seconds >= 0")
-    if checkpoint_seconds is None or not checkpoint_seconds >= 0:
-        raise ValueError(f"checkpoint_seconds: got {checkpoint_seconds}, expected seconds >= 0")
+    if max_seconds is not None:
+        check.seconds(max_seconds, "max_seconds")
+    check.seconds(checkpoint_seconds, "checkpoint_seconds")
     if third_scale is not None and settings.kind != "2d":
         raise ValueError(f"third_scale: got {third_scale} for kind '3d', expected None")
     run = _Run(start, views, settings, held_out, backend, measure, third_scale)
@@ -262,8 +264,10 @@ class _Run:
         if not path.exists():
             return
         state = checkpoint.load(path)
+        # Checkpoints from before they named the first splats can't be held to them.
+        stored_of = {"start": self.start, **state}
         for name, expected in self.identity().items():
-            stored = state.get(name)
+            stored = stored_of.get(name)
             if stored == expected:
                 continue
             if isinstance(expected, dict) and isinstance(stored, dict):
@@ -274,8 +278,8 @@ class _Run:
                 ]
                 name = f"settings ({'; '.join(differ)})"
             raise ValueError(
-                f"folder: {folder} holds a fit of other {name}; go on with the same ones, or name"
-                f" another folder, or remove {path} to begin again"
+                f"folder: {folder} holds a fit of other {NAMED.get(name, name)}; go on with the"
+                f" same ones, or name another folder, or remove {path} to begin again"
             )
         try:
             self.model.restore(state["model"])

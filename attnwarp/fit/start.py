@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,10 @@ import torch
 from attnwarp import check
 from attnwarp.camera import Camera
 from attnwarp.gaussians import Gaussians, Kind
+
+if TYPE_CHECKING:
+    from attnwarp.fit.settings import FitSettings
+    from attnwarp.io import Dataset
 
 Array = npt.NDArray[np.float64]
 
@@ -150,6 +155,52 @@ def from_points(
         torch.full((n,), FIRST_OPACITY),
         sh,
         origin=origin,
+    )
+
+
+FIRST_POINTS = 10_000
+"""Random first points, where a data set has none."""
+
+
+def first_splats(
+    dataset: Dataset,
+    cameras: Sequence[Camera],
+    settings: FitSettings,
+    say: Callable[[str], object],
+    *,
+    random: int = FIRST_POINTS,
+) -> Gaussians:
+    """First splats at a data set's points, or at random ones where it has none.
+
+    Args:
+        dataset: whose points and colours are taken.
+        cameras: of the views that are fitted on.
+        settings: kind, degree and seed of the splats.
+        say: told where random points are taken.
+        random: their number.
+
+    Example:
+        >>> from attnwarp import Camera
+        >>> from attnwarp.fit import FitSettings
+        >>> from attnwarp.io import Dataset
+        >>> view = dict(width=64, height=48, fov_y=40)
+        >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
+        >>> splats = first_splats(Dataset(cameras), cameras, FitSettings(), print, random=50)
+        the data has no points: beginning with 50 random ones
+        >>> len(splats), splats.kind
+        (50, '2d')
+    """
+    points, colors = dataset.points, dataset.colors
+    if points is None or not len(points):
+        say(f"the data has no points: beginning with {random} random ones")
+        points, colors = random_points(cameras, random, seed=settings.seed)
+    return from_points(
+        points,
+        colors,
+        kind=settings.kind,
+        sh_degree=settings.sh_degree,
+        seed=settings.seed,
+        cameras=cameras,
     )
 
 

@@ -233,15 +233,18 @@ def undistorted_image(
     columns = np.where(outside, 0.0, xy[..., 0] - 0.5)
 
     def resampled(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        channels = [
-            map_coordinates(values[..., k], [rows, columns], order=1, mode="nearest")
-            for k in range(values.shape[2])
-        ]
-        return np.where(outside[..., None], 0, np.stack(channels, axis=-1))
+        result = np.empty((target.height, target.width, values.shape[2]), values.dtype)
+        for channel in range(values.shape[2]):
+            value = map_coordinates(
+                values[..., channel].astype(np.float64), [rows, columns], order=1, mode="nearest"
+            )
+            whole = np.rint(value) if result.dtype.kind == "u" else value
+            result[..., channel] = np.where(outside, 0, whole)
+        return result
 
     if image.shape[2] == 4:
         return weighted_by_alpha(image, resampled)
-    return np.rint(resampled(image.astype(np.float64))).astype(image.dtype)
+    return resampled(image)
 
 
 def _pixels(camera: Camera, xy: Array) -> Array:

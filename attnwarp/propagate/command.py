@@ -16,7 +16,8 @@ from attnwarp.camera import Camera
 from attnwarp.editing.segment import load_segmenter, segments_of
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
-from attnwarp.fit import FitSettings, Views, fit, from_points, load_views, progress, random_points
+from attnwarp.fit import FitSettings, Views, fit, load_views, progress
+from attnwarp.fit.start import first_splats
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.io.names import file_stems
@@ -30,8 +31,6 @@ from attnwarp.propagate.scene import images_of, to_float
 from attnwarp.propagate.settings import PropagateSettings
 
 FIT_FOLDER = "fit"
-
-FIRST_POINTS = 10_000
 
 MOST_NAMES = 5
 """Names of views in one line."""
@@ -171,19 +170,7 @@ def _fitted(
             "seed": seed,
         }
     )
-    if dataset.points is not None and len(dataset.points):
-        points, colors = dataset.points, dataset.colors
-    else:
-        say(f"no points in the data: the fit begins with {FIRST_POINTS} random ones")
-        points, colors = random_points(views.cameras, FIRST_POINTS, seed=seed)
-    start = from_points(
-        points,
-        colors,
-        kind=settings.kind,
-        sh_degree=settings.sh_degree,
-        seed=seed,
-        cameras=views.cameras,
-    )
+    start = first_splats(dataset, views.cameras, settings, say)
     say(f"no --ply: fitting splats to {len(views)} views first: {folder}")
     if len(start) > plan.max_splats:
         say(progress.more_points(len(start), plan.max_splats))

@@ -32,6 +32,11 @@ from attnwarp.io.names import file_stems
 FORMAT = 1
 """Raised when a folder's files change meaning; older folders are then refused."""
 
+PROTOCOL = 2
+"""Raised when the same settings come to edit views otherwise, so that no folder mixes both. 2:
+warps and depth have the pictures' near plane, and ``mask=False`` leaves out what has no depth.
+"""
+
 MANIFEST = "manifest.json"
 SEGMENTS_FOLDER = "segments"
 VIEWER_PLY = "edited-3dgs.ply"
@@ -68,7 +73,7 @@ class Folder:
             InputError: the folder holds an edit of other settings or inputs, by name.
         """
         path = self.path / MANIFEST
-        manifest = json.loads(json.dumps({"format": FORMAT, **manifest}))
+        manifest = json.loads(json.dumps({"format": FORMAT, "protocol": PROTOCOL, **manifest}))
         if not path.exists():
             self.write_json(MANIFEST, manifest)
             return

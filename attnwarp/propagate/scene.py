@@ -133,9 +133,15 @@ def near_of(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
 
 
 def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: str) -> Image:
-    """(H, W, 3) float32 in [0, 1], over black."""
+    """(H, W, 3) float32 in [0, 1], over black.
+
+    Raises:
+        RuntimeError: splats render as NaN, as they do after a tuning that diverged.
+    """
     with torch.no_grad():
         color = render(gaussians, camera, backend=backend, near=near).color
+    if bool(color.isnan().any()):
+        raise RuntimeError(f"view {camera.name!r} renders as NaN; lower the learning rates")
     return np.asarray(color.clamp(0, 1).float().cpu().numpy())
 
 

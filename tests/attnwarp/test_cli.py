@@ -201,6 +201,9 @@ def test_a_fit_goes_on_from_fitted_splats(data, tmp_path):
     done = in_process("fit", data, *once, "--start", far, "--out", tmp_path / "c")
     assert done.exit_code == 2 and "cover less than" in done.stderr
 
+    done = in_process("fit", data, *once, "--start", splats, "--points", 9, "--out", tmp_path / "c")
+    assert done.exit_code == 2 and "--points: got 9, but --start names" in done.stderr
+
     # The kind is the file's, or the one that is asked for.
     full = tmp_path / "full.ply"
     round_one = {**vars(one_splat()), "kind": "3d", "scales": torch.full((1, 3), 0.2)}

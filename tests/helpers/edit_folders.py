@@ -17,11 +17,11 @@ def files(folder):
     }
 
 
-def without_start_protocol(folder):
-    """Make a folder's manifest what it was when a start was a step of the editor's schedule."""
+def without(folder, key):
+    """Make a folder's manifest what it was before it had a key."""
     path = folder / "manifest.json"
     manifest = json.loads(path.read_text())
-    del manifest["start_protocol"]
+    del manifest[key]
     path.write_text(json.dumps(manifest))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,8 @@ def _alone(dispatcher: Any) -> Iterator[None]:
         yield
         return
     with file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
+        with suppress(OSError):  # where the file system has no locks, each process compiles
+            fcntl.flock(file, fcntl.LOCK_EX)  # until it is closed
         yield
 
 
@@ -85,6 +86,18 @@ def _compiled(**options: Any) -> Any:
 
 
 jit = _compiled()
+
+
+def exact(function: Any) -> Any:
+    """numba's decorator for kernels whose every operation is rounded by itself, in its order.
+
+    Without numba's reference counts: two threads that count the same array up and down for every
+    token spend more on that than on the token. Such kernels allocate nothing.
+    """
+    options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
+    return by_one_process(numba.njit(**options)(function))
+
+
 # Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,
 # and two threads that count the same array up and down for every splat spend a third of their time
 # on it. Such kernels allocate nothing.

@@ -12,22 +12,13 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from attnwarp.render._kernels.compilation import by_one_process
-
-_options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-
-
-def jit(function: Any) -> Any:
-    """numba's decorator with these options."""
-    return by_one_process(numba.njit(**_options)(function))
-
+from attnwarp.render._kernels.compilation import exact
 
 INVERSE, BILINEAR, NEAREST = range(3)
 """How depth is interpolated."""
@@ -117,24 +108,24 @@ def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
     return types.float64(types.float64, types.float64, types.float64), build
 
 
-@jit
+@exact
 def _turn(matrix, row, x, y, z):
     """Row ``row`` of matrix @ (x, y, z)."""
     return _fma(z, matrix[row, 2], _fma(y, matrix[row, 1], x * matrix[row, 0]))
 
 
-@jit
+@exact
 def _valid(depth):
     return depth > 0 and depth < np.inf
 
 
-@jit
+@exact
 def _clamp(value, length):
     # Unsigned, so that numba does not look for indices that count from the end.
     return np.uint64(min(max(value, 0.0), length - 1.0))
 
 
-@jit
+@exact
 def _axis(position, length, snap):
     """Lower tap, upper tap and the upper one's share along one axis."""
     index = min(max(position - 0.5, -1.0), float(length))
@@ -147,7 +138,7 @@ def _axis(position, length, snap):
     return np.uint64(first), np.uint64(last), index - floor
 
 
-@jit
+@exact
 def _taps(x, y, shape, snap):
     """Columns and rows of four taps in an image of ``shape``, and their shares along both axes."""
     x0, x1, fx = _axis(x, shape[1], snap)
@@ -155,7 +146,7 @@ def _taps(x, y, shape, snap):
     return x0, x1, y0, y1, fx, fy
 
 
-@jit
+@exact
 def _blend_depth(depth, taps, how, spread):
     """Depth between four taps, NaN where they are undefined or spread too far."""
     x0, x1, y0, y1, fx, fy = taps
@@ -174,14 +165,14 @@ def _blend_depth(depth, taps, how, spread):
     return 1 / total if how == INVERSE else total
 
 
-@jit
+@exact
 def _nearest_depth(depth, x, y):
     """Depth of the pixel that holds the position, NaN where it is undefined."""
     value = float(depth[_clamp(np.floor(y), depth.shape[0]), _clamp(np.floor(x), depth.shape[1])])
     return value if _valid(value) else np.nan
 
 
-@jit
+@exact
 def _sample(image, taps):
     """An (h, w) image between four taps."""
     x0, x1, y0, y1, fx, fy = taps
@@ -194,7 +185,7 @@ def _sample(image, taps):
     return total
 
 
-@jit
+@exact
 def _smaller(before, after):
     """The smaller of two steps that are numbers, 0 if neither is."""
     before = before if before < np.inf else np.inf
@@ -203,7 +194,7 @@ def _smaller(before, after):
     return smaller if smaller < np.inf else 0.0
 
 
-@jit
+@exact
 def _slope(depth, i, j):
     """Depth's change per pixel, 0 where it is undefined."""
     h, w = depth.shape
@@ -218,7 +209,7 @@ def _slope(depth, i, j):
     return _smaller(up, down) + _smaller(left, right)
 
 
-@jit
+@exact
 def _scaled(position, length, other, integer):
     """A position in pixels of an image of ``length``, in one of ``other`` pixels."""
     if integer:
@@ -226,14 +217,14 @@ def _scaled(position, length, other, integer):
     return position * (other / length)
 
 
-@jit
+@exact
 def _in_image(pair, shape, x, y):
     """A source position in pixels of an image of ``shape``."""
     u = _scaled(x, pair.source.width, float(shape[1]), pair.integer)
     return u, _scaled(y, pair.source.height, float(shape[0]), pair.integer)
 
 
-@jit
+@exact
 def _inside(x, y, width, height, integer):
     if integer:
         x, y = x - 0.5, y - 0.5
@@ -241,7 +232,7 @@ def _inside(x, y, width, height, integer):
     return x >= 0 and x <= width and y >= 0 and y <= height
 
 
-@jit
+@exact
 def _locate(pair, i, j, depth, positions):
     """Fill pixel (i, j) of ``positions`` from its depth; whether it has a position."""
     lens, other, pose = pair.target, pair.source, pair.pose
@@ -275,7 +266,7 @@ def _locate(pair, i, j, depth, positions):
     return defined
 
 
-@jit
+@exact
 def layer(begin, end, pair, depth, how, spread, positions):
     """Rows ``begin`` to ``end`` of a feature grid's positions, from the image's depth (H, W)."""
     h, w = positions.depth.shape
@@ -290,7 +281,7 @@ def layer(begin, end, pair, depth, how, spread, positions):
             _locate(pair, i, j, z, positions)
 
 
-@jit
+@exact
 def _angle(ax, ay, az, bx, by, bz):
     """Degrees between two vectors: :func:`attnwarp.warp.rules.angle_between`."""
     a, b = math.sqrt(ax * ax + ay * ay + az * az), math.sqrt(bx * bx + by * by + bz * bz)
@@ -300,7 +291,7 @@ def _angle(ax, ay, az, bx, by, bz):
     return 2 * math.atan2(minus, plus) * (180 / math.pi)
 
 
-@jit
+@exact
 def _normal_passes(pair, rules, normal, i, j, positions):
     x, y, z = float(normal[i, j, 0]), float(normal[i, j, 1]), float(normal[i, j, 2])
     length = x * x + y * y + z * z
@@ -333,7 +324,7 @@ def _normal_passes(pair, rules, normal, i, j, positions):
     return _angle(nx, ny, nz, -X, -Y, -Z) < rules.angle
 
 
-@jit
+@exact
 def _depth_passes(rules, depth, taps, u, v, z):
     """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
     h, w = depth.shape
@@ -342,7 +333,7 @@ def _depth_passes(rules, depth, taps, u, v, z):
     return abs(z - d) <= rules.relative * z + rules.slope * change
 
 
-@jit
+@exact
 def _photometric_passes(pair, rules, source, target, i, j, x, y):
     h, w, channels = source.shape
     u, v = _in_image(pair, (h, w), x, y)
@@ -353,7 +344,7 @@ def _photometric_passes(pair, rules, source, target, i, j, x, y):
     return total / channels <= rules.photometric
 
 
-@jit
+@exact
 def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, passes, mask):
     """Rows ``begin`` to ``end``: positions, rules and the mask.
 
@@ -419,7 +410,7 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
             mask[i, j] = every
 
 
-@jit
+@exact
 def resize_mask(begin, end, mask, rows, columns, defined, result):
     """Rows ``begin`` to ``end`` of a mask on another grid, where ``defined`` too.
 

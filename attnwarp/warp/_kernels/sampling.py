@@ -13,22 +13,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from attnwarp.render._kernels.compilation import by_one_process
-
-# Without numba's reference counts: two threads that count the same array up and down for every
-# token spend more on that than on the token. Such kernels allocate nothing.
-_options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-
-
-def jit(function: Any) -> Any:
-    """numba's decorator with these options."""
-    return by_one_process(numba.njit(**_options)(function))
-
+from attnwarp.render._kernels.compilation import exact
 
 PLANES = 8
 """Planes of a feature map that are sampled together."""
@@ -127,12 +116,12 @@ def _narrow(typing: Any, row: Any, value: Any) -> Any:
     return row.dtype(row, value), build
 
 
-@jit
+@exact
 def _all_used(weight, n):
     return weight[0, n] > 0 and weight[1, n] > 0 and weight[2, n] > 0 and weight[3, n] > 0
 
 
-@jit
+@exact
 def _sum_used(plane, index, weight, n, zero):
     """The weighted sum of one plane's taps. A tap of weight 0 may hold anything."""
     total = zero
@@ -142,7 +131,7 @@ def _sum_used(plane, index, weight, n, zero):
     return total
 
 
-@jit
+@exact
 def sample_rows(begin, end, source, index, weight, result):
     """Tokens ``begin`` to ``end`` of ``result``.
 
@@ -171,7 +160,7 @@ def sample_rows(begin, end, source, index, weight, result):
                     row[c] = _narrow(row, total)
 
 
-@jit
+@exact
 def blend_rows(begin, end, source, index, weight, mask, alpha, rest, result):
     """Tokens ``begin`` to ``end`` become alpha warp(source) + rest result where ``mask``.
 
@@ -206,7 +195,7 @@ def blend_rows(begin, end, source, index, weight, mask, alpha, rest, result):
                     row[c] = _narrow(row, alpha * total + rest * _wide(row[c]))
 
 
-@jit
+@exact
 def copy_rows(begin, end, source, result):
     """Tokens ``begin`` to ``end`` of ``source`` to ``result``, both (B, N, C)."""
     for b in range(source.shape[0]):
@@ -215,7 +204,7 @@ def copy_rows(begin, end, source, result):
                 result[b, n, c] = source[b, n, c]
 
 
-@jit
+@exact
 def sample_maps(begin, end, source, index, weight, result):
     """Planes ``begin`` to ``end`` of ``result``.
 
@@ -239,7 +228,7 @@ def sample_maps(begin, end, source, index, weight, result):
                     result[p, n] = _narrow(result, _sum_used(source[p], index, weight, n, zero))
 
 
-@jit
+@exact
 def scatter_rows(begin, end, gradient, index, weight, share, result):
     """Channels ``begin`` to ``end`` of the gradient in the source's tokens.
 
@@ -263,7 +252,7 @@ def scatter_rows(begin, end, gradient, index, weight, share, result):
                         row[c] += factor * upstream[c]
 
 
-@jit
+@exact
 def scatter_maps(begin, end, gradient, index, weight, result):
     """Planes ``begin`` to ``end`` of the gradient in the source's maps.
 

@@ -126,7 +126,7 @@ def compare(
         folder = out / f"variant-{names.index(name) + 1}"
         edited = _edit(study, name, views, splats, words, folder / "run", seconds)
         seconds[name] = sum(edited.seconds.get(part, 0.0) for part in editing.OWN_WORK)
-        _write_pictures(views.cameras, edited, originals, folder)
+        _write_pictures(views.cameras, splats, edited, originals, folder)
         result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
         result.rows[name] |= {
             "folder": folder.name,
@@ -206,6 +206,7 @@ def _edit(
 
 def _write_pictures(
     cameras: Sequence[Camera],
+    before: Gaussians,
     edited: EditedScene,
     originals: Sequence[npt.NDArray[np.float32]],
     folder: Path,
@@ -214,7 +215,7 @@ def _write_pictures(
     from attnwarp.propagate.pictures import enlarged_change
     from attnwarp.propagate.scene import near_of, render_picture
 
-    near = near_of(cameras, edited.gaussians)
+    near = near_of(cameras, before)
     for k, camera in enumerate(cameras):
         picture = render_picture(edited.gaussians, camera, near, "auto")
         write_picture(folder / "renders" / f"{_name(k)}.png", _bytes(picture))

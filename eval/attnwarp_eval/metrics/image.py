@@ -288,7 +288,7 @@ class EditPsnr:
     @property
     def pooled(self) -> float:
         """PSNR of the mean MSE over the views that have one, each counting alike; +inf when all of
-        them are equal.
+        them are equal, NaN without any.
         """
         return psnr_of_mse(mean(np.array([error for error in self.mse if not math.isnan(error)])))
 

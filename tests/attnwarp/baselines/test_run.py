@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from edit_folders import Killed, events, files, without_start_protocol
+from edit_folders import Killed, events, files, without
 from tiny_baselines import QUICK, rows_of
 
 from attnwarp import Camera
@@ -203,6 +203,8 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
         run("dge", IGS2GSSettings())
     with pytest.raises(ValueError, match="option: got 'foldr'.*folder"):
         run("by_view", foldr=tmp_path)
+    with pytest.raises(ValueError, match="checkpoint_seconds: got None"):
+        run("by_view", checkpoint_seconds=None)
     with pytest.raises(ValueError, match="option: got 'progress'.*'watch'"):
         run("by_view", progress=print)
     with pytest.raises(ValueError, match="image_guidance: this editor has none"):
@@ -258,7 +260,7 @@ def test_a_folder_of_another_method_or_budget_is_refused_by_name(run, tmp_path):
 def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(run, tmp_path):
     noised = IGS2GSSettings(steps=1, iterations=0)
     run("igs2gs", noised, folder=tmp_path)
-    without_start_protocol(tmp_path)
+    without(tmp_path, "start_protocol")
     before = files(tmp_path)
     with pytest.raises(
         InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"

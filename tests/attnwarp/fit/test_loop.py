@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from attnwarp import Camera, Gaussians
-from attnwarp.fit import FitSettings, Views, fit, from_points
+from attnwarp.fit import FitSettings, Views, checkpoint, fit, from_points
 from attnwarp.fit.loop import CHECKPOINT, SPLATS
 from attnwarp.io import read_ply
 from attnwarp.render import render
@@ -320,8 +320,18 @@ def test_a_checkpoint_of_other_settings_or_views_is_refused_by_name(scene, tmp_p
     with pytest.raises(ValueError, match="other views"):
         fit(start, scene[1], settings, folder=tmp_path)
     moved = dataclasses.replace(start, means=start.means + 0.01)
-    with pytest.raises(ValueError, match="other start"):
+    with pytest.raises(ValueError, match="other first splats"):
         fit(moved, scene[0], settings, folder=tmp_path)
+
+
+def test_a_checkpoint_that_names_no_first_splats_is_resumed(scene, tmp_path):
+    """As those were that were written before."""
+    start, settings = begin(scene, iterations=5, sh_degree=0)
+    whole = fit(start, scene[0], settings, folder=tmp_path)
+    state = checkpoint.load(tmp_path / "checkpoint.pt")
+    del state["start"]
+    checkpoint.save(tmp_path / "checkpoint.pt", state)
+    assert same_bits(fit(start, scene[0], settings, folder=tmp_path).gaussians, whole.gaussians)
 
 
 def test_numbers_that_explode_end_in_a_clear_error(scene):

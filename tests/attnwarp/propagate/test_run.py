@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from edit_folders import Killed, events, files, without_start_protocol
+from edit_folders import Killed, events, files, without
 from tiny_baselines import rows_of
 from tiny_editors import nearest_steps
 from tiny_scenes import cameras, pictures, splats
@@ -306,13 +306,23 @@ def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, edit
     assert released.edit_psnr["views"] == list(errors)[:3]
 
 
-def test_a_view_that_renders_as_nan_is_no_equal_picture(finished, scene, editor, monkeypatch):
+def test_a_folder_that_was_edited_by_a_former_protocol_is_refused(scene, editor, tmp_path):
+    run(scene, editor, tmp_path, replace(QUICK, stages=1, iterations=0))
+    without(tmp_path, "protocol")
+    with pytest.raises(InputError, match=r"an edit of other protocol \(null, now 2\)"):
+        run(scene, editor, tmp_path, replace(QUICK, stages=1, iterations=0))
+
+
+def test_a_view_that_renders_as_nan_is_no_picture(finished, scene, editor, monkeypatch):
     """Of an edit that is complete but for what its folder says of the end."""
-    render = attnwarp.propagate.run.render_picture
-    monkeypatch.setattr(
-        attnwarp.propagate.run, "render_picture", lambda *args: np.nan * render(*args)
-    )
-    with pytest.raises(RuntimeError, match="after tuning: view '.*' renders as NaN"):
+    render = attnwarp.propagate.scene.render
+
+    def broken(*args, **options):
+        view = render(*args, **options)
+        return replace(view, color=np.nan * view.color)
+
+    monkeypatch.setattr(attnwarp.propagate.scene, "render", broken)
+    with pytest.raises(RuntimeError, match="view '.*' renders as NaN"):
         run(scene, editor, finished[1])
 
 
@@ -394,7 +404,7 @@ def test_a_folder_whose_start_was_a_step_of_the_editors_schedule_is_refused(
 ):
     settings = preset("released", stages=1, views_per_stage=1, steps=1, iterations=0)
     run(scene, editor, tmp_path, settings)
-    without_start_protocol(tmp_path)
+    without(tmp_path, "start_protocol")
     before = files(tmp_path)
     with pytest.raises(
         InputError, match=r"an edit of other start_protocol \(null, now 2\)\. Go on"
@@ -537,6 +547,8 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         propagate(model, views, images, editor, "a bear", QUICK, source=5)
     with pytest.raises(ValueError, match="instruction: is empty"):
         propagate(model, views, images, editor, "  ", QUICK)
+    with pytest.raises(ValueError, match="checkpoint_seconds: got None"):
+        run((model, views, images), editor, checkpoint_seconds=None)
 
 
 def guidance_of_passes(editor, name, call):

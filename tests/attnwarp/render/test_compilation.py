@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import subprocess
 import sys
+
+import numpy as np
+from numba import njit
+
+from attnwarp.render._kernels.compilation import by_one_process
 
 COMPILE = """
 import json
@@ -40,3 +46,16 @@ def test_of_processes_that_begin_together_one_compiles_and_the_others_read(tmp_p
     results = [json.loads(process.communicate()[0]) for process in processes]
     assert [result[0] for result in results] == [[1, 2, 0]] * 2
     assert sorted(result[1:] for result in results) == [[0, 1], [1, 0]]
+
+
+def test_a_file_system_without_locks_keeps_no_kernel_from_compiling(monkeypatch):
+    def refuse(*_):
+        raise OSError(37, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    doubled = by_one_process(njit(cache=True)(_doubled))
+    assert doubled(np.float32(3)) == 6
+
+
+def _doubled(value):
+    return value + value

@@ -308,6 +308,8 @@ class EditingProbe(Probe[EditResult]):
             "method": own.method,
             "settings": settings,
             **({"start_protocol": START_PROTOCOL} if noised else {}),
+            # Features once went to pixels without depth too.
+            **({"no_mask": "where there is depth"} if settings.get("mask") is False else {}),
             "editor": editor_identity(editor_of(study, variant)),
             "geometry": variant.geometry,
             "mask": own.mask,
