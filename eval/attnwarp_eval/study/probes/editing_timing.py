@@ -227,8 +227,9 @@ class EditingTimingProbe(Probe[Rounds]):
                 f"Seconds of one whole edit, {timed.turns[0].rounds} rounds of each variant in one"
                 f" process, in turn: {', '.join(turn.of for turn in timed.turns)}. Ratios are"
                 " medians over rounds of the ratio within a round, with a bootstrap interval. The"
-                " row `again` is the first variant against itself: inside that band nothing is"
-                f" called faster or slower.{editing_text if control is not None else ''}"
+                " row `again` is the first variant against itself: inside that band, or its mirror"
+                " image about 1, nothing is called faster or"
+                f" slower.{editing_text if control is not None else ''}"
             ),
         ]
         return Section("Seconds of an edit, taken in turn", text, [Table(columns, rows)])
