@@ -174,7 +174,7 @@ def _fit(
     import attnwarp.fit
     from attnwarp.fit.loop import CHECKPOINT
     from attnwarp.fit.progress import more_points, progress_display
-    from attnwarp.fit.start import FIRST_POINTS, first_splats
+    from attnwarp.fit.start import FIRST_POINTS
 
     settings = attnwarp.fit.FitSettings.from_dict(changes)
     dataset = read_views(data, reading)
@@ -185,7 +185,9 @@ def _fit(
         check_seen(start, first, train.cameras)
         first = first.with_sh_degree(settings.sh_degree)
     else:
-        first = first_splats(dataset, views.cameras, settings, echo, random=points or FIRST_POINTS)
+        first = attnwarp.fit.first_splats(
+            dataset, views.cameras, settings, echo, random=points or FIRST_POINTS
+        )
     out.mkdir(parents=True, exist_ok=True)
     if restart:
         (out / CHECKPOINT).unlink(missing_ok=True)

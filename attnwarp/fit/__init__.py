@@ -4,7 +4,7 @@ docs/fitting.md.
 
 from attnwarp.fit.loop import Fit, Record, Step, fit
 from attnwarp.fit.settings import FitSettings
-from attnwarp.fit.start import extent_of, from_points, random_points
+from attnwarp.fit.start import extent_of, first_splats, from_points, random_points
 from attnwarp.fit.views import Views, hold_out, load_views
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Step",
     "Views",
     "extent_of",
+    "first_splats",
     "fit",
     "from_points",
     "hold_out",

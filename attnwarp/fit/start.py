@@ -181,11 +181,12 @@ def first_splats(
 
     Example:
         >>> from attnwarp import Camera
-        >>> from attnwarp.fit import FitSettings
+        >>> from attnwarp.fit import FitSettings, first_splats
         >>> from attnwarp.io import Dataset
         >>> view = dict(width=64, height=48, fov_y=40)
         >>> cameras = [Camera.look_at(eye, (0, 0, 0), **view) for eye in ((3, 0, 0), (0, 3, 0))]
-        >>> splats = first_splats(Dataset(cameras), cameras, FitSettings(), print, random=50)
+        >>> data = Dataset(cameras, ["a.png", "b.png"])
+        >>> splats = first_splats(data, cameras, FitSettings(), print, random=50)
         the data has no points: beginning with 50 random ones
         >>> len(splats), splats.kind
         (50, '2d')

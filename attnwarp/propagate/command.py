@@ -16,8 +16,7 @@ from attnwarp.camera import Camera
 from attnwarp.editing.segment import load_segmenter, segments_of
 from attnwarp.editing.small import check_instruction, load_editor, thread_count
 from attnwarp.errors import InputError, suggest
-from attnwarp.fit import FitSettings, Views, fit, load_views, progress
-from attnwarp.fit.start import first_splats
+from attnwarp.fit import FitSettings, Views, first_splats, fit, load_views, progress
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.io.names import file_stems
