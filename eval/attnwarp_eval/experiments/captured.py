@@ -23,7 +23,7 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.progress import Progress, silent
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
-from attnwarp_eval.study.probes import editing, sensitivity
+from attnwarp_eval.study.probes import editing, fit, sensitivity
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.store import Store
 from attnwarp_eval.user_images import measure
@@ -78,7 +78,7 @@ def needs_truth(variant: Variant) -> str | None:
         return "its warp is the true one"
     if own.by_hand is not None:
         return "its source is drawn from the true picture"
-    if own.fitted:
+    if variant.part(fit.VariantPart).fitted:
         return "its splats are fitted to true pictures"
     return None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from attnwarp.warp import WarpSettings, render_surface
 from attnwarp_eval import metrics
@@ -12,10 +12,10 @@ from attnwarp_eval.document.model import Finding, Section, Table
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, mean_values, metrics_of
+from attnwarp_eval.study.probes.variant_splats import splats_of, surface_meaning, surface_spec
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study, Variant
-from attnwarp_eval.world import splats
 
 PLACES = (
     "depth.abs_rel",
@@ -55,17 +55,21 @@ class Depth(Probe[NoExtra]):
         """Splats, and how depth is read off them."""
         settings = variant.settings()
         return {
-            **surface_spec(study, variant),
+            **surface_spec(study, variant, seed),
             "depth": settings.depth,
             "depth_statistic": settings.depth_statistic,
         }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Splats may be fitted."""
+        return surface_meaning(study, variant)
 
     def compute(self, work: Work) -> NoExtra:
         """Render and measure, view by view."""
         spec, world, meter = work.spec, work.world, work.meter
         size = spec["size"]
         with meter.stage("splats"):
-            model = splats(work.cell.scene, size, spec["seed"], **spec["splats"])
+            model = splats_of(work)
         settings = WarpSettings(depth=spec["depth"], depth_statistic=spec["depth_statistic"])
         for name in spec["views"]:
             with meter.stage("truth"):
@@ -127,10 +131,3 @@ class Depth(Probe[NoExtra]):
             for title, region in regions.items()
         ]
         return [Table(columns, rows, "Inside surfaces and at edges apart", folded=True)]
-
-
-def surface_spec(study: Study, variant: Variant) -> Json:
-    """Where a variant's depth comes from."""
-    if variant.geometry == "truth":
-        return {"geometry": "truth"}
-    return {"splats": study.splats_of(variant).model_dump()}

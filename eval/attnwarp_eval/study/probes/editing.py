@@ -46,13 +46,13 @@ from attnwarp_eval.study.edit_truth import (
 )
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
 from attnwarp_eval.study.hand_made import Kind, hand_made
-from attnwarp_eval.study.probes import editing_sections, fit, register, sensitivity
+from attnwarp_eval.study.probes import editing_sections, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.probes.variant_splats import splats_meaning, splats_of, splats_spec
 from attnwarp_eval.study.record import Json, Record, with_nan
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, StudyError, Variant, did_you_mean
 from attnwarp_eval.study.warping import warp_truth
-from attnwarp_eval.world import splats
 
 if TYPE_CHECKING:
     from attnwarp.baselines import Budget
@@ -121,8 +121,7 @@ class VariantPart(Part):
 
     ``options`` are fields of the method's settings, over the study's; ``preset`` among them names
     its preset, else the variant's. ``mask: truth`` injects where the source truly sees the
-    surface, ``geometry: truth`` warps by exact depth. ``fitted`` takes splats that are fitted to
-    true pictures (keys ``fit``) in place of sampled ones. ``budget`` cuts the method short.
+    surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``by_hand`` gives the method a source view that was edited by hand
     (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
     """
@@ -130,7 +129,6 @@ class VariantPart(Part):
     method: str = "propagate"
     options: dict[str, Any] = Field(default_factory=dict)
     mask: Literal["rules", "truth"] = "rules"
-    fitted: bool = False
     editor: EditorPart | None = None
     budget: BudgetPart | None = None
     by_hand: Kind | None = None
@@ -313,11 +311,7 @@ class EditingProbe(Probe[EditResult]):
             "editor": editor_identity(editor_of(study, variant)),
             "geometry": variant.geometry,
             "mask": own.mask,
-            **(
-                {"fit": fit.fit_spec(study, variant, seed)}
-                if own.fitted
-                else {"splats": study.splats_of(variant).model_dump()}
-            ),
+            **splats_spec(study, variant, seed),
             **self._budget_spec(study, variant, seed),
             **({"by_hand": own.by_hand} if own.by_hand is not None else {}),
         }
@@ -337,12 +331,9 @@ class EditingProbe(Probe[EditResult]):
     def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
         """Everything that decides a cell but for its seed."""
         own = variant.part(VariantPart)
-        splats_from: Any = study.splats_of(variant)
-        if own.fitted:
-            splats_from = fit.fit_spec(study, variant, 0)
         settings = settings_of(study, variant, 0)
         return (
-            own.method, settings, variant.geometry, own.mask, splats_from,
+            own.method, settings, variant.geometry, own.mask, splats_meaning(study, variant),
             editor_of(study, variant), own.budget, own.by_hand,
         )  # fmt: skip
 
@@ -511,14 +502,6 @@ def _compile(kind: Literal["2d", "3d"]) -> None:
     means = splats.means.clone().requires_grad_()
     render(replace(splats, means=means), camera).color.sum().backward()
     warp_view(splats, camera, camera).at((4, 4)).warp_tokens(torch.zeros(1, 16, 4))
-
-
-def splats_of(work: Work) -> Gaussians:
-    """The splats that a cell's spec names: fitted, or sampled."""
-    if "fit" in work.spec:
-        return fit.fit_of(work).gaussians
-    spec = work.spec
-    return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
 
 
 class _Measure:

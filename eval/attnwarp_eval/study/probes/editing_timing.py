@@ -25,6 +25,7 @@ from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import InTurn, Layout, Place, Probe, Work
 from attnwarp_eval.study.probes.editing_sections import PARTS, WHOLE, is_alone
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
+from attnwarp_eval.study.probes.variant_splats import splats_of
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome, Results
 from attnwarp_eval.study.schema import Part, Study
@@ -125,7 +126,7 @@ class EditingTimingProbe(Probe[Rounds]):
             )
         contestants = [self._contestant(work, k) for k in range(len(spec["contestants"]))]
         with work.meter.stage("splats"):
-            scenes = [editing.splats_of(contestant) for contestant in contestants]
+            scenes = [splats_of(contestant) for contestant in contestants]
         rows: list[list[Mapping[str, float]]] = [[] for _ in range(len(contestants) + 1)]
         counters: list[dict[str, int]] = [{} for _ in contestants]
 

@@ -52,8 +52,11 @@ class StudyPart(Part):
 
 
 class VariantPart(Part):
-    """Keys of a variant that only this probe reads: its own fields of the fit's settings."""
+    """Keys of a variant: its own fields of the fit's settings; ``fitted`` has the other probes take
+    fitted splats in place of sampled ones.
+    """
 
+    fitted: bool = False
     fit: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -321,13 +324,13 @@ def fit_spec(study: Study, variant: Variant, seed: int) -> Json:
     return {**fits.model_dump(), "settings": settings_of(study, variant, seed).to_dict()}
 
 
-def fit_of(work: Work) -> attnwarp.fit.Fit:
-    """The fit that a cell's spec names under ``fit``.
+def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fit:
+    """The fit that a cell's spec, or ``spec`` in its place, names under ``fit``.
 
     It lies below the run's folder, named by what decides it: cells that want the same fit share
     it, and one that was cut short is resumed.
     """
-    spec, world = work.spec, work.world
+    spec, world = work.spec if spec is None else spec, work.world
     data = spec["fit"]
     return fitted.fit_scene(
         world.scene,

@@ -11,10 +11,10 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.probes import register
 from attnwarp_eval.study.probes.base import InTurn, Probe, Work
+from attnwarp_eval.study.probes.variant_splats import splats_of, surface_spec
 from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Outcome
 from attnwarp_eval.study.schema import Study
-from attnwarp_eval.world import splats
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Timing(Probe[Rounds]):
                     "contestants": [
                         {
                             "settings": study.variants[label].settings().to_dict(),
-                            "splats": study.splats_of(study.variants[label]).model_dump(),
+                            **surface_spec(study, study.variants[label], seed),
                         }
                         for label in names
                     ],
@@ -78,7 +78,7 @@ class Timing(Probe[Rounds]):
         target = world.targets[spec["views"][0]]
         contestants = [
             (
-                splats(work.cell.scene, spec["size"], spec["seed"], **contestant["splats"]),
+                splats_of(work, {**spec, **contestant}),
                 WarpSettings.from_dict(contestant["settings"]),
             )
             for contestant in spec["contestants"]

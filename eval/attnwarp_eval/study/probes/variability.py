@@ -27,6 +27,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth, edit_truth, neighbours, pair_of
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
+from attnwarp_eval.study.probes.variant_splats import splats_of
 from attnwarp_eval.study.record import Json
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study, Variant
@@ -129,7 +130,7 @@ class VariabilityProbe(Probe[Varied]):
                 work.cell.scene, spec["size"], spec["spp"], edit["name"], tuple(names)
             )
         with meter.stage("splats"):
-            before = editing.splats_of(work)
+            before = splats_of(work)
         edited: dict[int, dict[str, Image]] = {}
         for seed in spec["seeds"]:
             own = {**spec, "settings": {**spec["settings"], "seed": seed}}

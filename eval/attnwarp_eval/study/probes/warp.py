@@ -26,12 +26,11 @@ from attnwarp_eval.study.probes.base import (
     mean_values,
     metrics_of,
 )
-from attnwarp_eval.study.probes.depth import surface_spec
+from attnwarp_eval.study.probes.variant_splats import splats_of, surface_meaning, surface_spec
 from attnwarp_eval.study.record import Json, NoExtra
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Part, Study, Variant
 from attnwarp_eval.study.warping import warp_figures, warp_truth
-from attnwarp_eval.world import splats
 
 YAW_EDGES = (0, 15, 45, 75, 105, 135, 165, 180)
 """Bins around the yaws 30, 60, ... 150 that studies like to take, with the ends apart."""
@@ -94,12 +93,16 @@ class Warp(Probe[NoExtra]):
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """Depth, rules and feature grids."""
         return {
-            **surface_spec(study, variant),
+            **surface_spec(study, variant, seed),
             "spp": study.spp,
             "settings": variant.settings().to_dict(),
             "feature_sizes": study.feature_sizes,
             "feature_channels": study.feature_channels,
         }
+
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Splats may be fitted."""
+        return surface_meaning(study, variant)
 
     def compute(self, work: Work) -> NoExtra:
         """Warp and measure, view by view."""
@@ -107,9 +110,9 @@ class Warp(Probe[NoExtra]):
         size, spp = spec["size"], spec["spp"]
         settings = WarpSettings.from_dict(spec["settings"])
         model = source_surface = None
-        if "splats" in spec:
+        if spec.get("geometry") != "truth":
             with meter.stage("splats"):
-                model = splats(work.cell.scene, size, spec["seed"], **spec["splats"])
+                model = splats_of(work)
             # One source serves every target, so its render is no part of what a target costs.
             with meter.stage("source"):
                 source_surface = render_surface(model, world.source, settings)

@@ -1,0 +1,54 @@
+"""The splats of a variant: sampled on the scene's surfaces, or fitted to its true pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from attnwarp import Gaussians
+from attnwarp_eval.canonical_json import canonical_json
+from attnwarp_eval.study.probes import fit
+from attnwarp_eval.study.probes.base import Work
+from attnwarp_eval.study.record import Json
+from attnwarp_eval.study.schema import Study, Variant
+from attnwarp_eval.world import splats
+
+
+def splats_spec(study: Study, variant: Variant, seed: int) -> Json:
+    """What decides a variant's splats, as a cell's spec has it: an entry ``fit`` or ``splats``."""
+    if variant.part(fit.VariantPart).fitted:
+        return {"fit": fit.fit_spec(study, variant, seed)}
+    return {"splats": study.splats_of(variant).model_dump()}
+
+
+def surface_spec(study: Study, variant: Variant, seed: int) -> Json:
+    """Where a variant's depth comes from: the truth, or splats."""
+    if variant.geometry == "truth":
+        return {"geometry": "truth"}
+    if variant.part(fit.VariantPart).fitted:
+        # A fit depends on the samples of the pictures that it sees.
+        return {"spp": study.spp, **splats_spec(study, variant, seed)}
+    return splats_spec(study, variant, seed)
+
+
+def splats_meaning(study: Study, variant: Variant) -> str:
+    """What variants of the same splats share, for claims."""
+    return canonical_json(splats_spec(study, variant, 0))
+
+
+def surface_meaning(study: Study, variant: Variant) -> tuple[Any, ...]:
+    """What variants of the same depth and rules share, for claims."""
+    return variant.settings(), variant.geometry, splats_meaning(study, variant)
+
+
+def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
+    """The splats that a cell's spec names.
+
+    Args:
+        work: the cell.
+        spec: in place of the cell's own.
+    """
+    spec = work.spec if spec is None else spec
+    if "fit" in spec:
+        return fit.fit_of(work, spec).gaussians
+    return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])

@@ -1,0 +1,98 @@
+"""Variants on fitted splats. Oracle: the run's own file of splats, rendered by the float64 definition."""
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from ball_scene import SCENE
+
+from attnwarp.io import read_ply
+from attnwarp.render import render
+from attnwarp_eval.report.claims import load_claims
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study import Store, cells_of, load_study, parse_study
+from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.run import execute, plan
+from attnwarp_eval.study.study import parse_variant
+from attnwarp_eval.world import world
+
+FIT = {"views": 9, "points": 60, "settings": {"iterations": 4, "evaluate_every": 4}}
+STUDY = {
+    "name": "fitted",
+    "size": 32,
+    "scenes": ["ball.yaml"],
+    "spp": 2,
+    "splats": {"count": 300},
+    "fit": FIT,
+    "variants": {
+        "sampled": {},
+        "2D": {"fitted": True},
+        "3D": {"fitted": True, "fit": {"kind": "3d"}},
+        "own fit, sampled splats": {"fit": {"kind": "3d"}},
+    },
+}
+
+
+def load(folder, **probes):
+    (folder / "fitted.yaml").write_text(yaml.safe_dump({**STUDY, "probes": probes}))
+    return load_study(str(folder / "fitted.yaml"))
+
+
+@pytest.fixture
+def folder(tmp_path, coarse_textures, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ball.yaml").write_text(yaml.safe_dump(SCENE))
+    return tmp_path
+
+
+def test_probes_share_one_fit_and_its_depth_is_what_they_measure(folder):
+    study = load(folder, depth=["sampled", "2D"], warp=["2D"], timing=["sampled", "2D"])
+    store = Store(folder / "run")
+    assert execute(plan(study, store), store).complete
+    (file,) = (store.root / "fits").glob("*/splats.ply")  # the three cells share one fit
+    splats = read_ply(file)
+    scene = world(study.scenes[0], 32)
+    records = {
+        (cell["probe"], *cell["variants"]): store.read(cell["id"])
+        for cell in store.read_study()["cells"]
+    }
+    for view in records["depth", "2D"]["views"]:
+        camera = scene.targets[view["view"]]
+        drawn = render(splats.to(dtype=torch.float64), camera, backend="reference")
+        depth = drawn.median_depth.numpy()
+        truth = scene.pair(view["view"], 32).hits
+        both = truth.valid & (depth > 0) & np.isfinite(depth)
+        error = np.mean(np.abs(depth - truth.depth)[both] / truth.depth[both])
+        assert view["metrics"]["depth.abs_rel"] == pytest.approx(error, rel=1e-3)
+
+
+def test_a_variant_takes_its_own_kind_of_fit_and_none_where_it_does_not_say_fitted(folder):
+    study = load(folder, warp=list(STUDY["variants"]))
+    cells = cells_of(study, {name: load_scene(name) for name in study.scenes})
+    specs = {name: cell.spec for cell in cells if cell.probe == "warp" for name in cell.labels}
+    assert specs["2D"]["fit"]["settings"]["kind"] == "2d"
+    assert specs["3D"]["fit"]["settings"]["kind"] == "3d"
+    # A sampled variant's cell is the same as ever, whatever fit it names for other probes.
+    assert specs["own fit, sampled splats"] == specs["sampled"]
+    assert specs["sampled"]["splats"]["count"] == 300
+    assert "fit" not in specs["sampled"]
+
+
+@pytest.mark.parametrize("name", ["warp", "depth", "editing"])
+def test_claims_tell_fitted_splats_from_sampled_and_2d_from_3d(name):
+    study = parse_study({**STUDY, "scenes": ["spheres"], "probes": {"depth": ["sampled"]}})
+    of = probe(name)
+    kinds = [study.variants[label] for label in ("sampled", "2D", "3D")]
+    alike = [[of.alike(study, one, two) for two in kinds] for one in kinds]
+    assert alike == np.eye(3, dtype=bool).tolist()
+
+
+def test_the_claims_about_fitted_warps_are_about_fitted_splats():
+    study = parse_study({**STUDY, "scenes": ["spheres"], "probes": {"depth": ["sampled"]}})
+    claims = {claim.id: claim for claim in load_claims()}
+    two, three = (
+        parse_variant(side) for side in (claims["fitted-2dgs-warp"].b, claims["fitted-2dgs-warp"].a)
+    )
+    meaning = probe("warp").meaning
+    assert meaning(study, two) == meaning(study, study.variants["2D"])
+    assert meaning(study, three) == meaning(study, study.variants["3D"])
