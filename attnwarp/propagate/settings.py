@@ -202,8 +202,9 @@ class PropagateSettings:
         Raises:
             ValueError: a key that is no field, or a value out of range.
         """
+        known = [field.name for field in fields(cls)]
         for key in data:
-            check.one_of(key, [field.name for field in fields(cls)], "setting")
+            check.one_of(key, known, "setting")
         values = dict(data)
         if isinstance(values.get("warp"), dict):
             values["warp"] = WarpSettings.from_dict(values["warp"])

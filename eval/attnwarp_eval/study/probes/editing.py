@@ -8,7 +8,6 @@ view, figures of agreement between views are undefined: there was nothing to car
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import math
 import tempfile
@@ -282,19 +281,19 @@ class EditingProbe(Probe[EditResult]):
                     names_of["reference"] = reference
                     other = study.variants[reference]
                     names_of["reference editor"] = editor_of(study, other).name
-                for seed, edit in itertools.product(study.seeds, edits):
-                    spec = {
+                for seed in study.seeds:
+                    decided = {
                         **self.common_spec(study, scene, seed),
                         **self.variant_spec(study, variant, seed),
-                        "edit": edit,
-                        "encoders": encoders,
                     }
-                    views = study.pictures_of(spec["views"], label)
-                    yield Cell(
-                        spec, name, label, self.name, seed, (label,),
-                        tuple(f"{edit['name']}/{view}" for view in views),
-                        {**sources, **names_of},
-                    )  # fmt: skip
+                    views = study.pictures_of(decided["views"], label)
+                    for edit in edits:
+                        yield Cell(
+                            {**decided, "edit": edit, "encoders": encoders},
+                            name, label, self.name, seed, (label,),
+                            tuple(f"{edit['name']}/{view}" for view in views),
+                            {**sources, **names_of},
+                        )  # fmt: skip
 
     def variant_spec(self, study: Study, variant: Variant, seed: int) -> Json:
         """The method with all its settings, the editor, and where splats and warps come from."""
