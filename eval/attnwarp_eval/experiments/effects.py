@@ -73,9 +73,10 @@ def _tasks(scenes: Sequence[Scene], store: Store, settings: Settings) -> Iterato
 
     for scene in scenes:
         yield _entry(scene, settings)
+        forget()
         if settings.pictures:
             yield _pictures(scene, store)
-        forget()
+            forget()
 
 
 def _entry(scene: Scene, settings: Settings) -> Task[Part]:

@@ -364,10 +364,11 @@ def beam(scene: Scene, light: int) -> tuple[Array, float] | None:
     bounds = [shape.bounds() for shape in scene.shapes() if shape.object_id in smooth]
     low, high = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
     axis = (low + high) / 2 - np.array(spec.position)
-    reach = BEAM_MARGIN * float(np.linalg.norm(high - low)) / 2 / float(np.linalg.norm(axis))
-    if reach >= 1 or np.degrees(np.arcsin(reach)) > 60:
+    radius = BEAM_MARGIN * float(np.linalg.norm(high - low)) / 2
+    distance = float(np.linalg.norm(axis))
+    if radius >= distance or np.degrees(np.arcsin(radius / distance)) > 60:
         return None
-    return axis, float(np.degrees(np.arcsin(reach)))
+    return axis, float(np.degrees(np.arcsin(radius / distance)))
 
 
 def smooth_objects(scene: Scene) -> list[int]:

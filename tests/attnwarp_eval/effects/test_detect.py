@@ -525,6 +525,8 @@ def test_a_cone_upon_the_smooth_objects_holds_them():
     assert beam(make([FLOOR, ball(GLASS)], [SUN], 8), 0) is None
     inside = POINT | {"position": [0.5, 0, 1.3]}
     assert beam(make([FLOOR, ball(GLASS)], [inside], 8), 0) is None
+    middle = POINT | {"position": center.tolist()}
+    assert beam(make([FLOOR, ball(GLASS)], [middle], 8), 0) is None
 
 
 @pytest.mark.parametrize("name", ["point", "spot", "square", "globe"])

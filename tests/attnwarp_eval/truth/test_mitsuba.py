@@ -1,5 +1,7 @@
 """Mitsuba's pictures and geometry against Open3D, closed forms and the ray-cast shading."""
 
+import gc
+
 import numpy as np
 import pytest
 from direct_light import direct
@@ -228,3 +230,16 @@ def test_the_plan_of_one_bounce_and_a_path_tracer_of_one_bounce_agree():
     difference = reference.mean(0) - ours.mean(0)
     # Standard error of the mean over 48 x 48 x 3 values, of which the channels are not independent.
     assert abs(difference.mean()) < 4 * error / 48
+
+
+def test_looking_through_a_scene_leaves_nothing_behind_that_holds_it():
+    scene = world([SUN, SKY])
+    mitsuba.graph(scene)  # the first look may make what later ones use
+    visitors = build.library().TraversalCallback
+    before = len(visitors.__subclasses__())
+    gc.disable()  # each class of a look's own would wait for the collector, with all that it found
+    try:
+        mitsuba.graph(scene)
+        assert len(visitors.__subclasses__()) == before
+    finally:
+        gc.enable()

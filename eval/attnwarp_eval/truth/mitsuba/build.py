@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import math
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -250,8 +252,15 @@ def cached(key: Any, make: Callable[[], Any]) -> Any:
 
 
 def forget() -> None:
-    """Let go of the loaded scenes, which are kept for the next picture."""
+    """Let go of the loaded scenes, which are kept for the next picture, and of the memory of
+    pictures.
+
+    Dr.Jit keeps every freed array for the next one of its size, and pictures differ in size.
+    """
     _loaded.clear()
+    if "drjit" in sys.modules:
+        gc.collect()
+        sys.modules["drjit"].flush_malloc_cache()
 
 
 def load_shapes(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from attnwarp_eval.scene.scene import Scene
@@ -67,19 +68,33 @@ def _walk(thing: Any, path: str = "") -> list[tuple[str, Any]]:
     """Every object below ``thing``, depth first, with the path that Mitsuba's own traversal gives
     it.
     """
-    mi = library()
-    objects: list[tuple[str, Any]] = []
+    visit = _visitor(library().variant())(path)
+    thing.traverse(visit)
+    found: list[tuple[str, Any]] = visit.found
+    return found
+
+
+@functools.cache
+def _visitor(variant_name: str) -> Any:
+    """A class that collects the objects below one; a class made at each object would be a cycle
+    that keeps them alive.
+    """
+    mi = library(variant_name)
 
     class Visit(mi.TraversalCallback):  # type: ignore[name-defined]
+        def __init__(self, path: str) -> None:
+            super().__init__()
+            self.path = path
+            self.found: list[tuple[str, Any]] = []
+
         def put(self, name: str, value: Any, *_: Any) -> None:
             if isinstance(value, mi.Object):
-                objects.append((path + name, value))
-                objects.extend(_walk(value, f"{path}{name}."))
+                self.found.append((self.path + name, value))
+                self.found.extend(_walk(value, f"{self.path}{name}."))
 
         put_object = put
 
         def put_value(self, name: str, value: Any, *_: Any) -> None:
             """Numbers are of no interest here."""
 
-    thing.traverse(Visit())
-    return objects
+    return Visit
