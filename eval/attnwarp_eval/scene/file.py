@@ -15,7 +15,7 @@ from attnwarp_eval.scene import edits
 from attnwarp_eval.scene.explain import explain
 from attnwarp_eval.scene.meshes import MESH_SUFFIXES
 from attnwarp_eval.scene.scene import Scene, SceneError, inside, orbit_camera, view_name
-from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec, SkySpec
+from attnwarp_eval.scene.spec import MeshSpec, RectangleSpec, SceneSpec
 from attnwarp_eval.scene.terrain import ScatterSpec, TerrainSpec
 from attnwarp_eval.scene.transport import contradictions
 from attnwarp_eval.scene.yaml import YamlError, read_yaml
@@ -188,19 +188,6 @@ def _check(scene: Scene, root: yaml.Node) -> None:
                     "the path counts from the folder of the scene file",
                     *key,
                 )
-    skies = [k for k, light in enumerate(scene.spec.lights) if isinstance(light, SkySpec)]
-    if len(skies) > 1:
-        refuse(
-            f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one",
-            "lights",
-            skies[1],
-        )
-    if not scene.spec.lights and not any(item.emission for item in scene.spec.objects):
-        refuse(
-            "lights: there is none, and no object has an 'emission'; add a sun, a sky, a point or a"
-            " spot",
-            "lights",
-        )
     for message, at_fault in contradictions(scene.spec):
         refuse(message, *at_fault)
     for message, spot in edits.problems(scene.spec):

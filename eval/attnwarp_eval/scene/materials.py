@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from attnwarp_eval.scene.base import Color, Positive, Spec, Vector
 
@@ -157,6 +157,13 @@ class SpotSpec(Spec):
     color: Color = "#ffffff"
     cutoff: float = Field(25.0, gt=0, lt=90)
     beam: float | None = Field(None, gt=0, lt=90)
+
+    @field_validator("target")
+    @classmethod
+    def _elsewhere(cls, target: Vector, info: ValidationInfo) -> Vector:
+        if target == info.data.get("position"):
+            raise ValueError("is the lamp's own position; name a point that it shines at")
+        return target
 
 
 # Medium, lens, effects

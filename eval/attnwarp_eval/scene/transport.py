@@ -115,6 +115,20 @@ _REMEDIES: dict[Effect, str] = {
 
 def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]]]:
     """Contradictions in a scene file: a message, and the key in the file."""
+    skies = [k for k, light in enumerate(spec.lights) if isinstance(light, SkySpec)]
+    if len(skies) > 1:
+        yield (
+            f"lights[{skies[1]}]: a second sky; there is only one all-around light, keep one",
+            ("lights", skies[1]),
+        )
+    if not spec.lights and not any(item.emission for item in spec.objects):
+        yield (
+            (
+                "lights: there is none, and no object has an 'emission'; add a sun, a sky, a point"
+                " or a spot"
+            ),
+            ("lights",),
+        )
     present = called_for(spec)
     pinned, forbidden = spec.effects.pin, spec.effects.forbid
     for k, effect in enumerate(forbidden):

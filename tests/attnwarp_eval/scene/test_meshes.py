@@ -154,6 +154,21 @@ def read_text(tmp_path, name, text):
     return read_mesh(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.obj", "o Ångström\n# Å v 9 9 9\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"),
+        ("a.off", "OFF # Å 1 2 3\n3 1 0\n0 0 0\n1 0 0\n0 1 0 # Å 7\n3 0 1 2\n"),
+    ],
+)
+def test_no_letter_of_a_name_or_a_comment_ends_a_line(tmp_path, name, text):
+    # The second byte of UTF-8's "Å" is a line's end to Unicode, when it is read as latin-1.
+    (tmp_path / name).write_bytes(text.encode())
+    mesh = read_mesh(tmp_path / name)
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[0, 1, 2]]
+
+
 def test_what_an_obj_says_beside_polygons_is_counted_or_plays_no_part(tmp_path):
     text = """\
 # Vertices: 4

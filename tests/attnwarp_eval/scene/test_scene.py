@@ -170,6 +170,12 @@ MISTAKES = [
         15,
         r"lights\[1\]: a second sky",
     ),
+    (
+        "  - {type: sun",
+        "  - {type: spot, position: [0, 0, 3], target: [0, 0, 3], intensity: 1}\n  - {type: sun",
+        14,
+        r"lights\[0\].target: is the lamp's own position; name a point",
+    ),
     ("  radius: 3\n", "\tradius: 3\n", 17, "not valid YAML: .*check indentation and quotes"),
     (
         "checker, colors: ['#ffffff', '#202020']",

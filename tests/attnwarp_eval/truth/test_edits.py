@@ -218,6 +218,16 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
             "material: {type: mirror}",
             r"contradicts itself: appearance.bounces",
         ),
+        (
+            "    changes: [{object: ball, recolor: {'#c04020': '#2040c0'}}]\n",
+            "    lights: []\n",
+            r"edits\[0\]: makes a scene that contradicts itself: lights: there is none",
+        ),
+        (
+            "    changes: [{object: ball, recolor: {'#c04020': '#2040c0'}}]\n",
+            "    lights:\n" + 2 * "    - {type: sky, horizon: '#ffffff', zenith: '#8080ff'}\n",
+            r"edits\[0\]: makes a scene that contradicts itself: lights\[1\]: a second sky",
+        ),
     ],
 )
 def test_a_mistake_in_an_edit_is_told_with_its_place_and_remedy(tmp_path, old, new, says):

@@ -7,7 +7,15 @@ from collections import Counter
 
 import numpy as np
 
-from attnwarp_eval.scene.meshes.surface import Surface, clip, decimal, polygons, unit_colors, whole
+from attnwarp_eval.scene.meshes.surface import (
+    Surface,
+    clip,
+    decimal,
+    lines,
+    polygons,
+    unit_colors,
+    whole,
+)
 
 UNUSED = frozenset(
     [
@@ -63,7 +71,6 @@ def read_obj(data: bytes) -> Surface:
     """
     if data[:2] in (b"\xfe\xff", b"\xff\xfe"):
         raise ValueError("is text in UTF-16, expected ASCII or UTF-8; save it as UTF-8")
-    text = data.decode("latin-1")  # names and comments come in any encoding
     vertices: list[list[float]] = []
     colors: list[list[float]] = []
     faces: list[list[int]] = []
@@ -71,7 +78,7 @@ def read_obj(data: bytes) -> Surface:
     stated: dict[str, list[int]] = {}
     materials = False
     number, pending = 0, ""
-    for number, raw in enumerate(text.splitlines(), 1):
+    for number, raw in lines(data):
         line = pending + raw
         if line.endswith("\\"):
             pending = line[:-1] + " "
@@ -110,7 +117,7 @@ def read_obj(data: bytes) -> Surface:
     elif colors:
         words_ignored.append(f"colours of {len(colors)} of {len(vertices)} vertices")
     corners, sizes = polygons(faces)
-    cut_off = None if text.endswith(("\n", "\r")) else "its last line has no end"
+    cut_off = None if data.endswith((b"\n", b"\r")) else "its last line has no end"
     points = np.array(vertices).reshape(-1, 3)
     return Surface(points, corners, sizes, tint, tuple(words_ignored), cut_off, first=1)
 

@@ -6,7 +6,15 @@ import re
 
 import numpy as np
 
-from attnwarp_eval.scene.meshes.surface import Surface, clip, decimal, polygons, unit_colors, whole
+from attnwarp_eval.scene.meshes.surface import (
+    Surface,
+    clip,
+    decimal,
+    lines,
+    polygons,
+    unit_colors,
+    whole,
+)
 
 HEADER = re.compile(r"(ST)?(C)?(N)?(4)?(n)?OFF")
 
@@ -18,11 +26,8 @@ def read_off(data: bytes) -> Surface:
         ValueError: another dimension, a binary file, or other numbers of vertices, faces and
             corners than the file announces.
     """
-    text = data.decode("latin-1")
     rows = [
-        (number, words)
-        for number, line in enumerate(text.splitlines(), 1)
-        if (words := line.partition("#")[0].split())
+        (number, words) for number, line in lines(data) if (words := line.partition("#")[0].split())
     ]
     match = HEADER.fullmatch(rows[0][1][0]) if rows else None
     if match is None:

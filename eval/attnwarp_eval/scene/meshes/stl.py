@@ -7,7 +7,7 @@ import struct
 
 import numpy as np
 
-from attnwarp_eval.scene.meshes.surface import Surface, clip, decimal
+from attnwarp_eval.scene.meshes.surface import Surface, clip, decimal, lines
 
 RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
@@ -43,7 +43,7 @@ def read_stl(data: bytes) -> Surface:
 def _text(data: bytes) -> np.ndarray:
     values: list[float] = []
     inside, facet = False, 0
-    for line, raw in enumerate(data.decode("latin-1").splitlines(), 1):
+    for line, raw in lines(data):
         # What stands after solid and endsolid is a name.
         words = re.split(r"\s+", raw.strip()) if raw.strip() else []
         while words:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,14 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+
+
+def lines(data: bytes) -> Iterator[tuple[int, str]]:
+    """The lines of a text file with their numbers, from 1; names and comments come in any encoding.
+
+    Only line feeds and carriage returns end a line: str.splitlines() would cut UTF-8's "Å" in two.
+    """
+    return enumerate((line.decode("latin-1") for line in data.splitlines()), 1)
 
 
 @dataclass(frozen=True, eq=False)
