@@ -13,6 +13,7 @@ from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe, Work
 from attnwarp_eval.study.record import Cost, Environment, Failure, Record
 from attnwarp_eval.study.store import Store
@@ -31,6 +32,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     Raises:
         InputError: the scene's file has changed since the cell was planned.
     """
+    load_plugins()  # a worker has only what came with the cell
     # Image-sized tensor operations gain little from threads and lose much when other processes want
     # the cores; the renderer's own threads are counted apart.
     torch.set_num_threads(1)

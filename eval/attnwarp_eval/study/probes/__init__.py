@@ -14,6 +14,7 @@ import pkgutil
 from functools import cache
 from typing import Any, TypeVar
 
+from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe
 
 K = TypeVar("K", bound=type[Probe[Any]])
@@ -43,6 +44,7 @@ def unregister(name: str) -> None:
 def _discover() -> None:
     for module in sorted(m.name for m in pkgutil.iter_modules(__path__)):
         importlib.import_module(f"{__name__}.{module}")
+    load_plugins()
 
 
 def probes() -> list[Probe[Any]]:

@@ -1,0 +1,45 @@
+"""Probes and editing methods of other packages, which register themselves at their import."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from functools import cache
+from importlib.metadata import entry_points
+
+from attnwarp.errors import InputError
+
+GROUP = "attnwarp_eval"
+"""Group of entry points: each names a module of an installed package."""
+
+VARIABLE = "ATTNWARP_PLUGINS"
+"""Environment variable: modules to import as well, separated by commas. Workers of the same machine
+inherit it.
+"""
+
+
+@cache
+def load_plugins() -> None:
+    """Import every plugin, once a process.
+
+    Raises:
+        InputError: one cannot be imported; the message says where it was named.
+    """
+    for module, named_by in _named():
+        try:
+            importlib.import_module(module)
+        except Exception as error:
+            raise InputError(
+                f"{named_by}: the plugin {module!r} cannot be imported:"
+                f" {type(error).__name__}: {' '.join(str(error).split())}"
+            ) from error
+
+
+def _named() -> Iterator[tuple[str, str]]:
+    """Module names, each with what names it."""
+    for entry in entry_points(group=GROUP):
+        package = entry.dist.name if entry.dist else "a package"
+        yield entry.module, f"entry point {entry.name!r} of {package}"
+    for module in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
+        yield module, VARIABLE

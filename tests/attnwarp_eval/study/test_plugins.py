@@ -1,0 +1,87 @@
+"""Probes and methods from outside of the package. Oracle: the plugin's own closed form."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from attnwarp.errors import InputError
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.study import editing_methods, plugins
+from attnwarp_eval.study.probes import probe, unregister
+
+HELPERS = Path(__file__).parents[2] / "helpers"
+PLUGIN = """\
+from chord_probe import Chord
+from attnwarp_eval.study.editing_methods import EDITING_METHODS, Method
+from attnwarp_eval.study.probes import register
+
+register(Chord)
+EDITING_METHODS["mine"] = Method(lambda preset, fields, seed: {"seed": seed}, None)
+"""
+STUDY = {
+    "name": "own",
+    "size": 16,
+    "scenes": ["spheres"],
+    "views": ["yaw090"],
+    "spp": 1,
+    "variants": {"plain": {}, "double": {"stretch": 2.0, "method": "mine"}},
+    "probes": {"chord": ["plain", "double"]},
+}
+
+
+def test_a_plugin_registers_its_probe_and_its_method(tmp_path, monkeypatch):
+    (tmp_path / "my_plugin.py").write_text(PLUGIN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ATTNWARP_PLUGINS", " my_plugin, ")
+    monkeypatch.setattr(editing_methods, "EDITING_METHODS", dict(editing_methods.EDITING_METHODS))
+    plugins.load_plugins.__wrapped__()
+    try:
+        assert type(probe("chord")).__module__ == "chord_probe"
+        assert editing_methods.EDITING_METHODS["mine"].settings("paper", {}, 3) == {"seed": 3}
+    finally:
+        unregister("chord")
+        sys.modules.pop("my_plugin")
+
+
+@pytest.mark.slow
+def test_a_plugin_of_the_environment_has_its_probe_and_method_in_every_worker(tmp_path):
+    (tmp_path / "my_plugin.py").write_text(PLUGIN)
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(STUDY))
+    paths = [str(tmp_path), str(HELPERS), os.environ.get("PYTHONPATH", "")]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(paths),
+        "ATTNWARP_PLUGINS": " my_plugin, ",
+    }
+    command = [sys.executable, "-m", "attnwarp_eval.cli.main", "run", "own.yaml", "--jobs", "2"]
+    done = subprocess.run(
+        [*command, "--out", "run"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in (tmp_path / "run/results.jsonl").read_text().splitlines()]
+    length = {row["variant"]: row["value"] for row in rows if row["metric"] == "chord.length"}
+    cameras = load_scene("spheres").spec.cameras
+    (height,) = {t.height for t in cameras.targets if t.yaw - cameras.source.yaw == 90}
+    chord = math.hypot(math.sqrt(2) * cameras.radius, height - cameras.source.height)
+    assert length == {"plain": pytest.approx(chord), "double": pytest.approx(2 * chord)}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (None, "ATTNWARP_PLUGINS: the plugin 'my_broken' cannot be imported: ModuleNotFoundError"),
+        ("1 / 0", "the plugin 'my_broken' cannot be imported: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_a_plugin_that_cannot_be_imported_is_named(tmp_path, monkeypatch, text, says):
+    if text is not None:
+        (tmp_path / "my_broken.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ATTNWARP_PLUGINS", "my_broken")
+    with pytest.raises(InputError, match=says):
+        plugins.load_plugins.__wrapped__()
