@@ -39,7 +39,8 @@ class World:
         content_hash: of the scene's file, which a cell's spec names.
         source: the source camera.
         targets: the target cameras by name.
-        yaw: degrees from the source, folded to [0, 180], by the target's name.
+        signed_yaw: degrees from the source in [-180, 180), by the target's name.
+        yaw: the same folded to [0, 180].
     """
 
     def __init__(self, scene: Scene, size: int) -> None:
@@ -48,10 +49,11 @@ class World:
         self.geometry = Geometry(scene)
         self.source = scene.source
         self.targets = {camera.name: camera for camera in scene.targets}
-        self.yaw = {
-            camera.name: abs((view.yaw - scene.spec.cameras.source.yaw + 180) % 360 - 180)
+        self.signed_yaw = {
+            camera.name: (view.yaw - scene.spec.cameras.source.yaw + 180) % 360 - 180
             for camera, view in zip(scene.targets, scene.spec.cameras.targets, strict=True)
         }
+        self.yaw = {name: abs(yaw) for name, yaw in self.signed_yaw.items()}
         # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
@@ -64,7 +66,10 @@ class World:
         offset, source = (c.position[:2] - self.scene.center[:2] for c in (camera, self.source))
         cosine = offset @ source / (np.linalg.norm(offset) * np.linalg.norm(source))
         self.targets[camera.name] = camera
-        self.yaw[camera.name] = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        yaw = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        self.yaw[camera.name] = yaw
+        left = source[0] * offset[1] - source[1] * offset[0] >= 0  # yaw is counter-clockwise
+        self.signed_yaw[camera.name] = yaw if left else -yaw
 
     def camera(self, name: str) -> Camera:
         """The source ("source") or a target by its name."""

@@ -143,9 +143,19 @@ def edit_truth(scene: str, size: int, spp: int, edit: str, views: tuple[str, ...
 
 
 def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
-    """For each target the view before it by yaw, the source before the first."""
+    """For each target the nearest by yaw of the source and of the targets that are nearer to it."""
+    yaw = {of.source.name: 0.0, **of.signed_yaw}
     ordered = [of.source.name, *sorted(views, key=lambda view: of.yaw[view])]
-    return dict(zip(ordered[1:], ordered, strict=False))
+
+    def apart(first: str, second: str) -> float:
+        return abs((yaw[first] - yaw[second] + 180) % 360 - 180)
+
+    # Of several equally near ones the last counts.
+    return {
+        view: min(reversed(ordered[:k]), key=lambda other, view=view: apart(view, other))
+        for k, view in enumerate(ordered)
+        if k
+    }
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,60 @@
+"""A scene's world. Oracles: angles written out by hand, and what is loaded."""
+
+import math
+
+import pytest
+from ball_scene import ball_scene
+
+from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.scene.spec import SceneSpec
+from attnwarp_eval.splats.export import orbit
+from attnwarp_eval.study.edit_truth import neighbours
+from attnwarp_eval.world import World
+
+
+def world_of(*yaws, source=0):
+    cameras = {"look_at": [0, 0, 0.8], "radius": 3.5, "targets": yaws}
+    data = ball_scene("A ball", 0.9, ("#c0c0c0", "#d0d0d0"), cameras, [])
+    data["cameras"]["source"]["yaw"] = source
+    return World(Scene(SceneSpec.model_validate(data)), 16)
+
+
+@pytest.mark.parametrize(
+    ("yaws", "source", "expected"),
+    [
+        (
+            (-60, 30, -120, 90, 60, -30, 120, -90),
+            0,
+            {30: "source", 60: 30, 90: 60, 120: 90, -30: "source", -60: -30, -90: -60, -120: -90},
+        ),
+        ((20, 60, 0), 40, {20: "source", 60: "source", 0: 20}),
+        ((-90, -179, 90), 0, {90: "source", -90: "source", -179: -90}),
+        ((170, -175), 0, {170: "source", -175: 170}),  # 15 degrees apart, across the back
+        ((330, 300), 0, {330: "source", 300: 330}),
+    ],
+)
+def test_a_views_neighbour_is_on_its_own_side(yaws, source, expected):
+    world = world_of(*yaws, source=source)
+    names = dict(zip(yaws, world.targets, strict=True))
+    assert neighbours(world, list(world.targets)) == {
+        names[yaw]: names.get(other, other) for yaw, other in expected.items()
+    }
+
+
+def test_in_a_scene_of_one_side_each_view_follows_the_one_before():
+    world = World(load_scene("face"), 16)
+    names = ["yaw010", "yaw020", "yaw030", "yaw045", "yaw060", "yaw075", "yaw090", "yaw120",
+             "yaw150", "yaw180"]  # fmt: skip
+    expected = dict(zip(names, ["source", *names], strict=False))
+    assert neighbours(world, names[::-1]) == expected
+
+
+def test_a_camera_that_is_added_has_the_sign_of_its_side():
+    world = world_of(30)
+    for camera in orbit(world.scene, 8):
+        world.add(camera)
+        x, y, _ = camera.position  # the source is on the positive x axis
+        assert (world.signed_yaw[camera.name] > 0) == (y > 0)
+        assert abs(world.signed_yaw[camera.name]) == world.yaw[camera.name]
+        assert world.yaw[camera.name] == pytest.approx(math.degrees(math.acos(x / math.hypot(x, y))))
