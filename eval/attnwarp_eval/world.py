@@ -56,6 +56,8 @@ class World:
         self.yaw = {name: abs(yaw) for name, yaw in self.signed_yaw.items()}
         # Cells of one scene use the same pairs; a world lives as long as its scene is at work.
         self.pair: Callable[[str, int], TwoView] = cache(self._pair)
+        # Of two targets there are many pairs, of 100 bytes a pixel each.
+        self.between: Callable[[str, str], TwoView] = lru_cache(maxsize=64)(self._between)
         self.features: Callable[[str, int, int, int], Features] = cache(self._features)
         self.edge: Callable[[str, int], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
@@ -83,6 +85,12 @@ class World:
             self.targets[target].resize(size, size),
             bands=(self.edge(self.source.name, size), self.edge(target, size)),
         )
+
+    def _between(self, first: str, second: str) -> TwoView:
+        """The exact relation of any two views."""
+        if first == self.source.name:
+            return self.pair(second, self.source.width)
+        return two_view(self.geometry, self.camera(first), self.camera(second))
 
     def _edge(self, name: str, size: int) -> npt.NDArray[np.bool_]:
         """(size, size) bool: the band around the depth and object edges of a view."""

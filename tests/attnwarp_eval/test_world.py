@@ -1,7 +1,10 @@
 """A scene's world. Oracles: angles written out by hand, and what is loaded."""
 
+import gc
 import math
+import weakref
 
+import numpy as np
 import pytest
 from ball_scene import ball_scene
 
@@ -10,7 +13,8 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.splats.export import orbit
 from attnwarp_eval.study.edit_truth import neighbours
-from attnwarp_eval.world import World
+from attnwarp_eval.truth import Geometry, two_view
+from attnwarp_eval.world import World, world
 
 
 def world_of(*yaws, source=0):
@@ -43,7 +47,7 @@ def test_a_views_neighbour_is_on_its_own_side(yaws, source, expected):
 
 
 def test_in_a_scene_of_one_side_each_view_follows_the_one_before():
-    world = World(load_scene("face"), 16)
+    world = World(load_scene("spheres"), 16)
     names = ["yaw010", "yaw020", "yaw030", "yaw045", "yaw060", "yaw075", "yaw090", "yaw120",
              "yaw150", "yaw180"]  # fmt: skip
     expected = dict(zip(names, ["source", *names], strict=False))
@@ -58,3 +62,20 @@ def test_a_camera_that_is_added_has_the_sign_of_its_side():
         assert (world.signed_yaw[camera.name] > 0) == (y > 0)
         assert abs(world.signed_yaw[camera.name]) == world.yaw[camera.name]
         assert world.yaw[camera.name] == pytest.approx(math.degrees(math.acos(x / math.hypot(x, y))))
+
+
+def test_the_relation_of_any_two_views_is_that_of_their_cameras_and_goes_with_its_scene():
+    spheres = world("spheres", 16)
+    scene = load_scene("spheres").with_size(16, 16)
+    cameras = {camera.name: camera for camera in scene.cameras}
+    for first, second in (("yaw060", "yaw030"), ("source", "yaw030")):
+        expected = two_view(Geometry(scene), cameras[first], cameras[second])
+        pair = spheres.between(first, second)
+        np.testing.assert_array_equal(pair.xy, expected.xy)
+        np.testing.assert_array_equal(pair.label, expected.label)
+        assert spheres.between(first, second) is pair
+    former = weakref.ref(pair)
+    del spheres, pair
+    world("opposed", 16)
+    gc.collect()
+    assert former() is None

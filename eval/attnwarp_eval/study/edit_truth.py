@@ -15,9 +15,8 @@ from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.truth import appearance, two_view
+from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask
-from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World, world
 
 Image = npt.NDArray[np.float32]
@@ -156,12 +155,3 @@ def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
         for k, view in enumerate(ordered)
         if k
     }
-
-
-@lru_cache(maxsize=64)
-def pair_of(scene: str, size: int, first: str, second: str) -> TwoView:
-    """The exact relation of any two views of a scene."""
-    of = world(scene, size)
-    if first == of.source.name:
-        return of.pair(second, size)
-    return two_view(of.geometry, of.camera(first), of.camera(second))

@@ -41,7 +41,6 @@ from attnwarp_eval.study.edit_truth import (
     answers_of,
     edit_truth,
     neighbours,
-    pair_of,
 )
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
 from attnwarp_eval.study.hand_made import Kind, hand_made
@@ -585,7 +584,7 @@ class _Measure:
         return metrics.answers_by_view(images, part.answers, part.union)
 
     def _pair(self, first: str, second: str) -> Any:
-        return pair_of(self.work.cell.scene, self.work.spec["size"], first, second)
+        return self.work.world.between(first, second)
 
     def _fidelity(self, kind: str, figures: Mapping[str, float] | None) -> dict[str, float]:
         if figures is None:
@@ -846,7 +845,7 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
 
     def of(source: int, target: int) -> WarpedView:
         if target not in made:
-            pair = pair_of(work.cell.scene, spec["size"], names[source], names[target])
+            pair = world.between(names[source], names[target])
             if spec["geometry"] == "truth":
                 view = warp_truth(world, pair, settings)
             else:

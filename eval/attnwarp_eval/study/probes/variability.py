@@ -24,7 +24,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import EditTruth, edit_truth, neighbours, pair_of
+from attnwarp_eval.study.edit_truth import EditTruth, edit_truth, neighbours
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.probes.variant_splats import splats_of
@@ -165,7 +165,7 @@ class VariabilityProbe(Probe[Varied]):
     ) -> dict[str, float]:
         """Of one view, means over the seeds; NaN where a method did not edit the views."""
         mask = truth.union[view]
-        pair = pair_of(work.cell.scene, work.spec["size"], other, view)
+        pair = work.world.between(other, view)
         both = [views for views in edited.values() if view in views and other in views]
         own = [views[view] for views in edited.values() if view in views]
         same = [

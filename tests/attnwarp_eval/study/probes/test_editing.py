@@ -22,12 +22,12 @@ from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.budgets import Spent, Stopwatch
-from attnwarp_eval.study.edit_truth import pair_of
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import editing, probe
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.work import compute
+from attnwarp_eval.truth import Geometry, two_view
 
 STUDY = {
     "name": "mine",
@@ -187,11 +187,13 @@ def test_seconds_are_in_the_record_and_not_in_the_report_without_timings(
 def test_the_exact_mask_injects_where_the_source_truly_sees(folder, tmp_path):
     own = {"options": {"stages": 1, "views_per_stage": 3}, "mask": "truth", "geometry": "truth"}
     record = record_of(folder, tmp_path, variants={"planned": own})
-    scene = load_study(str(folder / "mine.yaml")).scenes[0]
-    pairs = [pair_of(scene, 32, "source", view.name.split("/")[1]) for view in record.views]
-    assert record.extra.injected == pytest.approx(
-        np.mean([p.visible.mean() for p in pairs]), abs=1e-6
-    )
+    scene = load_scene(load_study(str(folder / "mine.yaml")).scenes[0]).with_size(32, 32)
+    geometry, targets = Geometry(scene), {camera.name: camera for camera in scene.targets}
+    seen = [
+        two_view(geometry, scene.source, targets[view.name.split("/")[1]]).visible.mean()
+        for view in record.views
+    ]
+    assert record.extra.injected == pytest.approx(np.mean(seen), abs=1e-6)
     assert (
         record.cost.counters["network_rows"] == 4 * 2
     )  # one step; image guidance of 1 drops a branch
