@@ -19,6 +19,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.surface import SurfaceSamples, colored_samples, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
 from attnwarp_eval.truth.features import SolidField
+from attnwarp_eval.truth.mitsuba import forget
 from attnwarp_eval.two_view import TwoView
 
 SPLATS_PROTOCOL = 1
@@ -124,6 +125,7 @@ class World:
 @lru_cache(maxsize=1)
 def world(scene: str, size: int) -> World:
     """The world of a scene (a name or a path) at an image size; the last one is cached."""
+    forget()  # what was loaded for the pictures of the former one
     return World(load_scene(scene), size)
 
 

@@ -13,7 +13,8 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import SceneSpec
 from attnwarp_eval.splats.export import orbit
 from attnwarp_eval.study.edit_truth import neighbours
-from attnwarp_eval.truth import Geometry, two_view
+from attnwarp_eval.truth import Geometry, appearance, two_view
+from attnwarp_eval.truth.mitsuba import build
 from attnwarp_eval.world import World, world
 
 
@@ -79,3 +80,16 @@ def test_the_relation_of_any_two_views_is_that_of_their_cameras_and_goes_with_it
     world("opposed", 16)
     gc.collect()
     assert former() is None
+
+
+def test_another_scenes_world_forgets_loaded_scenes_and_the_same_scenes_keeps_them(
+    coarse_textures,
+):
+    first = world("spheres", 16)
+    appearance(first.scene, first.source, spp=1, seed=123)
+    loaded = {*build._loaded}
+    assert loaded
+    world("spheres", 16)
+    assert {*build._loaded} == loaded
+    world("opposed", 16)
+    assert not build._loaded
