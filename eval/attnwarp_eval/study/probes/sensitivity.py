@@ -549,11 +549,12 @@ def _flaws(
     layout: Layout,
 ) -> Section:
     spec = records[0][1].spec
-    edits = {(scene, name.rpartition("/")[0]) for scene, name, _ in _views(records)}
-    views = sum(len(record.views) for _, record in records)
+    views = {(scene, name) for scene, name, _ in _views(records)}
+    edits = {(scene, name.rpartition("/")[0]) for scene, name in views}
+    count = _scene_count(records)
     text = [
         (
-            f"{len(edits)} right results of edits in {len(records)} scenes, {views} pairs of a"
+            f"{len(edits)} right results of edits in {count} scenes, {len(views)} pairs of a"
             " result and a view. Each is compared with results that a method may have given in its"
             " place, each with one flaw. The figure: the share in which a metric ranks the right"
             " result above the flawed one. **1: it sees the flaw. 0.5: blind to it. Below 0.5: it"
@@ -568,8 +569,8 @@ def _flaws(
         ),
         encoders_named(results, spec),
     ]
-    if len(records) < len(results.study.scenes):
-        text.insert(0, f"**Measured on {len(records)} of {len(results.study.scenes)} scenes.**")
+    if count < len(results.study.scenes):
+        text.insert(0, f"**Measured on {count} of {len(results.study.scenes)} scenes.**")
     means = np.array([[shares[row.key][c.name].mean for c in FLAWS] for row in rows])
     framed = np.array([[c.name in row.meant for c in FLAWS] for row in rows])
     path = layout.figure("sensitivity.svg")
@@ -586,7 +587,6 @@ def _flaws(
         "figures/sensitivity.svg",
         "Which metric can see what: 1 sees the flaw, 0.5 is blind, below 0.5 prefers it.",
     )
-    count = len(records)
     table = [[row.title, *(spread(shares[row.key][c.name], count) for c in FLAWS)] for row in rows]
     columns = ["metric", *(c.title for c in FLAWS)]
     return Section(
@@ -608,7 +608,7 @@ def encoders_named(results: Results, spec: Mapping[str, Any]) -> str:
 
 
 def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
-    table, drawn = [], []
+    count, table, drawn = _scene_count(records), [], []
     for row in rows:
         by_scene: dict[str, list[tuple[float, float]]] = {}
         for scene, _, values in _views(records):
@@ -616,7 +616,7 @@ def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
         rank, steps = (
             interval({s: [pair[i] for pair in v] for s, v in by_scene.items()}) for i in (0, 1)
         )
-        table.append([row.title, spread(rank, len(records)), spread(steps, len(records))])
+        table.append([row.title, spread(rank, count), spread(steps, count)])
         if ".inside" not in row.key:
             drawn.append((row, [_mean(records, row.key, name) for name in STEPS]))
     columns = 3
@@ -652,6 +652,11 @@ def _strengths(records: Records, rows: list[Row], layout: Layout) -> Section:
     return Section(
         "Metrics against the strength of an edit", text, [Table(headings, table)], [picture]
     )
+
+
+def _scene_count(records: Records) -> int:
+    """A scene has a record for each seed."""
+    return len({scene for scene, _ in records})
 
 
 def _mean(records: Records, key: str, condition: str) -> Interval:

@@ -35,7 +35,8 @@ def record(views, key=MSE, rounds=None):
     )
 
 
-def results(records):
+def results(records, seeds=(0,)):
+    """The run whose records each scene has for every seed."""
     study = {
         "name": "by-hand",
         "scenes": list(records),
@@ -47,6 +48,7 @@ def results(records):
         [
             written_runs.outcome("sensitivity", scene, ["metrics"], one)
             for scene, one in records.items()
+            for _ in seeds
         ],
     )
 
@@ -143,6 +145,17 @@ def test_the_report_shows_what_can_be_seen_and_says_where_a_metric_moves_the_wro
     assert (
         dict(zip(costs.columns, costs.rows[0], strict=True))["ms a picture"] == "200"
     )  # the median of three rounds
+
+
+def test_records_of_several_seeds_are_of_one_scene(tmp_path):
+    cells = {"one": record([{RIGHT: 0.5}] * 2), "two": record([{RIGHT: 0.5}] * 2), "lost": None}
+    made = results(cells, seeds=(0, 1))
+    first, strengths, _ = (s for _, s in probe("sensitivity").sections(made, Layout(tmp_path)))
+    assert first.text[0] == "**Measured on 2 of 3 scenes.**"
+    assert first.text[1].startswith("2 right results of edits in 2 scenes, 4 pairs of a result")
+    # No share lacks one of the two scenes.
+    for table in (*first.tables, *strengths.tables):
+        assert table.rows and not [text for row in table.rows for text in row if " of " in text]
 
 
 def test_without_timings_two_reports_of_other_seconds_are_the_same_bytes(tmp_path):
