@@ -19,7 +19,7 @@ from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.record import Environment, Failure
-from attnwarp_eval.study.schema import Study, StudyError
+from attnwarp_eval.study.schema import Study, StudyError, did_you_mean
 from attnwarp_eval.study.store import Problems, Store, StoreError
 from attnwarp_eval.study.study import cells_of, explain_errors, parse_study
 from attnwarp_eval.study.work import compute_and_write
@@ -70,10 +70,11 @@ def plan(study: Study, store: Store) -> Plan:
     """Load the scenes, list the cells, and look which of them ``store`` already has.
 
     Raises:
-        InputError: something the study names cannot be used.
+        InputError: something the study names cannot be used, or is of none of its scenes.
     """
     scenes = _scenes(study)
     cells = cells_of(study, scenes)
+    _check_names(study, list(scenes.values()), cells)
     done = store.done()
     this = Environment.from_json(environment())
     todo: list[Cell] = []
@@ -96,6 +97,37 @@ def _scenes(study: Study) -> dict[str, Scene]:
             if other != name and scene.content_hash == scenes[name].content_hash:
                 raise StudyError(f"scenes: {other!r} and {name!r} are the same scene; name it once")
     return scenes
+
+
+def _check_names(study: Study, scenes: list[Scene], cells: list[Cell]) -> None:
+    """Check that views to be pictured, and what probes name, are of some scene of the study.
+
+    A misspelt name would else change the study in silence. What is of no chosen scene may be of one
+    that was left out; only then are those loaded.
+
+    Raises:
+        StudyError: a name is of none.
+    """
+    # Fits measure views of their own.
+    own = {view for cell in cells for view in cell.spec.get("views", ())}
+
+    def check(scenes: list[Scene]) -> None:
+        views = own | {camera.name for scene in scenes for camera in scene.targets}
+        for name in study.pictures.views:
+            if name not in views:
+                raise StudyError(
+                    f"pictures.views: no scene has a view {name!r}"
+                    f"{did_you_mean(name, sorted(views))}"
+                )
+        for each in probes():
+            each.check_scenes(study, scenes)
+
+    try:
+        check(scenes)
+    except StudyError:
+        if not study.left_out:
+            raise
+        check([*scenes, *map(load_scene, study.left_out)])
 
 
 def verify(store: Store) -> Problems:

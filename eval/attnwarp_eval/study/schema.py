@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
@@ -142,6 +142,12 @@ class Study(Part):
     ablations: list[Ablation] = Field(default_factory=list)
     fronts: list[Front] = Field(default_factory=list)
     pictures: Pictures = Pictures()
+    _left_out: tuple[str, ...] = PrivateAttr(default=())
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Scenes of the study's file that were not chosen; other keys may name them."""
+        return self._left_out
 
     @model_validator(mode="before")
     @classmethod

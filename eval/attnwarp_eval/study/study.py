@@ -213,11 +213,15 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
             f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
         )
     data = _beside(data, path.parent)
+    every = data.get("scenes")
     data.update({k: v for k, v in overrides.items() if v is not None})
     try:
-        return parse_study(data)
+        study = parse_study(data)
     except ValidationError as error:
         raise StudyError(f"{path}: {explain_errors(error)}") from None
+    if isinstance(every, list):
+        study._left_out = tuple(name for name in every if name not in study.scenes)
+    return study
 
 
 def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -5,10 +5,13 @@ import pathlib
 
 import pytest
 import yaml
+from typer.testing import CliRunner
 
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, cells_of, load_study
+from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.probes import editing, sensitivity
+from attnwarp_eval.study.run import plan
 from attnwarp_eval.study.study import shipped_studies
 
 SMALL = {
@@ -132,6 +135,41 @@ def test_a_study_that_does_not_exist_names_those_that_do():
 def test_a_view_that_a_scene_lacks_is_named(tmp_path):
     with pytest.raises(StudyError, match="'yaw031'; did you mean 'yaw030'"):
         cells(load_study(write(tmp_path, views=["yaw031"])))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"editing": {"edits": {"sphere": {"snow": None}}}},
+            "editing.edits: the study has no scene 'sphere'; did you mean 'spheres'",
+        ),
+        (
+            {"pictures": {"variants": ["again"], "views": ["yaw030", "yaw35"]}},
+            "pictures.views: no scene has a view 'yaw35'; did you mean 'yaw",
+        ),
+    ],
+)
+def test_a_key_that_names_nothing_of_any_scene_is_refused(tmp_path, changes, message):
+    path = write(tmp_path, scenes=["spheres", "opposed"], **changes | {"views": []})
+    for chosen in (None, ["spheres"]):
+        with pytest.raises(StudyError, match=message):
+            plan(load_study(path, scenes=chosen), Store(tmp_path / "run"))
+    result = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2 and message.split(":")[0] in result.stderr
+
+
+def test_keys_may_name_scenes_that_are_left_out(tmp_path):
+    named = {
+        "editing": {"edits": {"opposed": {"snow": None}}},
+        "pictures": {"variants": ["again"], "views": ["yaw030", "yaw165", "orbit_000_of_9"]},
+    }  # yaw165 is a view of opposed alone, orbit_000_of_9 one of the fits
+    probes = {"warp": ["again"], "fit": ["again"]}
+    path = write(tmp_path, scenes=["spheres", "opposed"], views=[], probes=probes, fit={"views": 9},
+                 **named)  # fmt: skip
+    planned = plan(load_study(path, scenes=["spheres"]), Store(tmp_path / "run"))
+    pictured = {cell.probe: cell.pictures for cell in planned.cells}
+    assert (pictured["warp"], pictured["fit"]) == (("yaw030",), ("orbit_000_of_9",))
 
 
 def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path):

@@ -185,6 +185,12 @@ class Probe(ABC, Generic[E]):
         Called for every study, with or without this probe; the message begins with the YAML's key.
         """
 
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """Raise StudyError if the study names what none of its scenes has.
+
+        Called before a run of any study, with or without this probe.
+        """
+
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Raise ValueError if a variant cannot be measured; its name is put before the message."""
 

@@ -241,6 +241,15 @@ class EditingProbe(Probe[EditResult]):
                     " none"
                 )
 
+    def check_scenes(self, study: Study, scenes: Sequence[Scene]) -> None:
+        """A scene without an entry has all of its edits measured, so a misspelt one matters."""
+        names = [scene.name for scene in scenes]
+        for name in study.part(StudyPart).editing.edits:
+            if name not in names:
+                raise StudyError(
+                    f"editing.edits: the study has no scene {name!r}{did_you_mean(name, names)}"
+                )
+
     def check_variant(self, study: Study, variant: Variant) -> None:
         """Settings are refused even where nothing is edited."""
         own = variant.part(VariantPart)
