@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from effect_scenes import FLOOR, SKY, SUN, ball, make
+from effect_scenes import FLOOR, PLAIN, SKY, SUN, ball, make
 from typer.testing import CliRunner
 
 from attnwarp.errors import InputError
@@ -84,6 +84,17 @@ def test_rays_answer_for_every_point_and_a_coarse_depth_map_is_wrong_or_silent()
     assert nearest.error[0] == nearest.more["wrong"] > 0.02 and nearest.more["unanswered"] == 0
     assert bilinear.more["unanswered"] > 0.2
     assert bilinear.error[0] == pytest.approx(bilinear.more["wrong"] + bilinear.more["unanswered"])
+
+
+def test_where_source_and_target_share_no_surface_the_panel_is_left_out_by_name(tmp_path):
+    box = {"type": "box", "center": [0, 0, 0.5], "size": [0.6, 0.6, 0.6]}
+    views = {"source": {"yaw": 0, "height": 0.5}, "targets": [{"yaw": 180, "height": 0.5}]}
+    scene = make([{"name": "box", "shape": box, "texture": PLAIN}], [SKY], cameras=views)
+    panel = point_visibility.visibility(scene, size=32, points=10, rounds=3, maps=(8,))
+    store_panel(tmp_path, replace(panel, scene="earlier"))
+    write([panel, depth_panel("one")], tmp_path)
+    assert "Left out: visibility of earlier, test. No point" in (tmp_path / "accuracy.md").read_text()
+    assert scenes_in(tmp_path) == ["one"] and not (tmp_path / "visibility.svg").exists()
 
 
 def test_a_depth_map_of_a_slanted_plane_answers_right_in_both_ways():

@@ -42,7 +42,7 @@ class Panel:
         question: "pictures", "depth" or "visibility".
         scene: its name.
         unit: of the error.
-        contestants: the baseline first.
+        contestants: the baseline first; none where the scene leaves nothing to measure.
         again: seconds of the baseline's second run of each round.
         squares: squared error of each round, by contestant ("pictures" only).
     """

@@ -46,6 +46,9 @@ def visibility(
         rounds: of the timing, which covers all points and the making of the depth map.
         maps: sizes of the depth maps.
         tell: told what is at work.
+
+    Returns:
+        A panel without contestants where no point can be asked about.
     """
     from attnwarp_eval.truth.raycast import Geometry
 
@@ -55,6 +58,9 @@ def visibility(
     source = scene.with_size(size, size).source
     hits = geometry.trace(target)
     asked = _faces_and_falls_in(hits, source)
+    unit = "share of points not labelled rightly"
+    if not asked.any():
+        return Panel("visibility", scene.name, unit, (), ())
     points_asked, normal, primitive = (
         hits.point[asked],
         hits.normal[asked],
@@ -114,7 +120,7 @@ def visibility(
     return Panel(
         "visibility",
         scene.name,
-        "share of points not labelled rightly",
+        unit,
         tuple(out),
         tuple(turns.again),
     )

@@ -36,6 +36,8 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
     nan = float("nan")
     check_overwriting(out, {(panel.question, panel.scene) for panel in panels})
     panels, left_out = with_earlier(panels, Store(out))
+    unmeasured = [panel.scene for panel in panels if not panel.contestants]
+    panels = [panel for panel in panels if panel.contestants]
 
     def point(panel: Panel, k: int) -> tuple[Interval, Interval]:
         base, ratio = float(np.median(panel.contestants[0].seconds)), panel.ratio(k)
@@ -90,6 +92,11 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
             f"Left out: {', '.join(f'{question} of {scene}' for question, scene in left_out)}. They"
             " were measured with other versions, another variant, or of another content of the"
             " scene. Measure these scenes again to have them here."
+        )
+    if unmeasured:
+        lead.append(
+            f"Left out: visibility of {', '.join(unmeasured)}. No point of the middle target faces"
+            " the source and falls inside its image."
         )
     report = Report("Error of the truth itself, against time", lead, sections)
     data = {
