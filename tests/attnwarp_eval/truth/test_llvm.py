@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from effect_scenes import FLOOR, SCENES, SKY, SUN, make
 from matplotlib.tri import LinearTriInterpolator, Triangulation
+from typer.testing import CliRunner
 
 from attnwarp.camera import Camera
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.effects import proof
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.file import load_scene
@@ -79,6 +81,14 @@ def test_a_probe_that_hangs_means_scalar_and_a_named_variant_needs_no_probe(fres
         llvm.subprocess, "run", lambda *a, **k: pytest.fail("asked although a variant was named")
     )
     assert llvm.variant() == "scalar_rgb"
+
+
+def test_a_named_variant_that_mitsuba_lacks_is_one_line(fresh_probe, tmp_path):
+    fresh_probe.setenv("ATTNWARP_MITSUBA", "lvm_ad_rgb")
+    asked = ["scenes", "render", "spheres", "--size", "16", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, asked)
+    words = "ATTNWARP_MITSUBA: got 'lvm_ad_rgb', expected one of scalar_rgb, "
+    assert result.exit_code == 2 and words in " ".join(result.stderr.split())
 
 
 def test_the_first_library_that_works_is_taken_and_left_for_child_processes(fresh_probe):

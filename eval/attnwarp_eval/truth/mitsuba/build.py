@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.errors import InputError
 from attnwarp_eval.cache import content_key
 from attnwarp_eval.scene.base import linear_rgb
 from attnwarp_eval.scene.extent import warn_of_strays
@@ -93,11 +94,20 @@ def use(name: str) -> None:
 
 
 def library(name: str | None = None) -> Any:
-    """The library, with the variant ``name``; without a name as the caller's caller has set it."""
+    """The library, with the variant ``name``; without a name as the caller's caller has set it.
+
+    Raises:
+        InputError: Mitsuba has no such variant.
+    """
     import mitsuba
 
     mi: Any = mitsuba
     wanted = name or mi.variant() or variant()
+    if wanted not in mi.variants():
+        raise InputError(
+            f"ATTNWARP_MITSUBA: got {wanted!r}, expected one of {', '.join(mi.variants())}; unset"
+            " it to have one chosen"
+        )
     if mi.variant() != wanted:
         mi.set_variant(wanted)
         mi.set_log_level(mi.LogLevel.Warn)
