@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -239,6 +240,9 @@ def flow(
             angles = [float(yaw) for yaw in names(yaws) or []]
         except ValueError as error:
             raise InputError(f"--yaws: {error}; expected degrees such as 5,20") from None
+        for angle in angles:
+            if not math.isfinite(angle):
+                raise InputError(f"--yaws: got {angle}, expected degrees such as 5,20")
         options = flow.Options(size, spp, cast(flow.Method, method), pictures)
         with (
             progress(lines=True) as show,

@@ -36,6 +36,13 @@ def run(out, *more):
     return CliRunner().invoke(app, [*arguments, *more])
 
 
+@pytest.mark.parametrize("yaws", ["nan", "5,inf", "five"])
+def test_yaws_that_are_no_degrees_are_one_line(tmp_path, yaws):
+    result = run(tmp_path / "out", "--yaws", yaws)
+    assert result.exit_code == 2 and "expected degrees such as 5,20" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
     result = run(tmp_path, "--yaws", "5")
     (row,) = json.loads((tmp_path / "flow.json").read_text())
