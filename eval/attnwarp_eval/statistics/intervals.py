@@ -9,7 +9,7 @@ coverage of this interval and of two bootstraps.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -48,7 +48,9 @@ class Interval:
 
     @property
     def bounded(self) -> bool:
-        """Whether both bounds are finite: of one scene there is no interval."""
+        """Whether both bounds are finite: of one scene there is no interval, nor of a few equal
+        differences.
+        """
         return bool(np.isfinite(self.low) and np.isfinite(self.high))
 
 
@@ -106,8 +108,16 @@ def _power_factor(scenes: int) -> float:
     return float(stats.t.ppf(0.975, scenes - 1) + stats.t.ppf(0.8, scenes - 1))
 
 
+ROUNDING = 2e-14
+"""Differences that vary by less than this share of the values they are of vary by rounding."""
+
+
 def paired(a: ByView, b: ByView) -> Interval:
     """Interval of b - a over the views that both have.
+
+    Student's t needs a spread, and shares often differ by exactly as much in every scene. The
+    p-value and the interval are then those of the sign test; below six scenes it has no bounds at
+    95 %.
 
     Args:
         a, b: scene -> view key -> value. Views that only one side has, or where one side is NaN,
@@ -119,6 +129,9 @@ def paired(a: ByView, b: ByView) -> Interval:
         >>> value = paired(ours, theirs)
         >>> value.mean, value.undefined
         (1.5, 1)
+        >>> equal = paired(ours, {"bear": {"yaw010": 2.0}, "fence": {"yaw010": 3.0}})
+        >>> equal.p, equal.bounded  # 2 / 2**2
+        (0.5, False)
     """
     differences: dict[str, list[float]] = {}
     for scene in sorted(set(a) | set(b)):
@@ -126,7 +139,16 @@ def paired(a: ByView, b: ByView) -> Interval:
         differences[scene] = [
             right.get(v, np.nan) - left.get(v, np.nan) for v in sorted(set(left) | set(right))
         ]
-    return interval(differences)
+    result = interval(differences)
+    sizes = [abs(x) for side in (a, b) for views in side.values() for x in views.values()]
+    rounding = ROUNDING * max(filter(np.isfinite, sizes), default=0.0)
+    if not result.detectable <= rounding:
+        return result
+    if abs(result.mean) <= rounding:
+        return replace(result, p=1.0)  # the same values
+    sign_test = 2 * 0.5**result.scenes
+    bound = result.mean if sign_test <= 0.05 else np.nan
+    return replace(result, low=bound, high=bound, detectable=np.nan, p=sign_test)
 
 
 def common(tables: Sequence[ByView]) -> list[dict[str, dict[str, float]]]:

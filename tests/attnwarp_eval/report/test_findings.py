@@ -47,9 +47,10 @@ def results(variants, values, *, pictures=True, calibration=None):
 
 CLAIMED = {"good": {}, "slipped": {"set": {"pixel_centers": "integer"}}}
 OTHER = {"good": {}, "slipped": {"set": {"depth_agreement": False}}}
+# Differences of 0.50, 0.49 and 0.51 px: an interval of 4.303 * 0.01 / sqrt(3) to either side.
 VALUES = {
     "good": [[0.1, 0.1], [0.1, 0.1], [0.1, 0.1]],
-    "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]],
+    "slipped": [[0.6, 0.6], [0.48, 0.7], [0.7, 0.52]],
 }
 
 
@@ -57,7 +58,7 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
     (finding,) = findings(results(CLAIMED, VALUES), [])
     assert finding.text.startswith("Integer pixel centres")
     assert finding.text.endswith("seen here, holds in general.")
-    assert finding.value == "+0.500 ± 0 layer px"
+    assert finding.value == "+0.500 ± 0.025 layer px"
     assert finding.outcome == "holds"
     assert isinstance(finding.picture, Slider)
     # 0.7 - 0.1; view 1 of scene two has the same, and a later name.
@@ -66,7 +67,7 @@ def test_a_claim_comes_with_its_difference_and_the_view_in_which_it_is_largest()
 
 
 def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
-    values = {**VALUES, "slipped": [[0.6, 0.6], [0.5, 0.7], [None, None]]}
+    values = {**VALUES, "slipped": [*VALUES["slipped"][:2], [None, None]]}
     (finding,) = findings(results(CLAIMED, values), [])
     assert finding.text.endswith("seen here in 2 of 3 scenes, holds in general.")
     assert finding.outcome == "holds"
@@ -75,7 +76,7 @@ def test_a_claim_that_some_scenes_lack_says_in_how_many_it_is_seen():
 def test_a_difference_that_no_claim_names_is_told_once_with_its_verdict():
     (finding,) = findings(results(OTHER, VALUES), [])
     assert finding.text.startswith("Slip: `slipped` is worse than `good` (")
-    assert (finding.value, finding.outcome) == ("+0.500 ± 0 layer px", "fails")
+    assert (finding.value, finding.outcome) == ("+0.500 ± 0.025 layer px", "fails")
     (bare,) = findings(results(OTHER, VALUES), [], pictures=False)
     assert bare.picture is None
 
@@ -106,8 +107,8 @@ def test_an_edit_is_shown_beside_its_counterpart_or_else_beside_the_unedited_vie
         ],
     }
     cells = []
-    for scene in SCENES:
-        for name, value in zip(names, (20.0, 25.0), strict=True):
+    for scene, gain in zip(SCENES, (5.1, 5.0, 4.9), strict=True):
+        for name, value in zip(names, (20.0, 20.0 + gain), strict=True):
             values = {"red/far": 20.0, "red/near": value}
             data = written_runs.record([(v, 0.0, {metric: x}) for v, x in values.items()])
             data |= EDIT.to_json()

@@ -68,7 +68,8 @@ def results(table, more=(), **changes):
     return written_runs.results(study(**changes), [*cells, *more])
 
 
-CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.5, 0.7], [0.7, 0.5]]}
+# Differences of 0.50, 0.49 and 0.51 px: an interval of 4.303 * 0.01 / sqrt(3) to either side.
+CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.48, 0.7], [0.7, 0.52]]}
 
 SLIP_CLAIM = Claim(
     "slip",
@@ -108,14 +109,14 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     (section,) = ablations(results(CLEAR))
     main, _, contrasts = section.tables
     column = main.columns.index("EPE on 64, layer px")
-    assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0"]
+    assert [row[column] for row in main.rows] == ["0.100 ± 0", "0.600 ± 0.025"]
     assert [row[main.columns.index("M splat-pixel pairs a view")] for row in main.rows] == [
         "1.00",
         "1.00",
     ]
     row = next(row for row in contrasts.rows if row[1] == SLIP)
     assert row[0] == "slipped"
-    assert row[2] == "0.500 ± 0"
+    assert row[2] == "0.500 ± 0.025"
     assert row[3] == "worse"
     assert row[6] == "3, 6"
 

@@ -83,12 +83,54 @@ def test_one_scene_has_a_mean_but_no_interval():
 def test_a_paired_difference_cancels_what_the_views_share():
     rng = np.random.default_rng(0)
     a = {f"s{i}": {f"v{j}": 100 * rng.normal() for j in range(6)} for i in range(4)}
-    b = {s: {v: x + 0.1 for v, x in views.items()} for s, views in a.items()}
+    gain = {"s0": 0.1, "s1": 0.11, "s2": 0.1, "s3": 0.09}
+    b = {s: {v: x + gain[s] for v, x in views.items()} for s, views in a.items()}
     difference = paired(a, b)
-    assert difference.low == pytest.approx(0.1, abs=1e-9)
+    expected = stats.t.interval(0.95, 3, 0.1, stats.sem([*gain.values()]))
+    assert (difference.low, difference.high) == pytest.approx(expected, abs=1e-9)
     assert verdict(difference, "higher") == "better"
     assert verdict(difference, "lower") == "worse"
     assert verdict(difference, "higher", atol=0.2) == "can't tell"
+
+
+@pytest.mark.parametrize("scenes", [2, 5, 6, 9])
+@pytest.mark.parametrize("gain", [0.25, -0.1, 1e-4])
+def test_equal_differences_have_the_sign_tests_p_value_and_no_bounds_below_six_scenes(scenes, gain):
+    # 0.1 + 0.7 and the like: the differences are equal but for rounding.
+    a = {f"s{i}": {"v": 0.1 * i + 0.7} for i in range(scenes)}
+    b = {s: {v: x + gain for v, x in views.items()} for s, views in a.items()}
+    result = paired(a, b)
+    assert result.p == stats.binomtest(scenes, scenes).pvalue
+    assert np.isnan(result.detectable)
+    # The 95 % interval of a median that all values are equal to.
+    assert result.bounded == (result.p <= 0.05) == (scenes >= 6)
+    if result.bounded:
+        assert (result.low, result.high) == pytest.approx((gain, gain), abs=1e-12)
+    clear = "better" if gain > 0 else "worse"
+    assert verdict(result, "higher", adjusted_p=result.p) == (
+        clear if scenes >= 6 else "can't tell"
+    )
+
+
+@pytest.mark.parametrize("scenes", [2, 6])
+def test_differences_that_are_all_zero_tell_nothing(scenes):
+    values = {f"s{i}": {"v": 0.1 * i} for i in range(scenes)}
+    result = paired(values, values)
+    assert (result.mean, result.p) == (0.0, 1.0)
+    assert verdict(result, "higher", adjusted_p=result.p) == "can't tell"
+
+
+@pytest.mark.parametrize("scenes", [2, 3, 6])
+def test_shares_of_four_views_without_a_true_difference_rarely_give_a_verdict(scenes):
+    rng = np.random.default_rng(2)
+    trials, wrong = 400, 0
+    for _ in range(trials):
+        # Both methods are right in each view by the flip of a coin.
+        a, b = ({f"s{i}": {"v": x} for i, x in enumerate(rng.binomial(4, 0.5, scenes) / 4)}
+                for _ in range(2))  # fmt: skip
+        result = paired(a, b)
+        wrong += verdict(result, "higher", adjusted_p=result.p) != "can't tell"
+    assert wrong <= stats.binom.ppf(0.999, trials, 0.05)
 
 
 def test_a_view_that_only_one_side_has_counts_as_undefined():
