@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 from attnwarp_eval.statistics.preferences import agreement, chances, preferences, strengths
 
@@ -43,6 +43,32 @@ def test_a_method_that_always_wins_has_probability_1_and_a_bound_by_people():
     exact = stats.binomtest(8, 8).proportion_ci(0.95, method="exact")
     assert share.value == pytest.approx(1, abs=1e-5)
     assert (share.low, share.high) == pytest.approx((exact.low, exact.high))
+
+
+@pytest.mark.parametrize("people", [2, 5, 6])
+def test_people_with_the_same_share_have_the_exact_interval_of_a_choice_each(people):
+    choices = [("a", "b")] * 3 + [("b", "a")] * 2
+    share = preferences({str(k): choices for k in range(people)}, ["a", "b"]).pairs["a", "b"]
+    assert share.value == pytest.approx(0.6, abs=1e-6)
+
+    # Clopper-Pearson: bounds at which as many choices or more, or fewer, come in 2.5 % of cases.
+    # I_p(k, n - k + 1) is that chance for whole k, and continues it to 0.6 n.
+    chose = 0.6 * people
+    assert special.betainc(chose, people - chose + 1, share.low) == pytest.approx(0.025, abs=1e-6)
+    assert special.betainc(chose + 1, people - chose, share.high) == pytest.approx(0.975, abs=1e-6)
+    assert share.low < 0.5
+
+
+def test_two_people_who_flip_five_coins_each_rarely_prefer_a_method():
+    rng, runs, wrong = np.random.default_rng(4), 150, 0
+    for _ in range(runs):
+        made = {
+            person: [("a", "b") if coin else ("b", "a") for coin in rng.integers(0, 2, 5)]
+            for person in "pq"
+        }
+        pair = preferences(made, ["a", "b"]).pairs["a", "b"]
+        wrong += pair.low > 0.5 or pair.high < 0.5
+    assert wrong <= runs - least(runs)
 
 
 def test_methods_that_nobody_compared_with_the_others_have_no_share():
