@@ -162,13 +162,20 @@ def shortened(value: float) -> float:
 
 
 def without_seed(value: Any) -> Any:
-    """A cell's spec without its seeds, at whatever depth they stand.
+    """A cell's spec without its seeds, at whatever depth they stand; of several, their number
+    counts.
 
     >>> without_seed({"seed": 1, "fit": {"iterations": 4, "seed": 1}})
     {'fit': {'iterations': 4}}
+    >>> without_seed({"seed": 5, "seeds": [5, 6]})
+    {'seeds': 2}
     """
     if isinstance(value, dict):
-        return {key: without_seed(item) for key, item in value.items() if key != "seed"}
+        return {
+            key: len(item) if key == "seeds" and isinstance(item, list) else without_seed(item)
+            for key, item in value.items()
+            if key != "seed"
+        }
     if isinstance(value, list):
         return [without_seed(item) for item in value]
     return value

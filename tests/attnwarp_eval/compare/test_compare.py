@@ -21,10 +21,11 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
 from attnwarp_eval.compare.judge import FEWEST_SCENES
-from attnwarp_eval.compare.snapshot import Figure, Measured
+from attnwarp_eval.compare.snapshot import Figure, Measured, definition
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
-from attnwarp_eval.study import Store
+from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study.run import plan
 
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 
@@ -377,6 +378,18 @@ def test_few_scenes_with_other_seeds_are_too_little_and_never_equal():
         assert {row.verdict for row in result.rows} == {"can't tell"}
         assert result.too_little and not result.regressed
     assert not compare(samples(1, 0, 6), samples(2, 3, 6)).too_little
+
+
+def test_a_cell_of_several_seeds_is_the_same_with_as_many_others():
+    def planned(seeds):
+        cells = plan(load_study("variability", scenes=["bear"], seeds=seeds), Store("none")).cells
+        return Snapshot("my", "", tuple(
+            Measured(cell.scene, cell.probe, cell.labels, cell.seed, definition(cell.spec), {}, {})
+            for cell in cells if cell.probe == "variability"
+        ))  # fmt: skip
+
+    assert compare(planned([1, 2]), planned([7, 9])).faults == ()
+    assert {f.kind for f in compare(planned([1, 2]), planned([7, 8, 9])).faults} == {"redefined"}
 
 
 def test_nothing_in_common_is_exit_code_3(stored, tmp_path):
