@@ -61,7 +61,7 @@ class Row:
             best at 0.
         adjusted_p: of the difference, for all tests of the comparison; NaN where none was made.
         worst: the view that got worse most (``scene/view/seed``), with its two values.
-        undefined: views whose value was defined in the baseline only.
+        undefined: views whose value was defined in the baseline only, in whatever seed.
     """
 
     probe: str
@@ -257,6 +257,7 @@ class _Group:
     Attributes:
         before, now: as measured.
         difference: paired.
+        gaps: whether any value of a view and seed is undefined.
         worsening: scene/view -> how much worse the run is, in the metric's unit.
     """
 
@@ -267,6 +268,7 @@ class _Group:
     before: ByView
     now: ByView
     difference: Interval
+    gaps: bool
     worsening: Mapping[str, float]
 
     @classmethod
@@ -294,7 +296,9 @@ class _Group:
             for view, value in views.items()
             if view in second.get(scene, {})
         }
-        return cls(probe, variant, metric, key, before, now, paired(first, second), worsening)
+        gaps = _any_undefined(left, shared, key) or _any_undefined(right, shared, key)
+        difference = paired(first, second)
+        return cls(probe, variant, metric, key, before, now, difference, gaps, worsening)
 
     def row(self, adjusted_p: float, exact: bool) -> Row:
         """The group's verdict."""
@@ -340,8 +344,10 @@ class _Group:
         return "better" if gained and not lost else None
 
     def _by_scenes(self, before: Mapping[str, float], adjusted_p: float, undefined: int) -> Verdict:
-        """The verdict of a test over scenes."""
+        """The verdict of a test over scenes; views that became undefined need none."""
         difference = self.difference
+        if undefined:
+            return "worse"
         if difference.scenes < FEWEST_SCENES:
             return "can't tell"
         values = [value for value in before.values() if math.isfinite(value)]
@@ -354,7 +360,7 @@ class _Group:
         )
         reach = float(np.mean([margin(self.key).around(value) for value in values]))
         within = max(abs(difference.low), abs(difference.high)) < reach
-        if outcome == "can't tell" and within and not undefined and not difference.undefined:
+        if outcome == "can't tell" and within and not self.gaps and not difference.undefined:
             return "equal"
         return outcome
 
@@ -362,7 +368,7 @@ class _Group:
 def _values(
     side: Mapping[Key, list[Measured]], keys: list[Key], metric: str, exact: bool
 ) -> dict[str, dict[str, float]]:
-    """Scene -> view (and seed) -> value; the mean over seeds where these differ."""
+    """Scene -> view (and seed) -> value; the mean over the defined seeds where seeds differ."""
     table: dict[str, dict[str, list[float]]] = {}
     for key in keys:
         for cell in side[key]:
@@ -371,9 +377,14 @@ def _values(
                 name = f"{view}/{cell.seed}" if exact else view
                 table.setdefault(key[0], {}).setdefault(name, []).append(value)
     return {
-        scene: {view: float(np.mean(values)) for view, values in views.items()}
+        scene: {view: _mean_of_defined(values) for view, values in views.items()}
         for scene, views in table.items()
     }
+
+
+def _any_undefined(side: Mapping[Key, list[Measured]], keys: list[Key], metric: str) -> bool:
+    figures = (cell.figures.get(metric) for key in keys for cell in side[key])
+    return any(math.isnan(v) for figure in figures if figure for v in figure.values.values())
 
 
 def _flat(table: ByView) -> dict[str, float]:
@@ -383,9 +394,9 @@ def _flat(table: ByView) -> dict[str, float]:
 
 
 def _mean(table: ByView) -> float:
-    means = [
-        float(np.mean(defined))
-        for views in table.values()
-        if (defined := [value for value in views.values() if math.isfinite(value)])
-    ]
-    return float(np.mean(means)) if means else math.nan
+    return _mean_of_defined([_mean_of_defined(views.values()) for views in table.values()])
+
+
+def _mean_of_defined(values: Iterable[float]) -> float:
+    defined = [value for value in values if math.isfinite(value)]
+    return float(np.mean(defined)) if defined else math.nan

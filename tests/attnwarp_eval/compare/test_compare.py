@@ -392,6 +392,29 @@ def test_a_cell_of_several_seeds_is_the_same_with_as_many_others():
     assert {f.kind for f in compare(planned([1, 2]), planned([7, 8, 9])).faults} == {"redefined"}
 
 
+def errors(by_seed, scenes=FEWEST_SCENES):
+    """Cells of one view a scene, with the same errors by seed in all scenes but for 1 % each."""
+    return Snapshot("my", "", tuple(
+        Measured(f"scene{i}", "depth", ("a",), seed, "same", {},
+                 {"depth.abs_rel": Figure(1, {"yaw010": value * (1 + 0.01 * i)})})
+        for i in range(scenes) for seed, value in by_seed.items()
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("run", "verdict", "undefined"),
+    [
+        ({3: math.nan, 4: math.nan, 5: math.nan}, "worse", FEWEST_SCENES),
+        ({3: 0.5, 4: 0.5, 5: math.nan}, "worse", 0),  # what is left of the seeds is worse
+        ({3: 0.01, 4: 0.01, 5: math.nan}, "can't tell", 0),
+        ({3: 0.01, 4: 0.01, 5: 0.01}, "equal", 0),
+    ],
+)
+def test_figures_that_became_undefined_with_other_seeds_are_seen(run, verdict, undefined):
+    (row,) = compare(errors({0: 0.01, 1: 0.01, 2: 0.01}), errors(run)).rows
+    assert (row.verdict, row.undefined) == (verdict, undefined)
+
+
 def test_nothing_in_common_is_exit_code_3(stored, tmp_path):
     run = stored / "variants"
     whole = read_snapshot(Store(run))
