@@ -24,6 +24,7 @@ from attnwarp_eval.statistics.intervals import (
     paired,
     verdict,
 )
+from attnwarp_eval.study.probes import probe as probe_of
 
 Verdict = Literal["worse", "better", "equal", "can't tell"]
 
@@ -83,7 +84,7 @@ class Comparison:
     Attributes:
         study: name of the run's study.
         exact: whether both sides have the same seeds, so that views are compared one by one.
-        scenes: how many both sides have.
+        scenes: how many the figure with most of them was compared on; hard cases are none.
         rows: one a (probe, variant, metric) that both sides have.
         faults: what fails without a figure.
         added: what only the run has; it passes until ``--update`` takes it into the baseline.
@@ -146,8 +147,9 @@ def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
         faults += missing
         added += new
     rows = _rows(left, right, exact)
-    scenes = {key[0] for key in left.keys() & right.keys()}
-    return Comparison(run.study, exact, len(scenes), rows, tuple(faults), tuple(added))
+    scenes = [row.difference.scenes for row in rows if probe_of(row.probe).needs_scenes]
+    most = max(scenes, default=0)
+    return Comparison(run.study, exact, most, rows, tuple(faults), tuple(added))
 
 
 def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:

@@ -415,6 +415,21 @@ def test_figures_that_became_undefined_with_other_seeds_are_seen(run, verdict, u
     assert (row.verdict, row.undefined) == (verdict, undefined)
 
 
+def test_hard_cases_are_no_scenes():
+    def with_cases(seed, value, scenes):
+        cases = tuple(
+            Measured(f"case{i}", "stability", ("cpu",), 0, "same", {},
+                     {"stability.margin": Figure(1, {"1": 2.0})}) for i in range(8)
+        )  # fmt: skip
+        snapshot = errors({seed: value}, scenes)
+        return dataclasses.replace(snapshot, cells=snapshot.cells + cases)
+
+    few = compare(with_cases(0, 0.01, 3), with_cases(1, 0.9, 3))
+    assert "a test over 3 scenes says nothing" in few.too_little
+    many = compare(with_cases(0, 0.01, 6), with_cases(1, 0.9, 6))
+    assert many.regressed and not many.too_little
+
+
 def test_nothing_in_common_is_exit_code_3(stored, tmp_path):
     run = stored / "variants"
     whole = read_snapshot(Store(run))
