@@ -62,7 +62,9 @@ def test_a_camera_that_is_added_has_the_sign_of_its_side():
         x, y, _ = camera.position  # the source is on the positive x axis
         assert (world.signed_yaw[camera.name] > 0) == (y > 0)
         assert abs(world.signed_yaw[camera.name]) == world.yaw[camera.name]
-        assert world.yaw[camera.name] == pytest.approx(math.degrees(math.acos(x / math.hypot(x, y))))
+        assert world.yaw[camera.name] == pytest.approx(
+            math.degrees(math.acos(x / math.hypot(x, y)))
+        )
 
 
 def test_the_relation_of_any_two_views_is_that_of_their_cameras_and_goes_with_its_scene():

@@ -157,7 +157,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
         [[*key, str(len(done)), str(sum(done))] for key, done in rows.items()],
     )
     Console().print(terminal(table))
-    scenes = f"scenes {', '.join(loaded.scenes)}; " if loaded.scenes else ""
+    scenes = f"scenes {', '.join(loaded.scene_names)}; " if loaded.scenes else ""
     typer.echo(
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"

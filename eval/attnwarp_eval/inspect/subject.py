@@ -27,6 +27,7 @@ from attnwarp_eval.inspect.capture import (
 )
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
+from attnwarp_eval.scene.file import scene_name
 from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
 
@@ -214,8 +215,9 @@ def of_run(
     study, listed = stored_study(Store(folder))
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
-    scene = scene or study.scenes[0]
-    one_of(scene, study.scenes, "scene")
+    files = dict(zip(study.scene_names, study.scenes, strict=True))
+    name = scene_name(scene or study.scenes[0])
+    one_of(name, list(files), "scene")
     seed = study.seeds[0] if seed is None else seed
     one_of(str(seed), [str(number) for number in study.seeds], "seed")
     variants = {
@@ -227,12 +229,12 @@ def of_run(
             f"{folder}: the study {study.name!r} has no variants; name a scene instead"
         )
     size = size or study.size
-    views = world(scene, size)
-    records = measured(folder, listed, scene, seed, views.source.name)
+    views = world(files[name], size)
+    records = measured(folder, listed, name, seed, views.source.name)
     for own in records.values():
         if own.scene != views.content_hash:
             raise InputError(
-                f"{folder}: the scene {scene!r} has changed since the run was made; run the study"
+                f"{folder}: the scene {name!r} has changed since the run was made; run the study"
                 " again, or name the scene instead of the run"
             )
     pictured = [name for name, own in records.items() if own.edits]
@@ -242,6 +244,7 @@ def of_run(
     elsewhere = ""
     if any(own.edited for own in records.values()):
         elsewhere = _elsewhere(folder, pictured, edited)
+    scene = files[name]
     targets = (*edited, *(study.views or views.targets))
     return Subject(
         scene, size, study.spp, seed, variants, targets, measured=records, elsewhere=elsewhere

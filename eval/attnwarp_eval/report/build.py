@@ -33,7 +33,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             f"Study `{study.name}`: {results.measured} of {total} cells measured,"
             f" {len(results.failures)} failed"
             + (
-                f"; scenes {', '.join(study.scenes)}; {study.size} x {study.size} px; seeds"
+                f"; scenes {', '.join(study.scene_names)}; {study.size} x {study.size} px; seeds"
                 f" {study.seeds}."
                 if study.scenes
                 else "."

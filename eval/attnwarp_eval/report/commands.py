@@ -55,7 +55,11 @@ def _commands(results: Results) -> Iterator[tuple[str, str, str]]:
     study = results.study
     for cell in results.cells:
         variant = cell.variants[0]
-        if cell.record is None or cell.scene not in study.scenes or variant not in study.variants:
+        if (
+            cell.record is None
+            or cell.scene not in study.scene_names
+            or variant not in study.variants
+        ):
             continue
         # Views that are no targets of the scene, such as those of a fit, cannot be opened.
         targets = cell.record.spec.get("views", [])

@@ -43,6 +43,26 @@ def list_scenes() -> list[str]:
     return sorted({path.stem for folder in scene_folders() for path in folder.glob("*.yaml")})
 
 
+def is_scene_file(name: object) -> bool:
+    """Whether :func:`load_scene` takes this for a file, not for a name to look up.
+
+    >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
+    (True, False)
+    """
+    if not isinstance(name, str):
+        return False
+    return Path(name).suffix in (".yaml", ".yml") or len(Path(name).parts) != 1
+
+
+def scene_name(name_or_path: str) -> str:
+    """What a scene is called wherever its file may lie: its name, or its file's without a suffix.
+
+    >>> scene_name("my/room.yaml"), scene_name("bear")
+    ('room', 'bear')
+    """
+    return Path(name_or_path).stem if is_scene_file(name_or_path) else name_or_path
+
+
 def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     """A scene by name (``"bear"``) or by file (``"my/scene.yaml"``).
 
@@ -63,7 +83,7 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
     """
     text = os.fspath(name_or_path)
     path = Path(text).expanduser()
-    if path.suffix in (".yaml", ".yml") or len(path.parts) != 1:
+    if is_scene_file(text):
         if not path.is_file():
             raise SceneError(f"no such scene file{suggest(path.name, _siblings(path))}", path)
         return _read(path)

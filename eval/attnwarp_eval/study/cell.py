@@ -46,6 +46,11 @@ class Cell:
         return digest(self.spec)
 
     @property
+    def scene_file(self) -> str:
+        """What :func:`attnwarp_eval.scene.file.load_scene` takes for the cell's scene."""
+        return self.sources.get("scene", self.scene)
+
+    @property
     def title(self) -> str:
         """Short text for progress bars and failure tables."""
         return f"{self.scene} / {self.variant} / {self.probe}" + (

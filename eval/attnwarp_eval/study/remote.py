@@ -157,7 +157,9 @@ def compute_and_send(probe: Probe[Any], cell: Cell, scene: SceneFiles | None) ->
         content = str(cell.spec.get("scene"))
         if scene is not None:
             _scenes[content] = _unpack_scene(scene, root / "scenes" / content[:16])
-        own = replace(cell, scene=str(_scenes[content])) if content in _scenes else cell
+        own = cell
+        if content in _scenes:
+            own = replace(cell, sources={**cell.sources, "scene": str(_scenes[content])})
         record = compute(probe, own, root, worker.state.nthreads)
         names = [picture.path for picture in record.pictures]
         pictures = {name: (root / name).read_bytes() for name in names}

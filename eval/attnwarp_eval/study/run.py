@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
-from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.file import load_scene, scene_name
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
@@ -86,7 +86,8 @@ def plan(study: Study, store: Store) -> Plan:
             todo.append(cell)
         else:
             other_code += not record.environment.same_code(this)
-    return Plan(study, scenes, cells, todo, other_code)
+    named = {scene_name(where): scene for where, scene in scenes.items()}
+    return Plan(study, named, cells, todo, other_code)
 
 
 def _scenes(study: Study) -> dict[str, Scene]:
@@ -137,7 +138,7 @@ def verify(store: Store) -> Problems:
     Raises:
         InputError: the folder is no run.
     """
-    stored = store.read_study()
+    stored = _by_name(store.read_study())
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
@@ -171,7 +172,7 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
         >>> [cell["title"] for cell in stored_study(store)[1]]
         ['spheres / calibration / calibration', 'spheres / a / depth']
     """
-    stored = store.read_study()
+    stored = _by_name(store.read_study())
     path, remedy = store.root / "study.json", _remedy(store)
     try:
         study = parse_study(stored["study"])
@@ -180,7 +181,9 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
     needs_scenes = {p.name: p.needs_scenes for p in probes()}
     for cell in stored["cells"]:
         on_scene = needs_scenes.get(cell["probe"], True)
-        if cell["probe"] not in needs_scenes or (on_scene and cell["scene"] not in study.scenes):
+        if cell["probe"] not in needs_scenes or (
+            on_scene and cell["scene"] not in study.scene_names
+        ):
             raise StoreError(
                 f"{path}: cell {cell['title']!r} names a probe or a scene that the study lacks;"
                 f" {remedy}"
@@ -188,6 +191,15 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
     if "sha256" not in stored:
         _check_labels(store, stored, study)
     return study, stored["cells"]
+
+
+def _by_name(stored: dict[str, Any]) -> dict[str, Any]:
+    """A ``study.json`` whose scenes are called by name; former ones called them by their files."""
+    return {
+        **stored,
+        "scenes": {scene_name(k): entry for k, entry in stored.get("scenes", {}).items()},
+        "cells": [{**cell, "scene": scene_name(cell["scene"])} for cell in stored["cells"]],
+    }
 
 
 def _remedy(store: Store) -> str:

@@ -5,6 +5,7 @@ What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator,
 from attnwarp import check
 from attnwarp.errors import InputError, suggest
 from attnwarp.warp import PRESETS, WarpSettings
+from attnwarp_eval.scene.file import scene_name
 
 if TYPE_CHECKING:
     from attnwarp_eval.scene.scene import Scene
@@ -145,6 +147,11 @@ class Study(Part):
     _left_out: tuple[str, ...] = PrivateAttr(default=())
 
     @property
+    def scene_names(self) -> list[str]:
+        """What cells and reports call the scenes, which ``scenes`` may name by their files."""
+        return [scene_name(where) for where in self.scenes]
+
+    @property
     def left_out(self) -> tuple[str, ...]:
         """Scenes of the study's file that were not chosen; other keys may name them."""
         return self._left_out
@@ -172,6 +179,12 @@ class Study(Part):
                 )
         for key in ("scenes", "seeds", "views"):
             check_distinct(getattr(self, key), key)
+        for name, count in Counter(self.scene_names).items():
+            if count > 1:
+                one, other, *_ = (where for where in self.scenes if scene_name(where) == name)
+                raise ValueError(
+                    f"scenes: {one!r} and {other!r} are both called {name!r}; rename a file"
+                )
         return self
 
     def check_variants(self, names: Iterable[str], key: str, probe: str = "") -> None:

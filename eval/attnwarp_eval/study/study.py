@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel, Field, ValidationError, create_model, model_validator
 
 from attnwarp_eval.scene import explain
+from attnwarp_eval.scene.file import is_scene_file, scene_name
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.yaml import YamlError, read_yaml
 from attnwarp_eval.study.cell import Cell, merged
@@ -159,13 +161,20 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
         >>> [cell.labels for cell in cells if cell.probe == "warp"]
         [('a', 'b')]
     """
-    ordered = {name: scenes[name] for name in study.scenes}
+    ordered = {scene_name(where): scenes[where] for where in study.scenes}
     names: dict[str, list[str]] = {p.name: [] for p in probes() if p.always}
     names |= {name: variants for name, variants in study.probes.items()}
     cells = [
         cell
         for name, variants in names.items()
         for cell in probe(name).cells(study, variants, ordered)
+    ]
+    files = {scene_name(where): where for where in study.scenes if is_scene_file(where)}
+    cells = [
+        replace(cell, sources={**cell.sources, "scene": files[cell.scene]})
+        if cell.scene in files
+        else cell
+        for cell in cells
     ]
     place = {name: i for i, name in enumerate(ordered)}
     # What has no scene comes last, in its own order.
@@ -215,12 +224,19 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
     data = _beside(data, path.parent)
     every = data.get("scenes")
     data.update({k: v for k, v in overrides.items() if v is not None})
+    if isinstance(data.get("scenes"), list):
+        # The run is reported and inspected from other folders than this one.
+        data["scenes"] = [
+            str(Path(name).expanduser().absolute()) if is_scene_file(name) else name
+            for name in data["scenes"]
+        ]
     try:
         study = parse_study(data)
     except ValidationError as error:
         raise StudyError(f"{path}: {explain_errors(error)}") from None
     if isinstance(every, list):
-        study._left_out = tuple(name for name in every if name not in study.scenes)
+        called = {scene_name(name) for name in study.scenes}
+        study._left_out = tuple(name for name in every if scene_name(name) not in called)
     return study
 
 
@@ -248,17 +264,6 @@ def _beside(data: dict[str, Any], folder: Path) -> dict[str, Any]:
             for kind, name in encoders.items()
         }
     return data
-
-
-def is_scene_file(name: Any) -> bool:
-    """Whether a scene is named by its file, as :func:`attnwarp_eval.scene.file.load_scene` has it.
-
-    >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
-    (True, False)
-    """
-    if not isinstance(name, str):
-        return False
-    return Path(name).suffix in (".yaml", ".yml") or len(Path(name).parts) > 1
 
 
 def explain_errors(error: ValidationError, model: type[BaseModel] | None = None) -> str:

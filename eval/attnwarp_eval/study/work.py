@@ -41,7 +41,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     scene_world = None
     if probe.needs_scenes:
         with meter.stage("setup"):
-            scene_world = world(cell.scene, cell.spec["size"])
+            scene_world = world(cell.scene_file, cell.spec["size"])
         if scene_world.content_hash != cell.spec["scene"]:
             raise InputError(
                 f"scene {cell.scene!r} has changed since the run was planned; start the run again"

@@ -93,7 +93,9 @@ def test_where_source_and_target_share_no_surface_the_panel_is_left_out_by_name(
     panel = point_visibility.visibility(scene, size=32, points=10, rounds=3, maps=(8,))
     store_panel(tmp_path, replace(panel, scene="earlier"))
     write([panel, depth_panel("one")], tmp_path)
-    assert "Left out: visibility of earlier, test. No point" in (tmp_path / "accuracy.md").read_text()
+    assert (
+        "Left out: visibility of earlier, test. No point" in (tmp_path / "accuracy.md").read_text()
+    )
     assert scenes_in(tmp_path) == ["one"] and not (tmp_path / "visibility.svg").exists()
 
 

@@ -11,7 +11,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.probes import editing, sensitivity
-from attnwarp_eval.study.run import plan
+from attnwarp_eval.study.run import expected, plan, stored_study, verify
 from attnwarp_eval.study.study import shipped_studies
 
 SMALL = {
@@ -207,8 +207,37 @@ def test_relative_paths_count_from_the_studys_file(tmp_path, monkeypatch):
         assert os.path.realpath(clip) == str(tmp_path / "studies" / "models" / "clip")
         assert study.encoders["dino"] == "dino-small"
         assert study.encoders["perceptual"] == "lpips:/abs/lpips"
-    # From the study's own folder a path is what the file has.
-    monkeypatch.chdir(path.parent)
-    assert load_study("study.yaml").scenes[0] == "scenes/own.yaml"
+        # Reports call a scene by its name, wherever its file lies.
+        assert study.scene_names == ["own", "bear", "other"]
     # What a person types on the command line counts from where they are.
-    assert load_study("study.yaml", scenes=["x/y.yaml"]).scenes == ["x/y.yaml"]
+    typed = load_study(os.path.relpath(path), scenes=["x/y.yaml"])
+    assert typed.scenes == [str(tmp_path / "elsewhere" / "x" / "y.yaml")]
+
+
+def test_two_scenes_of_one_name_are_refused(tmp_path):
+    path = tmp_path / "study.yaml"
+    path.write_text("name: s\nscenes: [a/room.yaml, b/room.yaml]\nprobes: {sensitivity: []}\n")
+    with pytest.raises(
+        StudyError, match=r"a/room.yaml' and '.*b/room.yaml' are both called 'room'"
+    ):
+        load_study(str(path))
+
+
+def test_a_scene_of_a_file_has_its_name_in_cells_and_its_file_beside_it(tmp_path):
+    shipped = pathlib.Path(__file__).parents[3] / "scenes" / "spheres.yaml"
+    (tmp_path / "room.yaml").write_text(shipped.read_text())
+    path = tmp_path / "study.yaml"
+    path.write_text(
+        "name: s\nscenes: [room.yaml]\nsize: 16\nvariants: {a: {}}\nprobes: {depth: [a]}\n"
+    )
+    study, store = load_study(str(path)), Store(tmp_path / "run")
+    planned = plan(study, store)
+    assert {(c.scene, c.scene_file) for c in planned.cells} == {
+        ("room", str(tmp_path / "room.yaml"))
+    }
+    written = expected(planned)
+    # A former run called the scene by its path, as it was typed.
+    written["cells"] = [{**cell, "scene": "some/room.yaml"} for cell in written["cells"]]
+    store.write_study(written)
+    assert {cell["scene"] for cell in stored_study(store)[1]} == {"room"}
+    assert not verify(store).damaged

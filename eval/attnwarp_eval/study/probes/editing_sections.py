@@ -209,7 +209,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
 def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
     """A table for each figure: variants by scenes."""
     measured = [name for name in names if results.records(probe, name)]
-    scenes = results.study.scenes
+    scenes = results.study.scene_names
     tables = []
     for metric, title in BY_SCENE.items():
         rows = []
@@ -237,7 +237,7 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
 
 def _injected(results: Results, probe: str, names: Sequence[str]) -> list[Table]:
     """Variants that inject features, by scenes; none where no variant does."""
-    scenes = results.study.scenes
+    scenes = results.study.scene_names
     rows = []
     for name in names:
         shares: dict[str, list[float]] = {}
@@ -262,10 +262,10 @@ def _ratios(results: Results, probe: str, names: Sequence[str]) -> Table:
         if base in ("", name):
             continue
         shared = common([results.views(probe, each, DISAGREEMENT) for each in (name, base)])
-        parts = [_part(results, probe, (name, base), shared, s) for s in results.study.scenes]
+        parts = [_part(results, probe, (name, base), shared, s) for s in results.study.scene_names]
         rows.append([name, base, *parts])
     title = "Disagreement with the source above its floor, as a part of the control's"
-    return Table(["variant", "control", *results.study.scenes], rows, title)
+    return Table(["variant", "control", *results.study.scene_names], rows, title)
 
 
 def _part(
@@ -389,7 +389,7 @@ def parts_of_time(results: Results, probe: str) -> Section:
 
 def choice(results: Results, probe: str, names: Sequence[str], metrics: Sequence[str]) -> Section:
     """The best variant for a given time: chosen on every other scene, checked on the rest."""
-    scenes = results.study.scenes
+    scenes = results.study.scene_names
     chosen_on, checked_on = scenes[::2], scenes[1::2]
     measured = [name for name in names if results.records(probe, name)]
     timed = timed_in_turn(results, WHOLE)

@@ -122,7 +122,7 @@ class EditingTimingProbe(Probe[Rounds]):
         names = [world.source.name, *spec["views"]]
         with work.meter.stage("truth"):
             truth = edit_truth(
-                work.cell.scene, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
+                work.cell.scene_file, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
             )
         contestants = [self._contestant(work, k) for k in range(len(spec["contestants"]))]
         with work.meter.stage("splats"):
@@ -155,7 +155,7 @@ class EditingTimingProbe(Probe[Rounds]):
         cell = replace(
             work.cell,
             spec={**spec, **work.spec["contestants"][number]},
-            sources={"editor": work.cell.sources[f"editor {number}"]},
+            sources={**work.cell.sources, "editor": work.cell.sources[f"editor {number}"]},
         )
         return Work(cell, work.root, work.scene_world, Meter())
 

@@ -127,7 +127,7 @@ class VariabilityProbe(Probe[Varied]):
         edit = spec["edit"]
         with meter.stage("truth"):
             truth = edit_truth(
-                work.cell.scene, spec["size"], spec["spp"], edit["name"], tuple(names)
+                work.cell.scene_file, spec["size"], spec["spp"], edit["name"], tuple(names)
             )
         with meter.stage("splats"):
             before = splats_of(work)

@@ -51,4 +51,4 @@ def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
     spec = work.spec if spec is None else spec
     if "fit" in spec:
         return fit.fit_of(work, spec).gaussians
-    return splats(work.cell.scene, spec["size"], spec["seed"], **spec["splats"])
+    return splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])
