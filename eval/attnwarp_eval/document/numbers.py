@@ -22,9 +22,9 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if value == 0:
         return "0"
-    if abs(value) >= 10**digits:
-        return f"{value:.0f}"
     text = f"{value:.{digits}g}"
+    if abs(float(text)) >= 10**digits:  # rounded: 999.6 has as many digits as 1000
+        return f"{value:.0f}"
     return (
         text
         if "e" in text
