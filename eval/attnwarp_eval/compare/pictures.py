@@ -72,33 +72,46 @@ def pictures_of_baseline(baseline: Path, snapshot: Snapshot) -> Pictures:
     """
     table = {}
     for cell in snapshot.cells:
-        for folder in sorted(_folder(baseline, cell.definition, cell.seed).glob("*/")):
-            files = {file.stem: file for file in sorted(folder.glob("*.jpg"))}
-            table[cell.definition, cell.seed, folder.name.replace(SLASH, "/")] = files
+        for view in _views(cell):
+            folder = _folder(folder_of(baseline), cell.definition, cell.seed, view)
+            if files := {file.stem: file for file in sorted(folder.glob("*.jpg"))}:
+                table[cell.definition, cell.seed, view] = files
     return table
-
-
-SLASH = "__"
-"""Stands for the slash of a view's name, such as ``edit/yaw030``, in the name of its folder."""
 
 
 def write_pictures(baseline: Path, pictures: Pictures) -> None:
     """Put a run's pictures beside a baseline's file, instead of former ones.
 
+    Those are removed when all of the new ones are there.
+
     Args:
         baseline: the file.
         pictures: of the run that it was written from.
     """
-    if folder_of(baseline).is_dir():
-        shutil.rmtree(folder_of(baseline))
+    folder = folder_of(baseline)
+    new, former = folder.with_suffix(".pictures-new"), folder.with_suffix(".pictures-former")
+    for left in (new, former):  # by a call that was killed
+        if left.is_dir():
+            shutil.rmtree(left)
     for (cell, seed, view), files in pictures.items():
         for content, file in files.items():
-            name = f"{view.replace('/', SLASH)}/{content}.jpg"
-            write_atomic(_folder(baseline, cell, seed) / name, file.read_bytes())
+            path = _folder(new, cell, seed, view) / f"{content}.jpg"
+            write_atomic(path, file.read_bytes())
+    if folder.is_dir():
+        folder.rename(former)
+    if new.is_dir():
+        new.rename(folder)
+    if former.is_dir():
+        shutil.rmtree(former)
 
 
-def _folder(baseline: Path, cell: str, seed: int) -> Path:
-    return folder_of(baseline) / f"{cell}-{seed}"
+def _folder(pictures: Path, cell: str, seed: int, view: str) -> Path:
+    """Of the pictures of a view, which may have a slash in its name, such as ``edit/yaw030``."""
+    return pictures / f"{cell}-{seed}" / view.replace("/", "__")
+
+
+def _views(cell: Measured) -> list[str]:
+    return sorted({view for figure in cell.figures.values() for view in figure.values})
 
 
 def largest_changes(
@@ -138,8 +151,7 @@ def _shared(baseline: Snapshot, run: Snapshot) -> Iterator[tuple[Measured, Measu
 def _of_cell(
     first: Measured, second: Measured, variant: str, before: Pictures, after: Pictures
 ) -> Iterator[Change]:
-    views = {view for figure in first.figures.values() for view in figure.values}
-    for view in sorted(views):
+    for view in _views(first):
         files = before.get((first.definition, first.seed, view), {})
         others = after.get((second.definition, second.seed, view), {})
         both = {
