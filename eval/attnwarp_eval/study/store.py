@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -22,6 +21,7 @@ from typing import Any, TypeVar
 from attnwarp.errors import InputError
 from attnwarp.io.file import remove_abandoned
 from attnwarp_eval.canonical_json import digest, write_json
+from attnwarp_eval.files import locked
 
 FORMAT = 1
 """Version of the layout of a cell's file; a reader refuses others."""
@@ -81,25 +81,22 @@ class Store:
         self.root.mkdir(parents=True, exist_ok=True)
         self.refuse_links()
         path = self.root / ".lock"
-        try:
-            # Neither followed nor emptied: in a folder from elsewhere it may link to any file.
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
-        except OSError as error:
-            if error.errno != errno.ELOOP:
-                raise
-            raise StoreError(f"{path}: is a symbolic link, expected a file; delete it") from None
-        try:
+        with ExitStack() as held:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                held.enter_context(locked(path, wait=False))
             except BlockingIOError:
                 raise StoreError(
                     f"{self.root}: another run is writing to this folder; wait for it, or name"
                     " another with --out"
                 ) from None
+            except OSError as error:
+                if error.errno != errno.ELOOP:
+                    raise
+                raise StoreError(
+                    f"{path}: is a symbolic link, expected a file; delete it"
+                ) from None
             self._sweep()
             yield
-        finally:
-            os.close(file)
 
     def refuse_links(self) -> None:
         """Check that what is written to the run's folder stays inside it.

@@ -20,6 +20,7 @@ from attnwarp_eval.canonical_json import canonical_json, digest
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number
+from attnwarp_eval.files import locked
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats import export, fitted
 from attnwarp_eval.statistics.intervals import Interval, interval
@@ -331,18 +332,21 @@ def fit_of(work: Work, spec: Mapping[str, Any] | None = None) -> attnwarp.fit.Fi
     it, and one that was cut short is resumed.
     """
     spec, world = work.spec if spec is None else spec, work.world
-    data = spec["fit"]
-    return fitted.fit_scene(
-        world.scene,
-        FitSettings.from_dict(data["settings"]),
-        folder_of(work.root, spec),
-        views=data["views"],
-        spp=spec["spp"],
-        points=data["points"],
-        noise=data["noise"],
-        seed=spec["seed"],
-        geometry=world.geometry,
-    )
+    data, folder = spec["fit"], folder_of(work.root, spec)
+    folder.mkdir(parents=True, exist_ok=True)
+    # Where two workers want one fit, the second reads what the first has done.
+    with locked(folder / ".lock", wait=True):
+        return fitted.fit_scene(
+            world.scene,
+            FitSettings.from_dict(data["settings"]),
+            folder,
+            views=data["views"],
+            spp=spec["spp"],
+            points=data["points"],
+            noise=data["noise"],
+            seed=spec["seed"],
+            geometry=world.geometry,
+        )
 
 
 def folder_of(root: Path, spec: Mapping[str, Any]) -> Path:
