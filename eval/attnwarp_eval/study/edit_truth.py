@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -151,7 +151,7 @@ def neighbours(of: World, views: Sequence[str]) -> dict[str, str]:
 
     # Of several equally near ones the last counts.
     return {
-        view: min(reversed(ordered[:k]), key=lambda other, view=view: apart(view, other))
+        view: min(reversed(ordered[:k]), key=partial(apart, view))
         for k, view in enumerate(ordered)
         if k
     }
