@@ -1,0 +1,66 @@
+"""Draw the README's picture of an edit: views edited alone, and by attention that is warped.
+
+python scripts/picture_of_an_edit.py docs/pictures/edit.jpg
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib import pyplot
+
+from attnwarp.baselines import ByViewSettings, by_view
+from attnwarp.editing.small import load_editor
+from attnwarp.propagate import preset, propagate
+from attnwarp_eval.world import splats, world
+
+VIEWS = ("yaw030", "yaw060", "yaw090", "yaw120")
+SIZE = 128
+"""Side of the pictures; the bundled editor `small-plain` was trained at this size."""
+
+
+def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
+    """Rows: before the edit, then alone or warped, each with own or with the same noise in every
+    view. Columns: the source view and targets.
+    """
+    truth = world(scene, SIZE)
+    cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
+    before = [np.clip(truth.image(camera.name, 8), 0, 1) for camera in cameras]
+    model = splats(scene, SIZE, 0, kind="2d", count=20_000, position_noise=0.1, normal_noise=3.0)
+    editor = load_editor("small-plain")
+    # The row shows edited views, so the splats need no tuning.
+    noises: dict[Literal["fresh", "shared"], str] = {"fresh": "own noise", "shared": "same noise"}
+    few: dict[str, Any] = {"iterations": 1, "seed": seed}
+    stage: dict[str, Any] = {"stages": 1, "views_per_stage": len(VIEWS), "sources": 1}
+    scene_and_words = (model, cameras, before, editor, instruction)
+    rows: dict[str, Mapping[int, Any]] = {"before": dict(enumerate(before))}
+    for noise, words in noises.items():
+        alone = by_view(*scene_and_words, ByViewSettings(noise=noise, **few))
+        rows[f"each view alone,\n{words}"] = alone.edited
+        warped = propagate(*scene_and_words, preset("corrected", noise=noise, **stage, **few))
+        rows[f"attention warped,\n{words}"] = warped.edited
+    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 11.3), dpi=80)
+    for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
+        axis.set_title(title)
+    for row, (title, pictures) in zip(axes, rows.items(), strict=True):
+        for number, axis in enumerate(row):
+            axis.imshow(pictures[number], interpolation="nearest")
+            axis.set(xticks=[], yticks=[])
+        row[0].set_ylabel(title)
+    figure.tight_layout(pad=0.4)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, pil_kwargs={"quality": 88})
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--scene", default="bear")
+    parser.add_argument("--instruction", default="make the bear another color")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    draw(options.out, options.scene, options.instruction, options.seed)
