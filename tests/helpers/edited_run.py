@@ -25,7 +25,7 @@ SCENE = {
     "cameras": {"look_at": [0, 0, 0.8], "radius": 3.5, "fov": 50, "size": [32, 32],
                 "source": {"yaw": 0, "height": 1.5},
                 "targets": [{"yaw": yaw, "height": 1.5} for yaw in (15, 30, 60, 90)]},
-    "edits": [{"name": name, "instruction": f"paint it {name}", "source": "a ball",
+    "edits": [{"name": name, "source": "a ball",
                "target": f"a {name} ball", "changes": [{"object": "ball", "paint": value}]}
               for name, value in (("red", "#d03020"), ("blue", "#2040d0"))],
 }  # fmt: skip
@@ -45,22 +45,33 @@ class Written:
     colors: dict[str, tuple[int, int, int]]
 
 
-def write_run(folder, views=2, methods=METHODS, seeds=(1, 2), more=MappingProxyType({})):
+def write_run(
+    folder,
+    views=2,
+    methods=METHODS,
+    seeds=(1, 2),
+    more=MappingProxyType({}),
+    steps=1,
+    instruction="paint it",
+    name="run",
+):
     """A run of two edits and so many seeds; every picture of a method has its colour.
 
-    ``more`` has further pictures of a method: their colours by what they show.
+    ``more`` has further pictures of a method: their colours by what they show. ``steps`` are the
+    first method's, ``name`` is that of the run's folder.
     """
-    (folder / "ball.yaml").write_text(yaml.safe_dump(SCENE))
+    edits = [{**e, "instruction": f"{instruction} {e['name']}"} for e in SCENE["edits"]]
+    (folder / "ball.yaml").write_text(yaml.safe_dump({**SCENE, "edits": edits}))
     names = ["yaw015", "yaw030", "yaw060", "yaw090"][:views]
     study = {
         "name": "people", "size": 32, "scenes": ["ball.yaml"], "seeds": list(seeds), "spp": 4,
-        "variants": {name: {"method": "by_view", "options": {"steps": k + 1}}
-                     for k, name in enumerate(METHODS) if name in methods},
+        "variants": {method: {"method": "by_view", "options": {"steps": k + steps}}
+                     for k, method in enumerate(METHODS) if method in methods},
         "probes": {"editing": list(methods)},
         "pictures": {"variants": list(methods), "views": names},
     }  # fmt: skip
     (folder / "people.yaml").write_text(yaml.safe_dump(study))
-    store = Store(folder / "run")
+    store = Store(folder / name)
     planned = plan(load_study(str(folder / "people.yaml")), store)
     store.write_study(expected(planned))
     colors = {name: (60 * k + 40, 200 - 60 * k, 90) for k, name in enumerate(METHODS)}

@@ -26,7 +26,7 @@ class Item:
     Attributes:
         scene, edit, seed: of the cells.
         instruction: in words.
-        content: hash of the scene and of all that decides its views.
+        content: hash of the scene, all that decides its views, and the instruction.
         before: by view, the file of the view before the edit.
         methods: by method and view, the file of the edited scene.
     """
@@ -61,15 +61,21 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
         InputError: there is none, a method that no run has, or runs that contradict each other.
     """
     items: dict[tuple[str, str, int], Item] = {}
+    first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> its cell and run
     for run in runs:
-        for key, one, method in _edited(run):
+        for key, one, method, cell in _edited(run):
             item = items.setdefault(key, one)
             if item.content != one.content:
                 raise InputError(
-                    f"{run}: {item.name}: another scene, size or set of views than in the runs"
-                    " before; build a page from runs of one study"
+                    f"{run}: {item.name}: another scene, size, set of views or instruction than in"
+                    " the runs before; build a page from runs of one study"
                 )
-            # A cell that several runs have is the same by its content.
+            former, former_run = first.setdefault((item.name, method), (cell, run))
+            if former != cell:
+                raise InputError(
+                    f"{run}: {item.name}: {method!r} has other settings than in {former_run}; give"
+                    " the variant another name in one of the studies"
+                )
             item.methods.setdefault(method, one.methods[method])
     available = list(dict.fromkeys(name for item in items.values() for name in item.methods))
     for name in methods or ():
@@ -91,14 +97,19 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
     return usable
 
 
-def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str]]:
-    """(scene, edit and seed; the cell as an item of its own; method) of a run's edited scenes."""
+def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
+    """(scene, edit and seed; the cell as an item of its own; method; the cell's id) of a run's
+    edited scenes.
+    """
     for cell in read_results(Store(run)).cells:
         record = cell.record
         if record is None or not isinstance(record.extra, EditResult):
             continue
         edit, spec = record.extra, record.spec
-        content = tuple(str(spec.get(key)) for key in ("scene", "size", "views", "spp"))
+        content = (
+            *(str(spec.get(key)) for key in ("scene", "size", "views", "spp")),
+            edit.instruction,
+        )
         item = Item(cell.scene, edit.name, cell.seed, edit.instruction, content)
         own: dict[str, Path] = {}
         for picture in record.pictures:
@@ -111,7 +122,7 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str]]:
             continue
         for method in cell.variants:
             item.methods = {method: own}
-            yield (cell.scene, edit.name, cell.seed), item, method
+            yield (cell.scene, edit.name, cell.seed), item, method, cell.id
 
 
 def read_picture(path: Path) -> bytes:

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from edited_run import write_run
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -129,6 +130,25 @@ def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
     done = build(run.root, "--out", tmp_path / "a", *arguments)
     assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 50}, "'alone' has other settings than in {first}; give the variant another"),
+        ({"instruction": "paint it bright"}, "instruction than in the runs before"),
+        ({"methods": ["alone", "warped"]}, None),  # the same cells
+    ],
+)
+def test_one_name_is_one_method_in_all_runs(tmp_path, changes, message):
+    first, other = write_run(tmp_path), write_run(tmp_path, **changes, name="other")
+    done = build(first.root, other.root, "--out", tmp_path / "a")
+    if message is None:
+        assert done.exit_code == 0, done.output
+        return
+    assert done.exit_code == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"attnwarp-eval: {other.root}: ")
+    assert message.format(first=first.root) in done.stderr
 
 
 def test_a_folder_that_is_no_run_and_a_missing_picture_are_one_line(run, tmp_path):
