@@ -56,8 +56,8 @@ class Inputs:
         prompt: what the edited scene should show.
         source_prompt: what the scene showed before.
         masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
-            distance, black does not.
-        background: sRGB in [0, 1] behind transparent pixels.
+            distance, black and transparent does not.
+        background: sRGB in [0, 1] behind transparent pixels of pictures.
     """
 
     renders: Path | None = None
@@ -154,7 +154,7 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Raised whenever the same pictures would give other figures."""
 
 
@@ -460,7 +460,9 @@ def _tasks(
     members = {figure: set(views.get(figure, ())) for figure in FIGURES}
 
     def read(group: str, names: Iterable[str]) -> dict[str, Picture]:
-        return {name: read_picture(folders[group][name], inputs.background) for name in names}
+        # Transparent parts of a mask count as little as black ones, whatever lies behind pictures.
+        background = (0.0, 0.0, 0.0) if group == "masks" else inputs.background
+        return {name: read_picture(folders[group][name], background) for name in names}
 
     def partners(
         group: str, names: Iterable[str], renders: Mapping[str, Picture]

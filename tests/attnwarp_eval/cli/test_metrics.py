@@ -401,6 +401,29 @@ def test_a_mask_leaves_out_what_is_black_and_divides_by_the_rest(data):
     assert list(views) == ["view1", "view2"]
 
 
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_transparent_parts_of_a_mask_do_not_count_over_any_background(data, background):
+    folder, arrays = data
+    cut_out = np.full((40, 48, 4), 255, np.uint8)
+    cut_out[..., 3] = 0
+    cut_out[10:20, 5:30, 3] = 255
+    write(folder / "masks" / "view1.png", cut_out)
+    done = call(
+        "metrics",
+        f"--renders={folder / 'renders'}",
+        f"--edited={folder / 'edited'}",
+        f"--mask={folder / 'masks'}",
+        f"--background={background}",
+        "--perceptual=none",
+        "--out",
+        folder / "out",
+    )
+    assert done.exit_code == 0, done.output
+    views = saved(folder)["metrics"]["edit.psnr_mean"]["views"]
+    a, b = (arrays[g]["view1"][10:20, 5:30].astype(float) / 255 for g in ("edited", "renders"))
+    assert views == {"view1": pytest.approx(-10 * math.log10(((a - b) ** 2).mean()), abs=1e-4)}
+
+
 def test_a_mask_acts_on_the_perceptual_distance_too(data, models):
     folder, arrays = data
     inside = np.zeros((40, 48), np.uint8)
