@@ -29,6 +29,9 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5
 
 MARKERS = "osD^vP*X"
 
+APART = 0.8
+"""Degrees between the intervals of two lines over yaw."""
+
 
 @contextmanager
 def drawing(
@@ -135,9 +138,10 @@ def lines(
     share: bool = False,
     log: bool = False,
     legend: bool = True,
+    apart: float = 0.0,
 ) -> None:
     """Means with their intervals as bars; undefined points are left out. A ``share`` is drawn from
-    0 to 1.
+    0 to 1. Lines that share their x are drawn ``apart``, in its unit, about where they belong.
 
     Example:
         >>> from pathlib import Path
@@ -155,7 +159,7 @@ def lines(
         x_values = np.asarray(line.x, dtype=float)[keep]
         low = np.array([v.low if v.bounded else v.mean for v in line.y])[keep]
         high = np.array([v.high if v.bounded else v.mean for v in line.y])[keep]
-        shift = (i - (len(series) - 1) / 2) * 0.8
+        shift = (i - (len(series) - 1) / 2) * apart
         bars = np.clip([mean[keep] - low, high - mean[keep]], 0, None)
         axes.errorbar(
             x_values + shift,

@@ -33,3 +33,12 @@ def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
             assert not one.get_window_extent().overlaps(other.get_window_extent())
         assert next(note for note in notes if note.get_text() == "alone").xyann == (5, 5)
     assert "variant 3" in (tmp_path / "front.svg").read_text()
+
+
+@pytest.mark.parametrize(("apart", "shifts"), [({}, (0, 0, 0)), ({"apart": 2.0}, (-2, 0, 2))])
+def test_lines_stand_where_their_numbers_are_or_apart_about_there(tmp_path, apart, shifts) -> None:
+    series = [charts.Line(name, [0.5, 1.0], [around(1.0), around(2.0)]) for name in "abc"]
+    with charts.drawing(tmp_path / "lines.svg") as (axes,):
+        charts.lines(axes, series, x="seconds", y="dB", title="fits", **apart)
+        for bars, shift in zip(axes.containers, shifts, strict=True):
+            np.testing.assert_allclose(bars.lines[0].get_xdata(), [0.5 + shift, 1.0 + shift])

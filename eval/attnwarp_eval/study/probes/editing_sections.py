@@ -181,6 +181,7 @@ def by_yaw(results: Results, probe: str, names: Sequence[str], layout: Layout) -
                 title=title,
                 share="same_answer" in metric,
                 legend=metric == list(BY_YAW)[-1],
+                apart=charts.APART,
             )
     tables = [
         Table(

@@ -219,7 +219,16 @@ class Warp(Probe[NoExtra]):
             ):
                 series = [charts.Line(name, *self._curve(results, name, metric)) for name in names]
                 x, y = "yaw from the source, degrees", "share"
-                charts.lines(axes, series, x=x, y=y, title=title, share=True, legend=axes is right)
+                charts.lines(
+                    axes,
+                    series,
+                    x=x,
+                    y=y,
+                    title=title,
+                    share=True,
+                    legend=axes is right,
+                    apart=charts.APART,
+                )
         drawn = Picture(
             "figures/masks-by-yaw.svg",
             "Both errors of the masks by yaw; means and 95 % intervals over scenes.",
