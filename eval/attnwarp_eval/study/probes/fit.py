@@ -300,16 +300,21 @@ class Fit(Probe[Curve]):
         return Picture("figures/fits.svg", "Accuracy against time as the fits proceed.")
 
     def _curve(self, results: Results, name: str, pick: Pick) -> tuple[list[float], list[Interval]]:
-        """CPU seconds and values at the evaluations that every scene has, without the one before
-        the first iteration.
+        """CPU seconds and values at the evaluations that every scene and seed has, without the one
+        before the first iteration.
         """
         curves: list[tuple[str, dict[int, Point]]] = [
-            (f"{scene}/{seed}", {point.iteration: point for point in record.extra.points})
-            for scene, seed, record in results.records(self.name, name)
+            (scene, {point.iteration: point for point in record.extra.points})
+            for scene, _, record in results.records(self.name, name)
         ]
         common = sorted(set.intersection(*({*curve} for _, curve in curves)) - {0})
         seconds = [sum(curve[k].cpu_seconds for _, curve in curves) / len(curves) for k in common]
-        values = [interval({scene: [pick(curve[k])] for scene, curve in curves}) for k in common]
+        values = []
+        for k in common:
+            by_scene: dict[str, list[float]] = {}
+            for scene, curve in curves:
+                by_scene.setdefault(scene, []).append(pick(curve[k]))
+            values.append(interval(by_scene))
         return seconds, values
 
 

@@ -1,10 +1,11 @@
-"""Curves of fits. Oracle: the seconds that the records hold."""
+"""Curves of fits. Oracles: the seconds that the records hold, and SciPy's t over the scenes' means."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import written_runs
+from scipy import stats
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.study.probes import probe
@@ -52,3 +53,12 @@ def test_curves_are_drawn_at_their_seconds(results, tmp_path, monkeypatch):
     assert len(drawn) > 2 * len(NAMES)
     for x in drawn:
         np.testing.assert_allclose(x, [*SECONDS.values()], rtol=1e-12)
+
+
+def test_intervals_of_curves_are_over_scenes_and_not_over_seeds(results):
+    _, values = probe("fit")._curve(results, NAMES[0], lambda point: point.psnr)
+    means = [np.mean(v) for v in PSNR.values()]
+    expected = stats.t.interval(0.95, 2, np.mean(means), stats.sem(means))
+    for value in values:
+        assert (value.low, value.high) == pytest.approx(expected, rel=1e-9)
+        assert (value.scenes, value.views) == (3, 9)
