@@ -60,9 +60,12 @@ def compare(
             write_json(json, as_json(result))
         _print(result)
     if result.regressed:
+        accept = "accept it with --update"
+        if baseline.is_dir():
+            accept = f"name {run} in its place, or keep a file: BASELINE.jsonl {run} --update"
         typer.echo(
             f"attnwarp-eval: {run}: a regression against {baseline}; if the change is meant,"
-            " accept it with --update",
+            f" {accept}",
             err=True,
         )
         raise Regression

@@ -57,12 +57,14 @@ class Row:
     Attributes:
         probe, variant, metric: what it is of.
         verdict: "equal" only where the margin shows it.
-        baseline, run: means over scenes of the means over views.
+        baseline, run: means over scenes of the means over the views that both sides define.
         difference: run - baseline, paired on scene and view; of absolute values where a figure is
             best at 0.
         adjusted_p: of the difference, for all tests of the comparison; NaN where none was made.
         worst: the view that got worse most (``scene/view/seed``), with its two values.
         undefined: views whose value was defined in the baseline only, in whatever seed.
+        beyond_margin: views of the same seed that got worse by more than the metric's margin; one
+            is enough for "worse", whatever the mean does.
     """
 
     probe: str
@@ -75,6 +77,7 @@ class Row:
     adjusted_p: float
     worst: tuple[str, float, float] | None
     undefined: int
+    beyond_margin: int = 0
 
 
 @dataclass(frozen=True)
@@ -317,19 +320,23 @@ class _Group:
             self.variant,
             self.key,
             judged or self._by_scenes(flat_before, adjusted_p, undefined),
-            _mean(self.before),
-            _mean(self.now),
+            *_means_of_shared(self.before, self.now),
             self.difference,
             adjusted_p,
             (worst, flat_before[worst], flat_now[worst]) if worst else None,
             undefined,
+            self._beyond_margin(flat_before) if exact else 0,
         )
+
+    def _beyond_margin(self, before: Mapping[str, float]) -> int:
+        limit = margin(self.key)
+        return sum(w > limit.around(before[name]) for name, w in self.worsening.items())
 
     def _exactly(self, before: Mapping[str, float], undefined: int) -> Verdict | None:
         """The verdict on equal computations, view by view; None where only a test can tell."""
         allowed = Margin(self.metric.atol, self.metric.rtol)
         limit = margin(self.key)
-        if undefined or any(w > limit.around(before[n]) for n, w in self.worsening.items()):
+        if undefined or self._beyond_margin(before):
             return "worse"
         now = _flat(self.now)
         if any(math.isnan(before[name]) and math.isfinite(now[name]) for name in self.worsening):
@@ -395,8 +402,19 @@ def _flat(table: ByView) -> dict[str, float]:
     }
 
 
-def _mean(table: ByView) -> float:
-    return _mean_of_defined([_mean_of_defined(views.values()) for views in table.values()])
+def _means_of_shared(before: ByView, now: ByView) -> tuple[float, float]:
+    """Means over scenes of the means over the views that both define; NaN without any."""
+    names = _flat(before).keys() & _flat(now).keys()
+    one, other = _flat(before), _flat(now)
+    shared = {n for n in names if math.isfinite(one[n]) and math.isfinite(other[n])}
+
+    def mean(table: ByView) -> float:
+        return _mean_of_defined(
+            _mean_of_defined(x for view, x in views.items() if f"{scene}/{view}" in shared)
+            for scene, views in table.items()
+        )
+
+    return mean(before), mean(now)
 
 
 def _mean_of_defined(values: Iterable[float]) -> float:

@@ -172,6 +172,10 @@ def _section(title: str, columns: list[str], rows: list[list[str]]) -> Section:
     return Section(title, text, [Table(columns, rows[:LONGEST])])
 
 
+def _views(count: int) -> str:
+    return "1 view is" if count == 1 else f"{count} views are"
+
+
 def _cells(row: Row) -> list[str]:
     difference = number(row.difference.mean)
     if row.difference.bounded:
@@ -181,8 +185,10 @@ def _cells(row: Row) -> list[str]:
     if row.worst is not None:
         name, before, now = row.worst
         worst = f"{name}: {number(before, 4)} -> {number(now, 4)}"
+    if row.beyond_margin and row.difference.views > 1:
+        worst += f" (beyond its margin in {row.beyond_margin} of {row.difference.views} views)"
     if row.undefined:
-        worst += f" ({row.undefined} views are undefined now)"
+        worst += f" ({_views(row.undefined)} undefined now)"
     means = [f"{number(value, 4)}" for value in (row.baseline, row.run)]
     if math.isfinite(row.difference.mean):
         difference += f" {unit}"

@@ -22,6 +22,7 @@ from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
 from attnwarp_eval.compare.judge import FEWEST_SCENES
 from attnwarp_eval.compare.snapshot import Figure, Measured, definition
+from attnwarp_eval.compare.write import document
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study import Store, load_study
@@ -107,7 +108,7 @@ PLANTED = {
     "half a pixel": (add_half_a_pixel, "worse  warp  corrected  warp.epe_median"),
     "a dropped metric": (drop_a_metric, "missing  spheres / warp / corrected / seed 0 / warp.epe"),
     "a dropped view": (drop_a_view, "warp.epe_median / yaw030  the run has no such view"),
-    "an undefined value": (undefine, "1 views are undefined now"),
+    "an undefined value": (undefine, "1 view is undefined now"),
     "a doubled counter": (double_a_counter, "pairs  51328 in the baseline, 102656 in the run"),
 }
 
@@ -167,6 +168,19 @@ def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
     path = run.parent / "new.jsonl"
     assert gate(path, run, "--update").exit_code == 3
     assert not path.exists()
+
+
+def test_figures_of_both_sides_are_of_the_same_views_and_a_single_bad_view_is_told():
+    def side(**values):
+        figures = {"warp.epe_median": Figure(1, values)}
+        return Snapshot("my", "", (Measured("bear", "warp", ("a",), 0, "", {}, figures),))
+
+    # One view got better, one worse, and one is undefined now: the mean of all would have improved.
+    (row,) = compare(side(a=1.0, b=8.0, c=9.0), side(a=3.0, b=5.0, c=math.nan)).rows
+    assert (row.baseline, row.run, row.difference.mean) == (4.5, 4.0, -0.5)
+    assert (row.verdict, row.beyond_margin, row.undefined) == ("worse", 1, 1)
+    section = document(compare(side(a=1.0, b=8.0), side(a=3.0, b=5.0))).sections[0]
+    assert section.tables[0].rows[0][-1].endswith("(beyond its margin in 1 of 2 views)")
 
 
 def test_a_cell_that_computes_something_else_is_a_regression(stored, run):
