@@ -149,7 +149,7 @@ def edit_dataset(
     if result.gaussians.kind == "2d":
         # Other programs take no splats of two scales.
         write_ply(out / VIEWER_PLY, result.gaussians, third_scale=THIRD_SCALE)
-    return result, write_page(Folder(out, views.cameras))
+    return result, write_page(Folder(out, views.cameras), images)
 
 
 def _fitted(

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
+
 from attnwarp.io.file import write_atomically
+from attnwarp.io.images import encode_png
 from attnwarp.propagate.folder import MANIFEST, VIEWER_PLY, Folder
-from attnwarp.propagate.pictures import SOURCE_COLORS
+from attnwarp.propagate.pictures import SOURCE_COLORS, resized, to_bytes
+from attnwarp.propagate.scene import to_float
 
 PAGE = "index.html"
 
 MOST_ROWS = 12
-"""Views with all their pictures on the page; the folder has the rest."""
+"""Edited views on the page; the folder has the rest."""
+
+MOST_UNEDITED = 4
+"""Views on the page that were not edited; the folder has the rest."""
+
+Photographs = Mapping[str, npt.NDArray[Any]]
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; }
@@ -32,8 +41,12 @@ figcaption { font-size: .82em; opacity: .8; }
 """
 
 
-def write_page(folder: Folder) -> Path:
+def write_page(folder: Folder, images: Sequence[npt.NDArray[Any]]) -> Path:
     """Write ``index.html`` of a finished edit from its folder's files.
+
+    Args:
+        folder: of the edit.
+        images: (H, W, 3) photograph of each view, sRGB, uint8, uint16 or floating in [0, 1].
 
     Returns:
         Its path.
@@ -43,6 +56,7 @@ def write_page(folder: Folder) -> Path:
     source = manifest["source"]
     targets = [name for stage in manifest["stages"] for name in stage]
     chain = manifest.get("chain", [])
+    photographs = dict(zip(folder.names, images, strict=True))
     about = {name: folder.read_json(f"views/{name}.json") for name in [*chain, *targets]}
     parts = [
         f"<h1>{escape(manifest['instruction'])}</h1>",
@@ -50,30 +64,28 @@ def write_page(folder: Folder) -> Path:
         f"<h2>Source view: {escape(source)}</h2>",
         _row(
             folder,
-            ("before, render", f"renders/before/{source}.png"),
+            *_before(folder, source, photographs, "source.png"),
             ("edit of the source", "source.png"),
             ("its attention features, three principal components", "features.png"),
             ("edited scene", f"renders/after/{source}.png"),
         ),
-        *_chain(folder, source, chain, about),
+        *_chain(folder, source, chain, about, photographs),
         "<h2>Edited views</h2>",
-        f"<p>{MOST_ROWS} of {len(targets)}; the folder has all.</p>"
-        if len(targets) > MOST_ROWS
-        else "",
+        _left_out(targets, MOST_ROWS),
     ]
     for name in _spread(targets, MOST_ROWS):
         parts += [
             f"<h3>{escape(name)}, stage {about[name]['stage']}: {_shares(about[name])}</h3>",
-            _target(folder, name),
+            _target(folder, name, photographs),
         ]
     rest = [name for name in folder.names if name not in {source, *chain, *targets}]
     if rest:
-        parts.append("<h2>Views that were not edited</h2>")
-        for name in _spread(rest, 4):
+        parts += ["<h2>Views that were not edited</h2>", _left_out(rest, MOST_UNEDITED)]
+        for name in _spread(rest, MOST_UNEDITED):
             parts.append(
                 _row(
                     folder,
-                    (f"{name}, before", f"renders/before/{name}.png"),
+                    (f"{name}, before, render", f"renders/before/{name}.png"),
                     ("edited scene", f"renders/after/{name}.png"),
                 )
             )
@@ -92,7 +104,13 @@ def write_page(folder: Folder) -> Path:
     return path
 
 
-def _chain(folder: Folder, source: str, chain: Sequence[str], about: dict[str, Any]) -> list[str]:
+def _chain(
+    folder: Folder,
+    source: str,
+    chain: Sequence[str],
+    about: dict[str, Any],
+    photographs: Photographs,
+) -> list[str]:
     """The further sources, each with what it got from those before."""
     if not chain:
         return []
@@ -106,7 +124,8 @@ def _chain(folder: Folder, source: str, chain: Sequence[str], about: dict[str, A
         f"<p>Edited in this order, each with features of those before. In the masks: {colors}</p>",
     ]
     for name in chain:
-        parts += [f"<h3>{escape(name)}: {_shares(about[name])}</h3>", _target(folder, name)]
+        heading = f"<h3>{escape(name)}: {_shares(about[name])}</h3>"
+        parts += [heading, _target(folder, name, photographs)]
     return parts
 
 
@@ -120,11 +139,24 @@ def _shares(about: dict[str, Any]) -> str:
     return f"sources of its pixels: {each or 'none'}"
 
 
-def _target(folder: Folder, name: str) -> str:
+def _before(
+    folder: Folder, name: str, photographs: Photographs, edited: str
+) -> tuple[tuple[str, str | bytes], ...]:
+    """A view before its edit: its photograph as the editor saw it, and the splats' render."""
+    h, w = folder.read_picture(edited).shape[:2]
+    seen = to_bytes(resized(to_float(photographs[name]), (h, w)))
+    return (
+        ("before, photograph", encode_png(seen)),
+        ("before, render", f"renders/before/{name}.png"),
+    )
+
+
+def _target(folder: Folder, name: str, photographs: Photographs) -> str:
+    edited = f"views/{name}.png"
     return _row(
         folder,
-        ("before, render", f"renders/before/{name}.png"),
-        ("edited view", f"views/{name}.png"),
+        *_before(folder, name, photographs, edited),
+        ("edited view", edited),
         ("mask", f"masks/{name}.png"),
         ("warped features", f"features/{name}.png"),
         ("edited scene", f"renders/after/{name}.png"),
@@ -175,19 +207,27 @@ def _table(head: tuple[str, str], rows: Sequence[tuple[str, Any]]) -> str:
     return f"<table>{f'<tr>{top}</tr>' if top else ''}{body}</table>"
 
 
-def _row(folder: Folder, *pictures: tuple[str, str]) -> str:
-    """Pictures side by side; those that an edit does not have are left out."""
+def _row(folder: Folder, *pictures: tuple[str, str | bytes]) -> str:
+    """Pictures side by side, each the name of a file or a PNG; files that an edit does not have are
+    left out.
+    """
     figures = "".join(
-        f'<figure><img alt="{escape(text)}" src="{_data(folder.path / name)}">'
+        f'<figure><img alt="{escape(text)}" src="{_data(folder, picture)}">'
         f"<figcaption>{escape(text)}</figcaption></figure>"
-        for text, name in pictures
-        if folder.has(name)
+        for text, picture in pictures
+        if isinstance(picture, bytes) or folder.has(picture)
     )
     return f'<div class="row">{figures}</div>'
 
 
-def _data(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+def _data(folder: Folder, picture: str | bytes) -> str:
+    png = picture if isinstance(picture, bytes) else (folder.path / picture).read_bytes()
+    return "data:image/png;base64," + base64.b64encode(png).decode()
+
+
+def _left_out(names: Sequence[str], most: int) -> str:
+    """Says that not all views are on the page, where that is so."""
+    return f"<p>{most} of {len(names)}; the folder has all.</p>" if len(names) > most else ""
 
 
 def _spread(names: Sequence[str], most: int) -> list[str]:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -27,7 +28,9 @@ from attnwarp.cli.main import app
 from attnwarp.errors import InputError
 from attnwarp.io import Dataset, read_image, read_ply, write_ply, write_transforms
 from attnwarp.io.images import encode_png
+from attnwarp.propagate import page as page_of_edits
 from attnwarp.propagate.command import mask_files, read_mask, read_over_black
+from attnwarp.propagate.folder import Folder
 
 runner = CliRunner()
 QUICK = (
@@ -99,7 +102,7 @@ class Page(HTMLParser):
             self.other.append(values)
 
 
-def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_path):
+def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_path, monkeypatch):
     result = run(place, tmp_path, "--ply", place / "splats.ply", "--source", "v2.png")
     assert result.exit_code == 0, result.output
     assert result.stdout.splitlines()[-1] == str(tmp_path / "index.html")
@@ -109,14 +112,31 @@ def test_it_leaves_an_edited_ply_and_a_page_that_needs_no_other_file(place, tmp_
     assert np.array_equal(other.scales[:, :2], edited.scales)
     assert np.allclose(other.scales[:, 2], 1e-6)
     assert not np.array_equal(edited.sh, read_ply(place / "splats.ply").sh)
-    page = Page((tmp_path / "index.html").read_text())
+    text = (tmp_path / "index.html").read_text()
+    page = Page(text)
     assert page.other == []
     files = {path.read_bytes() for path in tmp_path.rglob("*.png")}
     assert set(page.pictures) <= files
-    # Source: 4 pictures; two edited views: 5 each; two views that were not edited: 2 each.
-    assert len(page.pictures) == 4 + 2 * 5 + 2 * 2
+    # Source: 5 pictures; two edited views: 6 each; two views that were not edited: 2 each.
+    assert len(page.pictures) == 5 + 2 * 6 + 2 * 2
     assert (tmp_path / "source.png").read_bytes() in page.pictures
     assert not (tmp_path / "fit").exists()
+    assert "the folder has all" not in text
+    # Photographs that are no renders are beside the source and the edited views, of whose size they are.
+    negatives = [255 - read_image(place / "data" / "images" / c.name) for c in cameras()]
+    monkeypatch.setattr(page_of_edits, "MOST_UNEDITED", 1)
+    text = page_of_edits.write_page(Folder(tmp_path, cameras()), negatives).read_text()
+    stages = json.loads((tmp_path / "manifest.json").read_text())["stages"]
+    shown = ["v2", *(name for stage in stages for name in stage)]
+    pixels = [
+        cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR_RGB)
+        for png in Page(text).pictures
+        if png not in files
+    ]
+    expected = [negatives[Folder(tmp_path, cameras()).names.index(name)] for name in shown]
+    assert len(pixels) == 3 and all(map(np.array_equal, pixels, expected))
+    rest = text[text.index("<h2>Views that were not edited") : text.index("<h2>Time")]
+    assert "<p>1 of 2; the folder has all.</p>" in rest and len(Page(rest).pictures) == 2
 
 
 def test_the_page_shows_the_further_sources_in_their_order(place, tmp_path):
