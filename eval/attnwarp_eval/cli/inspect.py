@@ -86,6 +86,7 @@ def inspect(
             check_web()
         from attnwarp.errors import InputError
         from attnwarp_eval.inspect.capture import one_of
+        from attnwarp_eval.inspect.gl import has_display
         from attnwarp_eval.inspect.pair import COLORINGS, EDIT_DISAGREEMENT
         from attnwarp_eval.inspect.scene import State
 
@@ -117,7 +118,8 @@ def inspect(
 
             write_export(export, chosen, state, picked)
             typer.echo(export)
-        if screenshot is None and export is not None and not web:
+        answered = export is not None or (picked is not None and not has_display())
+        if screenshot is None and answered and not web:
             return
         from attnwarp_eval.inspect.window import Window
 

@@ -14,6 +14,11 @@ OSMESA = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 WITHOUT_DRAWING = "--export FILE.glb or FILE.vtp needs no OpenGL, --pixel prints the numbers"
 
 
+def has_display() -> bool:
+    """Whether this machine names a display for windows."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def require_gl(*, display: bool) -> None:
     """Refuse to draw where VTK would crash, or would draw into nothing.
 
@@ -25,7 +30,7 @@ def require_gl(*, display: bool) -> None:
     Raises:
         InputError: no display, or no OpenGL.
     """
-    if display and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if display and not has_display():
         raise InputError(
             "inspect: this machine has no display; draw a picture with --screenshot FILE, serve a"
             " browser with --web, or write a file to share with --export FILE.html"

@@ -390,6 +390,13 @@ def test_the_command_draws_and_explains(tmp_path):
     assert pyvista.read(out).dimensions[0] > 1000
 
 
+def test_without_a_display_the_numbers_of_a_pixel_are_the_answer(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    done = invoke("spheres", "--size", SIZE, "--view", "yaw060", "--pixel", "30,40")
+    assert done.exit_code == 0 and "pixel (30, 40)" in done.stdout and not done.stderr
+
+
 def test_the_command_refuses_by_name(tmp_path, folders, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
