@@ -17,6 +17,15 @@ from attnwarp.cli.options import (
 )
 from attnwarp.cli.shell import assignments, check_out, clear_errors, use_threads
 from attnwarp.editing.command import DeviceOption, EditorOption, InstructionOption, ThreadsOption
+from attnwarp.editing.small import check_words, guide_of
+
+PRESETS = {
+    "by_view": ("default",),
+    "igs2gs": ("default", "released", "improved"),
+    "dge": ("default", "released"),
+    "gaussctrl": ("default", "paper", "released", "random"),
+}
+"""What a person may type for a method's choices; named here to refuse others without torch."""
 
 
 class BaselineMethod(StrEnum):
@@ -59,6 +68,11 @@ def baseline(
     with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
         changes = assignments(change or [], {})
         check_out(out)
+        check_words(instruction)
+        guide_of(editor)  # refuses what is no editor
+        from attnwarp import check
+
+        check.one_of(preset, PRESETS[method.value], "preset")
         import attnwarp.baselines.settings
 
         settings = attnwarp.baselines.settings.preset(method.value, preset, **changes)

@@ -44,6 +44,7 @@ def convert(
         suffix = out.suffix.lower()
         if suffix not in (".ply", ".splat"):
             raise ValueError(f"OUT: got {out}, expected a name ending in .ply or .splat")
+        _check_start(source)
         from attnwarp.io import THIRD_SCALE, write_ply, write_splat
         from attnwarp.io.file import check_other
 
@@ -63,6 +64,17 @@ def convert(
         else:
             write_ply(out, splats, third_scale=third_scale, coordinates=coordinates.value)
         typer.echo(f"{out}: {len(splats)} splats")
+
+
+def _check_start(path: Path) -> None:
+    """Refuse what does not begin as a PLY does, before the seconds of torch's import."""
+    if path.suffix.lower() == ".splat" or not path.is_file():
+        return
+    with path.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            raise ValueError(
+                f"{path}: not a PLY file, which begins with 'ply'; expected splats, .ply or .splat"
+            )
 
 
 @reading_options()

@@ -29,6 +29,7 @@ from attnwarp.editing.command import (
     WhereOption,
     check_segmenter,
 )
+from attnwarp.editing.small import check_words, guide_of
 from attnwarp.errors import InputWarning
 
 NO_FEATURES = 0.001
@@ -116,6 +117,11 @@ def edit(
         changes |= assignments(change or [], {**flags, "method": "--each-view-alone"})
         check_segmenter(segmenter, words)
         check_out(out)
+        check_words(instruction)
+        guide_of(editor)  # refuses what is no editor
+        from attnwarp import check
+
+        check.one_of(preset, PRESETS, "preset")
 
         import attnwarp.propagate.settings
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from attnwarp.editing.small import check_words, guide_of
+
 if TYPE_CHECKING:
     from attnwarp.editing.editor import Image
 
@@ -78,6 +80,9 @@ def edit_image(
     if mask_out is not None and words is None:
         raise ValueError("--mask: needs --where, which makes the mask")
     check_segmenter(segmenter, words)
+    check_words(instruction)
+    if guide_of(editor) != "picture":
+        raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
     from attnwarp.io.file import check_other
 
     for path in (out, sheet, mask_out):
@@ -103,8 +108,6 @@ def edit_image(
     guidance = {"text_guidance": text_guidance, "image_guidance": image_guidance}
     given = {name: value for name, value in guidance.items() if value is not None}
     model = load_editor(editor, device=device, **given)
-    if model.guide != "picture":
-        raise ValueError(f"--editor {editor}: takes depth maps, expected one that takes a picture")
     check_instruction(editor, model, instruction)
     torch.set_num_threads(thread_count(model, threads))
     image = _fit(image, size or model.unet.config.sample_size * model.factor, 4 * model.factor)

@@ -88,6 +88,16 @@ def thread_count(editor: Any, asked: int | None = None) -> int:
     return 1 if small else core_count()
 
 
+def check_words(text: str) -> None:
+    """Refuse an instruction without words, before any editor is loaded.
+
+    Raises:
+        InputError: no words.
+    """
+    if not text.strip():
+        raise InputError("instruction: is empty, expected words such as 'make it red'")
+
+
 def check_instruction(name: str, editor: InstructPix2Pix | DepthControlNet, text: str) -> None:
     """Refuse an instruction that an editor cannot take, and warn of words that it was not trained
     on.
@@ -101,8 +111,7 @@ def check_instruction(name: str, editor: InstructPix2Pix | DepthControlNet, text
         InputError: no words.
         ValueError: more words than the text encoder takes.
     """
-    if not text.strip():
-        raise InputError("instruction: is empty, expected words such as 'make it red'")
+    check_words(text)
     editor.check_text(text)
     unknown = unknown_words(editor, text) if name in bundled() else []
     if unknown:

@@ -19,7 +19,8 @@ from imported_modules import modules_after
 from plyfile import PlyData
 from typer.testing import CliRunner
 
-from attnwarp import Camera, Gaussians
+from attnwarp import Camera, Gaussians, baselines
+from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
 from attnwarp.render import render
@@ -100,6 +101,7 @@ def test_help_of_every_command_imports_nothing_heavy():
     code = """
 from typer.main import get_command
 from typer.testing import CliRunner
+from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 names = sorted(get_command(app).commands)
 assert {"fit", "render", "edit", "edit-image", "convert"} <= set(names)
@@ -109,6 +111,39 @@ for name in names:
     heavy = {"torch", "numba", "numpy", "cv2", "scipy", "diffusers", "transformers"}
     modules = modules_after(code)
     assert "attnwarp.cli.main" in modules and not modules & heavy
+
+
+def test_mistyped_words_are_answered_before_anything_heavy_is_imported(tmp_path):
+    garbage = tmp_path / "garbage.ply"
+    garbage.write_bytes(b"hello, this is a text")
+    edit = ["edit", "data", "--out", str(tmp_path / "out"), "--instruction"]
+    image = ["edit-image", "a.png", "--out", str(tmp_path / "a.png"), "--instruction"]
+    more = ["--ply", "a.ply", "--out", str(tmp_path / "out"), "--instruction"]
+    dge = ["baseline", "dge", "data", *more]
+    wrong = {
+        "instruction: is empty": [[*edit, " "], [*image, " "], [*dge, " "]],
+        "editor 'smal': neither": [[*c, "red", "--editor", "smal"] for c in (edit, image, dge)],
+        "takes depth maps": [[*image, "red", "--editor", "small-depth"]],
+        "preset: got 'paper_'": [[*c, "red", "--preset", "paper_"] for c in (edit, dge)],
+        "not a PLY": [["convert", str(garbage), str(tmp_path / "a.splat")]],
+    }
+    code = f"""
+from typer.testing import CliRunner
+from attnwarp.cli import baseline
+from attnwarp.cli.main import app
+for message, calls in {wrong!r}.items():
+    for call in calls:
+        done = CliRunner().invoke(app, call)
+        assert done.exit_code == 2 and message in done.stderr, (call, done.stderr)
+"""
+    modules = modules_after(code)
+    assert "attnwarp.cli.main" in modules and not modules & {"torch", "cv2", "diffusers"}
+
+
+def test_presets_of_the_baselines_are_those_of_the_library():
+    assert {name: set(names) for name, names in baseline.PRESETS.items()} == {
+        name: set(presets) for name, presets in baselines.PRESETS.items()
+    }
 
 
 def test_fit_and_render_do_what_they_say(data, tmp_path):
@@ -275,16 +310,14 @@ def test_a_fit_that_is_stopped_keeps_what_it_has_and_goes_on(data, tmp_path, num
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fit", "nowhere", "--out", "{out}"], "nowhere: no such file or folder"),
+        # No name of a scene: no hint.
+        (["fit", "nowhere", "--out", "{out}"], "nowhere: no such file or folder\n"),
         (["fit", "bear", "--out", "{out}"], "for a scene: attnwarp-eval scenes export bear DIR"),
         (
             ["fit", "scenes/bear.yaml", "--out", "{out}"],
             "for a scene: attnwarp-eval scenes export scenes/bear.yaml DIR",
         ),
-        (
-            ["fit", "{data}/none", "--out", "{out}"],
-            "none: no such file or folder\n",
-        ),  # no name of a scene: no hint
+        (["fit", "{data}/none", "--out", "{out}"], "none: no such file or folder\n"),
         (["fit", "{data}", "--out", "{out}", "--set", "lr_mean=1"], "did you mean 'lr_means'"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim"], "expected NAME=VALUE"),
         (["fit", "{data}", "--out", "{out}", "--set", "ssim=2"], "ssim: got 2"),
