@@ -239,7 +239,10 @@ class Recording:
 
     plan: RecordingPlan
     timesteps: list[float] = field(default_factory=list)
-    _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict, repr=False)
+    _features: dict[tuple[float, str], Tensor | Path] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Recording({len(self.timesteps)} steps so far of: {self.plan})"
 
     @functools.cached_property
     def _folder(self) -> Path:

@@ -67,6 +67,15 @@ class Correspondence:
             if getattr(self, name).dtype != torch.float64:
                 raise ValueError(f"{name}: got {getattr(self, name).dtype}, expected float64")
 
+    def __repr__(self) -> str:
+        return f"Correspondence({self.sizes}, {share_of(self.defined)} defined)"
+
+    @property
+    def sizes(self) -> str:
+        """(H, W) of the target and of the source, such as "(48, 64) <- (48, 64)"."""
+        target, source = ((c.height, c.width) for c in (self.target, self.source))
+        return f"{target} <- {source}"
+
     @property
     def z(self) -> Tensor:
         """(H, W) depth of the points in the source camera, of either sign; NaN without a target
@@ -83,6 +92,11 @@ class Correspondence:
     def target_points(self) -> Tensor:
         """(H, W, 3) the same surface points in the target camera's axes."""
         return _directions(self.target, self.pixel_centers) * self.target_depth[..., None]
+
+
+def share_of(mask: Tensor) -> str:
+    """How much of a mask is True, such as "48 %"."""
+    return f"{100 * float(mask.double().mean()):.0f} %"
 
 
 def correspond(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from attnwarp.warp.depth import Array
 
 
@@ -14,7 +16,7 @@ class Surface:
     Args:
         depth: (H, W) along the optical axis, NaN where undefined.
         normal: (H, W, 3) world normals of either sign and any length, NaN or zero where undefined.
-        alpha: (H, W) in [0, 1].
+        alpha: (H, W) in [0, 1]; None is opaque everywhere.
         image: (H, W, C) sRGB in [0, 1], before any edit.
         counters: how much work it was to render, see :class:`attnwarp.render.Render`.
 
@@ -30,7 +32,12 @@ class Surface:
     normal: Array | None = None
     alpha: Array | None = None
     image: Array | None = None
-    counters: dict[str, int] = field(default_factory=dict, repr=False)
+    counters: dict[str, int] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        parts = ("depth", "normal", "alpha", "image")
+        given = ", ".join(part for part in parts if getattr(self, part) is not None)
+        return f"Surface({tuple(np.shape(self.depth))}: {given})"
 
 
 def needed(surface: Surface | None, view: str, part: str, rule: str) -> Array:

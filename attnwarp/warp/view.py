@@ -20,6 +20,7 @@ from attnwarp.warp.correspondence import (
     correspond_at,
     in_bounds,
     layer_size,
+    share_of,
 )
 from attnwarp.warp.depth import Array
 from attnwarp.warp.features import Backend, FeatureWarp
@@ -72,7 +73,12 @@ class WarpedView:
     target: Surface
     source: Surface | None = None
     backend: Backend = "auto"
-    _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict, repr=False)
+    _at: dict[tuple[int, ...], FeatureWarp] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        rules = ", ".join(f"{name} {share_of(rule)}" for name, rule in self.rules.items())
+        sizes = self.correspondence.sizes
+        return f"WarpedView({sizes}, mask {share_of(self.mask)}; rules: {rules})"
 
     def at(
         self, size: tuple[int, int], *, source_size: tuple[int, int] | None = None
@@ -147,7 +153,8 @@ def warp_surfaces(
     Args:
         source, target: the cameras.
         target_surface: what the target sees; its normals are needed by the normal tests, its image
-            by the photometric.
+            by the photometric. The rule ``opaque`` takes a view without alpha, target or source,
+            for opaque everywhere.
         source_surface: what the source sees; needed by depth agreement (depth) and the photometric
             test (image).
         settings: which rules, and how. ``gaussian_filter``, ``depth`` and ``depth_statistic``
@@ -199,7 +206,7 @@ def warp_surfaces(
             settings, correspondence, mask, rules, target_surface, source_surface, backend
         )
         if warn_empty:
-            _warn_if_empty(view)
+            _warn_if_empty(view, NO_DEPTH)
         return view
     correspondence = correspond(
         source,
@@ -251,7 +258,7 @@ def warp_surfaces(
         settings, correspondence, mask, rules, target_surface, source_surface, backend
     )
     if warn_empty:
-        _warn_if_empty(view)
+        _warn_if_empty(view, NO_DEPTH)
     return view
 
 
@@ -344,7 +351,7 @@ def warp_view(
     )
     # Where a filter left splats out, it may be what emptied the view.
     if warn_empty and filtered is gaussians:
-        _warn_if_empty(view)
+        _warn_if_empty(view, UNSEEN)
     return view
 
 
@@ -426,13 +433,17 @@ def _check_pictures(
             )
 
 
-def _warn_if_empty(view: WarpedView) -> None:
+UNSEEN = "the target sees no surface; check"
+NO_DEPTH = "the target's depth is nowhere finite and above zero; check the depth map, and"
+
+
+def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
     if view.rules["defined"].any():
         return
     surface = torch.isfinite(view.correspondence.target_depth).any()
-    reason = "every point lies behind the source" if surface else "the target sees no surface"
+    reason = "every point lies behind the source; check" if surface else without_surface
     warnings.warn(
-        f"no pixel of the target has a position in the source: {reason}; check world_to_camera of"
+        f"no pixel of the target has a position in the source: {reason} world_to_camera of"
         " both: from world to camera, not camera-to-world; OpenCV axes (x right, y down, z"
         " forward), not OpenGL's",
         InputWarning,

@@ -105,6 +105,7 @@ def test_a_recording_holds_what_the_processors_return(size):
                     recording.features(timestep, layer, branch), outputs[step][row : row + 1]
                 )
     assert recording.timesteps == [981.0, 481.0]
+    assert repr(recording) == f"Recording(2 steps so far of: {plan})" and len(repr(recording)) < 150
 
 
 @pytest.mark.parametrize("rows", [1, 3])

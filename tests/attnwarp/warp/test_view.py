@@ -338,6 +338,35 @@ def test_a_view_without_a_position_says_what_to_check_and_why():
         with pytest.warns(UserWarning, match=f"every point lies behind the source{remedy}") as got:
             warp_surfaces(behind, ahead, wall, None, settings, backend=backend)
         assert [warning.filename for warning in got] == [__file__]
+        message = "depth is nowhere finite and above zero; check the depth map, and world_to_camera"
+        with pytest.warns(UserWarning, match=message):
+            nothing = Surface(np.full((16, 16), np.nan))
+            warp_surfaces(ahead, ahead, nothing, None, settings, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_view_without_alpha_is_opaque_everywhere(backend):
+    camera = orbit(0, size=8)
+    settings = preset("corrected", depth_agreement=False, normal_test="none", opaque=0.5)
+    depth = np.full((8, 8), 2.0)
+    view = warp_surfaces(camera, camera, Surface(depth), None, settings, backend=backend)
+    assert view.rules["opaque"].all()
+    clear = Surface(depth, alpha=np.zeros((8, 8)))
+    view = warp_surfaces(camera, camera, clear, None, settings, backend=backend)
+    assert not view.rules["opaque"].any()
+
+
+def test_what_a_notebook_prints_is_one_short_line():
+    camera = Camera(np.array([[8.0, 0, 4], [0, 8, 3], [0, 0, 1]]), np.eye(4), 8, 6)
+    depth = np.full((6, 8), 2.0)
+    depth[:3] = np.nan
+    surface = Surface(depth, alpha=np.ones((6, 8)))
+    settings = preset("corrected", depth_agreement=False, normal_test="none")
+    view = warp_surfaces(camera, camera, surface, None, settings)
+    assert repr(surface) == "Surface((6, 8): depth, alpha)"
+    assert repr(view.correspondence) == "Correspondence((6, 8) <- (6, 8), 50 % defined)"
+    assert repr(view).startswith("WarpedView((6, 8) <- (6, 8), mask 50 %; rules: defined 50 %, ")
+    assert len(repr(view)) < 150
 
 
 def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an_array():
