@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def stability(
     case: Annotated[
-        list[str] | None, typer.Option(help="Show one case with its sweep, and run no other.")
+        list[str] | None, typer.Option(help="Print one case with its sweep, and write nothing.")
     ] = None,
     list_: Annotated[bool, typer.Option("--list", help="Name the cases, and run none.")] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Three levels of each case.")] = False,
@@ -32,6 +32,7 @@ def stability(
 
     Killed half-way and started again, it goes on where it was.
     """
+    from attnwarp.errors import InputError
     from attnwarp_eval import stability
 
     with clear_errors():
@@ -40,6 +41,9 @@ def stability(
                 typer.echo(f"{hard.number:2}  {hard.name:24} {hard.title}")
             return
         chosen = [stability.hard_case(name) for name in case or ()]
+        for option, given in (("--out", out is not None), ("--jobs", jobs > 1)):
+            if chosen and given:
+                raise InputError(f"{option}: --case prints here and writes nothing; leave it out")
     failed = _show(chosen, quick) if chosen else _study(quick, out, jobs)
     for line in failed:
         typer.echo(f"attnwarp-eval: {line}", err=True)
@@ -48,13 +52,13 @@ def stability(
 
 
 def _show(chosen: list[Case], quick: bool) -> list[str]:
-    """Print the sweeps of these cases; return what fails."""
+    """Print the sweeps of these cases with their verdict; return what fails."""
     import textwrap
 
     from rich.console import Console
 
     from attnwarp_eval.document.write import terminal
-    from attnwarp_eval.study.probes.stability import Swept, case_table, verdict_lines
+    from attnwarp_eval.study.probes.stability import Swept, case_table, must_hold, verdict_lines
 
     console = Console()
     lines: list[str] = []
@@ -70,12 +74,20 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
         for line in textwrap.wrap(about, width=min(console.width, 100)):
             typer.echo(line)
         for direction in hard.bounds:
-            table = case_table([sweep for sweep in swept if sweep.way.direction == direction])
+            part = [sweep for sweep in swept if sweep.way.direction == direction]
+            table = case_table(part)
             table.caption = ""
+            for number, row in enumerate(table.rows):
+                if any(must_hold(sweep.outcomes[number]) for sweep in part):
+                    row[0] += " *"
             console.print(terminal(table))
         for message in dict.fromkeys(o.refusal for s in swept for o in s.outcomes if o.refusal):
             typer.echo(f"refused: {message}")
-        lines += verdict_lines(swept)
+        failed = verdict_lines(swept)
+        typer.echo("* must hold, or be refused; ! does not though it must; ~ a harder level breaks")
+        if not failed:
+            typer.echo(f"{hard.name} holds at every required level")
+        lines += failed
     return lines
 
 

@@ -334,6 +334,14 @@ def test_the_command_lists_and_shows_cases_and_fails_where_one_breaks(monkeypatc
     assert shown.exit_code == 0, shown.output
     assert "Oracle: pinhole projection in mpmath" in shown.output.replace("\n", " ")
     assert "refused: world_to_camera: rotation is not orthonormal" in shown.output
+    lines = shown.output.splitlines()
+    assert lines[-2].startswith("* must hold, or be refused; ! does not")
+    assert lines[-1] == "not_a_rotation holds at every required level"
+    # What is no rotation by 1e-3 must be refused, and so has its asterisk.
+    assert "0.001 *" in shown.output
+    for option in (["--out", "folder"], ["--jobs", "2"]):
+        done = runner.invoke(app, ["stability", "--case", "not_a_rotation", *option])
+        assert done.exit_code == 2 and f"{option[0]}: --case prints here" in done.output
     unknown = runner.invoke(app, ["stability", "--case", "nedle"])
     assert unknown.exit_code == 2 and "did you mean 'needle'" in unknown.output
 

@@ -72,7 +72,7 @@ class Swept:
     @property
     def failures(self) -> list[Outcome]:
         """Levels that had to hold and do not."""
-        return [o for o in self.outcomes if o.verdict == "breaks" and _must_hold(o)]
+        return [o for o in self.outcomes if o.verdict == "breaks" and must_hold(o)]
 
     @property
     def end(self) -> Outcome | None:
@@ -80,7 +80,8 @@ class Swept:
         return next((o for o in self.outcomes if o.verdict != "holds"), None)
 
 
-def _must_hold(outcome: Outcome) -> bool:
+def must_hold(outcome: Outcome) -> bool:
+    """Whether a level is required, as a result or as a refusal."""
     return outcome.required or outcome.must_refuse
 
 
@@ -426,5 +427,5 @@ def _cell(outcome: Outcome) -> str:
     else:
         text = "accepted" if outcome.must_refuse else _error(outcome.error)
     if outcome.verdict == "breaks":
-        return f"{text} {'!' if _must_hold(outcome) else '~'}"
+        return f"{text} {'!' if must_hold(outcome) else '~'}"
     return text
