@@ -335,7 +335,8 @@ class _Run:
             self.iterate()
             self.seconds += time.perf_counter() - wall
             self.cpu_seconds += time.process_time() - cpu
-            if self.iteration % s.evaluate_every == 0:
+            # The last before it is shown, so that what stays on a screen is the result's.
+            if self.iteration % s.evaluate_every == 0 or self.iteration == s.iterations:
                 self.evaluate()
             if watch is not None:
                 watch(self.step())

@@ -150,6 +150,14 @@ def test_the_folder_always_holds_splats_that_can_be_read(scene, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [CHECKPOINT, SPLATS]
 
 
+def test_the_last_step_that_is_shown_has_the_results_own_evaluation(scene):
+    start, settings = begin(scene, iterations=3, evaluate_every=1000, **FAST)
+    shown = []
+    result = fit(start, scene[0], settings, held_out=scene[1], watch=shown.append)
+    assert [step.evaluated for step in shown] == [0, 0, 3]
+    assert shown[-1].held_out == result.history[-1].psnr != result.history[0].psnr
+
+
 def test_a_seed_decides_every_bit(scene):
     start, settings = begin(scene, **{**BUSY, "iterations": 30})
     runs = [fit(start, scene[0], dataclasses.replace(settings, seed=seed)) for seed in (1, 1, 2)]
