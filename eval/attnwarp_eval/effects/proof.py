@@ -371,8 +371,9 @@ def climb(
         Rung(
             "paired bias, 1 spp",
             not bad,
-            f"everything on is {common.difference:+.2%} +- {common.error:.2%} brighter over {pairs}"
-            f" common seeds (p = {common.p:.2g}, refused below {share:.2g})",
+            f"everything on is {abs(common.difference):.2%} +- {common.error:.2%}"
+            f" {'darker' if common.difference < 0 else 'brighter'} over {pairs} common seeds"
+            f" (p = {common.p:.2g}, refused below {share:.2g})",
             asdict(common),
         )
     )

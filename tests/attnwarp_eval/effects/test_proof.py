@@ -145,6 +145,15 @@ def synthetic(trial, kind="normal", brighter=1.0):
     return pictures
 
 
+@pytest.mark.parametrize(("light", "word"), [(1.25, "20 brighter"), (0.8, "25 darker")])
+def test_less_light_is_darker_and_no_negative_brightness(light, word):
+    rungs = {rung.name: rung for rung in proof.climb(synthetic(0, brighter=light)).rungs}
+    words = rungs["paired bias, 1 spp"].words
+    # A share of the light of everything on, in whole percent: (1.25 - 1) / 1.25, (0.8 - 1) / 0.8.
+    said = re.match(r"everything on is (\d+\.\d\d)% \+- \d\.\d\d% (\w+) over", words)
+    assert said and f"{float(said[1]):.0f} {said[2]}" == word, words
+
+
 @pytest.mark.parametrize("kind", ["normal", "skewed", "sky"])
 @pytest.mark.parametrize(
     ("alpha", "range_"),
