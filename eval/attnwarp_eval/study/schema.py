@@ -89,7 +89,7 @@ class Ablation(Part):
     title: str
     probe: str = ""
     baseline: str
-    variants: list[str]
+    variants: Annotated[list[str], Field(min_length=1)]
     note: str = ""
 
 

@@ -101,7 +101,8 @@ def _check_metric(front: Front, front_probe: Probe[Any], key: str) -> None:
     try:
         direction = front_probe.metric(front.metric).direction
     except KeyError:
-        raise ValueError(f"{key}: no metric {front.metric!r}") from None
+        near = did_you_mean(front.metric, front_probe.metrics)
+        raise ValueError(f"{key}: no metric {front.metric!r}{near}") from None
     if direction != "lower":
         raise ValueError(f"{key}: {front.metric!r} is not one of which less is better")
 

@@ -93,12 +93,20 @@ def test_ids_change_with_the_content_and_not_with_the_names(tmp_path):
         ({"name": "../escape"}, "name: .*pattern"),
         ({"feature_sizes": [128]}, "expected 1 to 64, the image size"),
         (
-            {"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": []}]},
+            {"ablations": [{"title": "t", "probe": "fit", "baseline": "again", "variants": ["b"]}]},
             "add it to probes.fit",
+        ),
+        (
+            {"ablations": [{"title": "t", "baseline": "again", "variants": []}]},
+            "ablations.*variants: .*at least 1",
         ),
         (
             {"fronts": [{"title": "t", "metric": "depth.foo", "variants": ["again"]}]},
             "no metric 'depth.foo'",
+        ),
+        (
+            {"fronts": [{"title": "t", "metric": "warp.epe_medain.64", "variants": ["again"]}]},
+            "no metric 'warp.epe_medain.64'; did you mean 'warp.epe_median'",
         ),
         (
             {"fronts": [{"title": "t", "metric": "occlusion.f1", "variants": ["again"]}]},
