@@ -149,9 +149,7 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     todo = {cell.id for cell in planned.todo}
     rows: dict[tuple[str, str], list[bool]] = {}
     for cell in planned.cells:
-        rows.setdefault((cell.probe, " = ".join(cell.labels) or cell.variant), []).append(
-            cell.id not in todo
-        )
+        rows.setdefault((cell.probe, _who(cell)), []).append(cell.id not in todo)
     table = Table(
         ["probe", "variant", "cells", "done"],
         [[*key, str(len(done)), str(sum(done))] for key, done in rows.items()],
@@ -162,6 +160,13 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
+
+
+def _who(cell: Cell) -> str:
+    """The variants of a cell: names of one content, or those that it measures in turn."""
+    if cell.labels and cell.variant not in cell.labels:
+        return f"{', '.join(cell.labels)} (in turn)"
+    return " = ".join(cell.labels) or cell.variant
 
 
 def run_study(

@@ -92,6 +92,14 @@ def start(*arguments, **options):
     return subprocess.Popen(command, text=True, **options)
 
 
+def test_a_dry_run_names_the_variants_that_one_cell_times_in_turn(folder):
+    done = call("run", "study.yaml", "--out", "never", "--dry-run")
+    rows = [line for line in done.stdout.splitlines() if " timing " in line]
+    # Of another content each, they are no names of one variant.
+    assert done.exit_code == 0 and len(rows) == 1
+    assert "corrected, released (in turn)" in rows[0] and "=" not in rows[0]
+
+
 def without_timings(run):
     done = call("report", run, "--no-timings")
     assert done.exit_code == 0, done.stderr
