@@ -47,6 +47,11 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
             " and view; verdicts are adjusted for the number of tests in their table, those of"
             ' claims for the number of claims. "can\'t tell" is not "equal".'
         )
+        if len(study.scenes) == 1 and study.variants:
+            lead.append(
+                '**One scene gives no verdict in general: every test says "can\'t tell". Name more'
+                " scenes for one.**"
+            )
     layout = Layout(root, timings)
     of_probes: dict[Place, list[Section]] = {place: [] for place in Place}
     for probe in probes():

@@ -495,6 +495,19 @@ def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
     assert "1 cells with revision `bbbbbbbbbbbb` with local changes" in text
 
 
+def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_path):
+    cells = [
+        written_runs.outcome("warp", "one", [name], record([value, value + 0.1]), name)
+        for name, value in (("good", 0.1), ("slipped", 0.9))
+    ]
+    text = markdown(build(written_runs.results(study(scenes=["one"]), cells), tmp_path))
+    assert "One scene gives no verdict in general" in text[: text.index("\n## ")]
+    # It is true: a difference of 0.8 in every view stays undecided.
+    row = next(line for line in text.splitlines() if line.startswith("| slipped") and "0.8" in line)
+    assert "can't tell" in row
+    assert "One scene gives" not in markdown(build(results(CLEAR), tmp_path))
+
+
 def calibrated(**changes):
     figures = {
         "warp.epe_median": 1e-13,
