@@ -2,13 +2,16 @@
 Python-Markdown makes of them, and on the page; OpenCV's decoder.
 """
 
+import asyncio
 import base64
 import re
 from html.parser import HTMLParser
 
+import browser
 import cv2
 import markdown as python_markdown
 import numpy as np
+import pytest
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import (
@@ -95,6 +98,37 @@ def test_a_page_holds_every_picture_and_nothing_from_elsewhere_in_8_mb(tmp_path)
     identities = re.findall(r'\bid="([^"]*)"', text)
     assert len(identities) == len(set(identities))
     assert set(re.findall(r'(?:href="|url\()#([^")]*)', text)) <= set(identities)
+
+
+PLACES = """[...document.querySelectorAll('.scroll')].map((table) => {
+    const row = table.querySelector('tbody tr').getBoundingClientRect();
+    return [table.getBoundingClientRect().right, row.y + row.height / 2];
+})"""
+
+
+def test_a_table_that_is_cut_has_a_shadow_at_its_right_edge(tmp_path):
+    if browser.executable() is None:
+        pytest.skip("needs a Chromium (Debian: chromium-headless-shell)")
+    wide = Table(["a", *(f"column {k}" for k in range(40))], [["x", *["1"] * 40]], caption="wide")
+    narrow = Table(["a", "b"], [["x", "1"]], caption="narrow")
+    path = tmp_path / "report.html"
+    path.write_text(page(Report("title", [], [Section("s", [], [wide, narrow])]), tmp_path))
+
+    async def look():
+        async with browser.opened(path.as_uri()) as tab:
+            await tab.until("document.querySelectorAll('.scroll').length == 2")
+            edges = []
+            for scrolled in (0, 1e6):
+                await tab.run(f"document.querySelector('.scroll').scrollLeft = {scrolled}")
+                image = (await tab.picture()).astype(int)
+                for right, y in await tab.run(PLACES):
+                    # The last pixels of a row against those beside the table.
+                    row = image[int(y)]
+                    edges.append(abs(row[int(right) - 2] - row[int(right) + 4]).max())
+            return edges
+
+    at_first, narrow_first, at_end, narrow_end = asyncio.run(look())
+    assert at_first > 20 and max(narrow_first, at_end, narrow_end) < 5
 
 
 def test_a_list_is_one_in_markdown_and_on_a_page(tmp_path):
