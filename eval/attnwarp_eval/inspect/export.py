@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +20,7 @@ from attnwarp.io.file import write_atomically
 from attnwarp.io.images import encode_png
 from attnwarp_eval.colors import to_linear
 from attnwarp_eval.inspect import scene
-from attnwarp_eval.inspect.pair import Pair
+from attnwarp_eval.inspect.pair import Legend, Pair
 from attnwarp_eval.inspect.scene import Part, State
 from attnwarp_eval.inspect.subject import Subject
 
@@ -65,7 +67,8 @@ def write_export(path: Path, subject: Subject, state: State, picked: Any = None)
     elif path.suffix == ".glb":
         data = glb(parts, subject.center, subject.up)
     else:
-        data = page(parts, subject, pair)
+        title = scene.title(subject, pair, state)
+        data = page(parts, subject, pair, title, pair.legend(state.coloring))
     write_atomically(path, lambda stream: stream.write(data))
 
 
@@ -259,8 +262,23 @@ def _indices(mesh: pyvista.PolyData) -> tuple[npt.NDArray[Any], int]:
 # --- a page
 
 
-def page(parts: Sequence[Part], subject: Subject, pair: Pair) -> bytes:
-    """An HTML page with the parts and a viewer in it, which works without a network."""
+VIEWER_TITLE = re.compile("<title>.*?</title>", re.DOTALL)
+
+CAPTION = (
+    "position: fixed; z-index: 1; left: 0; bottom: 0; margin: 0; padding: .4em .7em;"
+    " font: 14px/1.5 system-ui, sans-serif; color: #000; background: #fffc; pointer-events: none"
+)
+
+
+def page(parts: Sequence[Part], subject: Subject, pair: Pair, title: str, legend: Legend) -> bytes:
+    """An HTML page with the parts and a viewer in it, which works without a network.
+
+    Args:
+        parts: of the 3D view.
+        subject, pair: whose cameras are in view.
+        title: of the page, and of what it shows.
+        legend: (text, "#rrggbb") of what the colours mean.
+    """
     with optional_imports():
         from trame_vtk.modules.vtk import serializers
         from trame_vtk.tools.vtksz2html import HTML_VIEWER_PATH
@@ -303,4 +321,11 @@ def page(parts: Sequence[Part], subject: Subject, pair: Pair) -> bytes:
         "<script>function loadDataSet() { const container = document.querySelector('.content')"
         f" || document.body; OfflineLocalView.load(container, {{base64Str: '{text}'}}); }}</script>"
     )
-    return viewer.replace("</body>", f"{script}</body>").encode()
+    head = f"<title>{escape(title)}</title>"
+    viewer = VIEWER_TITLE.sub(lambda _: head, viewer, count=1)
+    entries = "".join(
+        f'<br><span style="color: {color}">\u25a0</span> {escape(name)}' for name, color in legend
+    )
+    # The viewer empties what it draws in, so the caption stands beside it.
+    body = f'<div class="content"></div><p style="{CAPTION}">{escape(title)}{entries}</p>{script}'
+    return viewer.replace("</body>", f"{body}</body>").encode()

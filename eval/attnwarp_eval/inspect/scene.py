@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -290,6 +291,16 @@ class State:
     step: str = ""
     splats: bool = False
     surface: bool = False
+
+
+def title(subject: Subject, pair: Pair, state: State) -> str:
+    """What a state shows, in a line: scene, variant, views, grid, step and colours."""
+    layer = "" if state.layer is None else f", grid {state.layer[1]} x {state.layer[0]}"
+    step = f", {state.step}" if pair.edit is not None else ""
+    return (
+        f"{Path(subject.scene).name}, {state.variant}, {pair.cameras[0].name} ->"
+        f" {state.target}{layer}{step}; colours: {state.coloring}"
+    )
 
 
 SOURCE_COLOR, TARGET_COLOR, BLOCKER_COLOR = "#1f4e9c", "#b35a00", "#e31a1c"

@@ -480,12 +480,7 @@ class Window:
 
     def _draw_texts(self) -> None:
         pair, state = self.pair, self.state
-        layer = "" if state.layer is None else f", grid {state.layer[1]} x {state.layer[0]}"
-        step = f", {state.step}" if pair.edit is not None else ""
-        title = (
-            f"{Path(self.subject.scene).name}, {state.variant}, {pair.cameras[0].name} ->"
-            f" {state.target}{layer}{step}; colours: {state.coloring}"
-        )
+        title = scene.title(self.subject, pair, state)
         numbers = [] if self.picked is None else ["", *self.picked.lines()]
         self._text("title", "\n".join([title, *numbers]), "upper_left")
         keys = "\n".join(f"{key:>6}  {what}" for key, what in KEYS.items())

@@ -239,10 +239,14 @@ def test_a_page_to_share_draws_itself_without_a_network(tmp_path):
                 picture = await tab.picture()
                 green = (picture[..., 1] > picture[..., 0] + 40).mean()
                 if green > 0.02:  # the mask's "visible, accepted"
-                    return green
-        return 0.0
+                    return green, await tab.run("[document.title, document.body.innerText]")
+        return 0.0, None
 
-    assert asyncio.run(look()) > 0.02
+    green, texts = asyncio.run(look())
+    assert green > 0.02
+    title, text = texts
+    assert title == "spheres, corrected, source -> yaw060; colours: mask"
+    assert all(words in text for words in (title, "\u25a0 visible, accepted", "hidden, accepted"))
 
 
 def test_without_opengl_the_error_names_the_remedy_and_files_are_written(tmp_path):
