@@ -12,9 +12,10 @@ import torch
 
 from attnwarp import Gaussians
 from attnwarp.camera import Camera
+from attnwarp.errors import InputError
 from attnwarp_eval.cache import content_key, read_arrays, write_arrays
 from attnwarp_eval.colors import to_srgb
-from attnwarp_eval.scene.file import load_scene
+from attnwarp_eval.scene.file import load_scene, scene_file
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.splats.surface import SurfaceSamples, colored_samples, surface_splats
 from attnwarp_eval.truth import Geometry, appearance, edge_band, two_view
@@ -46,6 +47,7 @@ class World:
 
     def __init__(self, scene: Scene, size: int) -> None:
         self.content_hash = scene.content_hash
+        self._loaded = scene
         self.scene = scene = scene.with_size(size, size)
         self.geometry = Geometry(scene)
         self.source = scene.source
@@ -63,6 +65,10 @@ class World:
         self.edge: Callable[[str, int], npt.NDArray[np.bool_]] = cache(self._edge)
         self.image: Callable[[str, int], npt.NDArray[np.float32]] = cache(self._image)
         self.samples: Callable[[int, int], Samples] = cache(self._samples)
+
+    def edited_hash(self, edit: str, answer: str | None) -> str:
+        """The hash of the scene's file after an edit, which a cell's spec names."""
+        return self._loaded.edited(edit, answer).content_hash
 
     def add(self, camera: Camera) -> None:
         """Add a target camera under its name."""
@@ -122,14 +128,24 @@ class World:
         return SolidField(self.scene.center, width, channels=channels, seed=seed)
 
 
-@lru_cache(maxsize=1)
 def world(scene: str, size: int) -> World:
-    """The world of a scene (a name or a path) at an image size; the last one is cached."""
+    """The world of a scene (a name or a path) at an image size; the last one is cached, as long as
+    its file stays as it is.
+    """
+    return _world(scene, size, scene_file(scene).read_bytes())
+
+
+@lru_cache(maxsize=1)
+def _world(scene: str, size: int, content: bytes) -> World:
     forget()  # what was loaded for the pictures of the former one
     return World(load_scene(scene), size)
 
 
-@lru_cache(maxsize=8)
+def changed(what: str) -> InputError:
+    """The error of a scene that is no longer what a cell was planned for."""
+    return InputError(f"{what} has changed since the run was planned; start the run again")
+
+
 def splats(
     scene: str,
     size: int,
@@ -148,17 +164,32 @@ def splats(
         kind, count, position_noise, normal_noise: see
             :func:`attnwarp_eval.splats.surface.surface_splats`.
     """
-    scene_world = world(scene, size)
+    content = world(scene, size).content_hash
+    return _splats(content, scene, size, seed, kind, count, position_noise, normal_noise)
+
+
+@lru_cache(maxsize=8)
+def _splats(
+    content: str,
+    scene: str,
+    size: int,
+    seed: int,
+    kind: Literal["2d", "3d"],
+    count: int,
+    position_noise: float,
+    normal_noise: float,
+) -> Gaussians:
     settings: dict[str, Any] = {
         "kind": kind,
         "count": count,
         "position_noise": position_noise,
         "normal_noise": normal_noise,
     }
-    key = content_key("surface splats", SPLATS_PROTOCOL, scene_world.content_hash, seed, settings)
+    key = content_key("surface splats", SPLATS_PROTOCOL, content, seed, settings)
     stored = read_arrays("splats", key)
     names = ("means", "quats", "scales", "opacities", "sh")
     if stored is None:
+        scene_world = world(scene, size)
         samples = scene_world.samples(count, seed)
         made = surface_splats(scene_world.scene, seed=seed, samples=samples, **settings)
         write_arrays(

@@ -81,15 +81,28 @@ def load_scene(name_or_path: str | os.PathLike[str]) -> Scene:
         Traceback (most recent call last):
         attnwarp_eval.scene.scene.SceneError: ...
     """
+    return _read(scene_file(name_or_path))
+
+
+def scene_file(name_or_path: str | os.PathLike[str]) -> Path:
+    """The file of a scene by name or by file.
+
+    Raises:
+        SceneError: there is none.
+
+    Example:
+        >>> scene_file("spheres").name
+        'spheres.yaml'
+    """
     text = os.fspath(name_or_path)
     path = Path(text).expanduser()
     if is_scene_file(text):
         if not path.is_file():
             raise SceneError(f"no such scene file{suggest(path.name, _siblings(path))}", path)
-        return _read(path)
+        return path
     for folder in scene_folders():
         if (folder / f"{text}.yaml").is_file():
-            return _read(folder / f"{text}.yaml")
+            return folder / f"{text}.yaml"
     available = list_scenes()
     raise SceneError(
         f"no scene named {text!r}{suggest(text, available)}; known scenes:"

@@ -17,7 +17,7 @@ from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask
-from attnwarp_eval.world import World, world
+from attnwarp_eval.world import World, changed, world
 
 Image = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -109,8 +109,19 @@ def answers_of(scene: Scene, edit: str) -> list[tuple[str, str | None]]:
     return [(one.name, one.name) for one in answers] or [(ONLY, None)]
 
 
-@lru_cache(maxsize=8)
-def edit_truth(scene: str, size: int, spp: int, edit: str, views: tuple[str, ...]) -> EditTruth:
+Answers = Sequence[Sequence[str]]
+"""(name, hash of the edited scene) of each answer, as a cell's spec names them."""
+
+
+def edit_truth(
+    scene: str,
+    size: int,
+    spp: int,
+    edit: str,
+    views: tuple[str, ...],
+    *,
+    planned: Answers | None = None,
+) -> EditTruth:
     """The truth of an edit; cached, since all variants of a scene share it.
 
     Args:
@@ -118,7 +129,30 @@ def edit_truth(scene: str, size: int, spp: int, edit: str, views: tuple[str, ...
         spp: samples a pixel.
         edit: as for :func:`answers_of`.
         views: names, the source among them.
+        planned: the answers for which the cell was planned; whatever the file says if None.
+
+    Raises:
+        InputError: the answers are not those ``planned``.
     """
+    of = world(scene, size)
+    title = edit.partition("=")[0]
+    answers = tuple((n, of.edited_hash(title, one)) for n, one in answers_of(of.scene, edit))
+    if planned is not None and answers != tuple((name, content) for name, content in planned):
+        raise changed(f"edit {edit!r} of scene {of.scene.name!r}")
+    return _edit_truth(of.content_hash, answers, scene, size, spp, edit, views)
+
+
+@lru_cache(maxsize=8)
+def _edit_truth(
+    content: str,
+    hashes: tuple[tuple[str, str], ...],
+    scene: str,
+    size: int,
+    spp: int,
+    edit: str,
+    views: tuple[str, ...],
+) -> EditTruth:
+    """``content`` and ``hashes``: what the scene's file says now, before the edit and after it."""
     of = world(scene, size)
     answers = answers_of(of.scene, edit)
     title = edit.partition("=")[0]

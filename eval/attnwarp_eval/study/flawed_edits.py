@@ -20,7 +20,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.spec import AnswerSpec, EditSpec
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask, touched
-from attnwarp_eval.world import World
+from attnwarp_eval.world import World, changed
 
 ANSWERS = 3
 """Of an edit with several right answers, the first that are rendered: one right, one wrong, and a
@@ -251,12 +251,19 @@ RIGHT = f"strength_{100 * STRENGTHS[-1]:03.0f}"
 
 
 def shots_of(world: World, task: Task, spec: Mapping[str, Any]) -> dict[str, Shot]:
-    """The source and every target of a cell's spec, by name."""
+    """The source and every target of a cell's spec, by name.
+
+    Raises:
+        InputError: an edit is not what the task was planned for.
+    """
     names = [world.source.name, *spec["views"]]
-    scenes = [world.scene, world.scene.edited(task.edit, task.answer)]
-    scenes += [world.scene.edited(task.edit, answer) for answer, _ in task.others]
-    if task.elsewhere is not None:
-        scenes.append(world.scene.edited(*task.elsewhere[:2]))
+    scenes = [world.scene]
+    others = [(task.edit, answer, content) for answer, content in task.others]
+    elsewhere = [] if task.elsewhere is None else [task.elsewhere]
+    for edit, answer, content in [(task.edit, task.answer, task.content), *others, *elsewhere]:
+        if world.edited_hash(edit, answer) != content:
+            raise changed(f"edit {edit!r} of scene {world.scene.name!r}")
+        scenes.append(world.scene.edited(edit, answer))
     # Scene by scene: Mitsuba caches the last one, and loading costs more than rendering.
     images: dict[str, list[Array]] = {name: [] for name in names}
     for scene in scenes:

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from attnwarp.errors import InputError
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
 from attnwarp_eval.cost import Meter, environment, peak_memory_mb
@@ -17,7 +16,7 @@ from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe, Work
 from attnwarp_eval.study.record import Cost, Environment, Failure, Record
 from attnwarp_eval.study.store import Store
-from attnwarp_eval.world import world
+from attnwarp_eval.world import changed, world
 
 
 def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = None) -> Record[Any]:
@@ -43,9 +42,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
         with meter.stage("setup"):
             scene_world = world(cell.scene_file, cell.spec["size"])
         if scene_world.content_hash != cell.spec["scene"]:
-            raise InputError(
-                f"scene {cell.scene!r} has changed since the run was planned; start the run again"
-            )
+            raise changed(f"scene {cell.scene!r}")
     work = Work(cell, root, scene_world, meter)
     extra = probe.compute(work)
     _check_metrics(probe, work)

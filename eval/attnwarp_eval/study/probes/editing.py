@@ -368,7 +368,12 @@ class EditingProbe(Probe[EditResult]):
         names = [world.source.name, *spec["views"]]
         with meter.stage("truth"):
             truth = edit_truth(
-                work.cell.scene_file, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
+                work.cell.scene_file,
+                spec["size"],
+                spec["spp"],
+                spec["edit"]["name"],
+                tuple(names),
+                planned=spec["edit"]["answers"],
             )
         with meter.stage("splats"):
             before = splats_of(work)

@@ -122,7 +122,12 @@ class EditingTimingProbe(Probe[Rounds]):
         names = [world.source.name, *spec["views"]]
         with work.meter.stage("truth"):
             truth = edit_truth(
-                work.cell.scene_file, spec["size"], spec["spp"], spec["edit"]["name"], tuple(names)
+                work.cell.scene_file,
+                spec["size"],
+                spec["spp"],
+                spec["edit"]["name"],
+                tuple(names),
+                planned=spec["edit"]["answers"],
             )
         contestants = [self._contestant(work, k) for k in range(len(spec["contestants"]))]
         with work.meter.stage("splats"):

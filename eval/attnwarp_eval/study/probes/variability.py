@@ -127,7 +127,12 @@ class VariabilityProbe(Probe[Varied]):
         edit = spec["edit"]
         with meter.stage("truth"):
             truth = edit_truth(
-                work.cell.scene_file, spec["size"], spec["spp"], edit["name"], tuple(names)
+                work.cell.scene_file,
+                spec["size"],
+                spec["spp"],
+                edit["name"],
+                tuple(names),
+                planned=edit["answers"],
             )
         with meter.stage("splats"):
             before = splats_of(work)
