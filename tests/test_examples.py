@@ -183,6 +183,7 @@ source_tokens, own_tokens = torch.rand(2, 1, 64 * 64, 8)
 
 NOT_RUN = {
     "docs/encoders.md": "weights of the user's own",
+    "docs/extending.md": "registers a method for the rest of the process",
     "docs/fitting.md": "3000 iterations",
     "docs/masks-by-words.md": "weights of the user's own",
 }

@@ -142,7 +142,7 @@ def _shares(about: dict[str, Any]) -> str:
 def _before(
     folder: Folder, name: str, photographs: Photographs, edited: str
 ) -> tuple[tuple[str, str | bytes], ...]:
-    """A view before its edit: its photograph as the editor saw it, and the splats' render."""
+    """A view before its edit: its photograph at the size of its edit, and the splats' render."""
     h, w = folder.read_picture(edited).shape[:2]
     seen = to_bytes(resized(to_float(photographs[name]), (h, w)))
     return (

@@ -39,7 +39,7 @@ def world_of(*yaws, source=0):
         ((330, 300), 0, {330: "source", 300: 330}),
     ],
 )
-def test_a_views_neighbour_is_on_its_own_side(yaws, source, expected):
+def test_a_views_neighbour_is_the_nearest_by_signed_yaw(yaws, source, expected):
     world = world_of(*yaws, source=source)
     names = dict(zip(yaws, world.targets, strict=True))
     assert neighbours(world, list(world.targets)) == {

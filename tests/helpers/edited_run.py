@@ -54,11 +54,12 @@ def write_run(
     steps=1,
     instruction="paint it",
     name="run",
+    encoders=MappingProxyType({}),
 ):
     """A run of two edits and so many seeds; every picture of a method has its colour.
 
     ``more`` has further pictures of a method: their colours by what they show. ``steps`` are the
-    first method's, ``name`` is that of the run's folder.
+    first method's, ``name`` is that of the run's folder, ``encoders`` are of the figures alone.
     """
     edits = [{**e, "instruction": f"{instruction} {e['name']}"} for e in SCENE["edits"]]
     (folder / "ball.yaml").write_text(yaml.safe_dump({**SCENE, "edits": edits}))
@@ -69,6 +70,7 @@ def write_run(
                      for k, method in enumerate(METHODS) if method in methods},
         "probes": {"editing": list(methods)},
         "pictures": {"variants": list(methods), "views": names},
+        **({"encoders": dict(encoders)} if encoders else {}),
     }  # fmt: skip
     (folder / "people.yaml").write_text(yaml.safe_dump(study))
     store = Store(folder / name)

@@ -86,7 +86,7 @@ def _show(chosen: list[Case], quick: bool) -> list[str]:
         failed = verdict_lines(swept)
         typer.echo("* must hold, or be refused; ! does not though it must; ~ a harder level breaks")
         if not failed:
-            typer.echo(f"{hard.name} holds at every required level")
+            typer.echo(f"{hard.name} holds at every required level that is shown")
         lines += failed
     return lines
 

@@ -31,6 +31,9 @@ Verdict = Literal["worse", "better", "equal", "can't tell"]
 FEWEST_SCENES = 6
 """A test over fewer pairs of scenes flags nothing."""
 
+SEVERAL_VIEWS = 3
+"""Views of a scene that other seeds hardly leave undefined all at once."""
+
 FaultKind = Literal["missing", "redefined", "counter"]
 
 
@@ -319,7 +322,7 @@ class _Group:
             self.probe,
             self.variant,
             self.key,
-            judged or self._by_scenes(flat_before, adjusted_p, undefined),
+            judged or self._by_scenes(flat_before, adjusted_p),
             *_means_of_shared(self.before, self.now),
             self.difference,
             adjusted_p,
@@ -352,10 +355,22 @@ class _Group:
         lost = any(w > tolerance for w, tolerance, _ in changes)
         return "better" if gained and not lost else None
 
-    def _by_scenes(self, before: Mapping[str, float], adjusted_p: float, undefined: int) -> Verdict:
-        """The verdict of a test over scenes; views that became undefined need none."""
+    def _lost(self) -> bool:
+        """Whether the run defines the figure nowhere, or in none of several views of a scene.
+
+        Which single views define it is a matter of the seeds.
+        """
+        defined = {s: sum(map(math.isfinite, v.values())) for s, v in self.before.items()}
+        left = {s: sum(map(math.isfinite, v.values())) for s, v in self.now.items()}
+        gone = [views for scene, views in defined.items() if views and not left.get(scene)]
+        if not gone:
+            return False
+        return max(gone) >= SEVERAL_VIEWS or len(gone) == sum(map(bool, defined.values()))
+
+    def _by_scenes(self, before: Mapping[str, float], adjusted_p: float) -> Verdict:
+        """The verdict of a test over scenes; a figure that is lost needs none."""
         difference = self.difference
-        if undefined:
+        if self._lost():
             return "worse"
         if difference.scenes < FEWEST_SCENES:
             return "can't tell"

@@ -125,6 +125,8 @@ def measured(
         own = available.get(cell["probe"])
         if (cell["scene"], cell["seed"]) != (scene, seed) or cell["id"] not in done or own is None:
             continue
+        if own.times_in_turn:
+            continue  # several variants in one record, for their seconds alone
         read = partial(_measured, folder, source, own)
         one = store.read_as(cell["id"], read)
         for name in cell["variants"]:

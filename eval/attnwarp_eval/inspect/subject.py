@@ -27,7 +27,6 @@ from attnwarp_eval.inspect.capture import (
 )
 from attnwarp_eval.inspect.pair import Pair
 from attnwarp_eval.inspect.run import Measured, measured
-from attnwarp_eval.scene.file import scene_name
 from attnwarp_eval.study.schema import Splats, Variant
 from attnwarp_eval.study.store import Store
 
@@ -216,7 +215,7 @@ def of_run(
     if not study.scenes:
         raise InputError(f"{folder}: the study {study.name!r} has no scenes; name a scene instead")
     files = dict(zip(study.scene_names, study.scenes, strict=True))
-    name = scene_name(scene or study.scenes[0])
+    name = scene or study.scene_names[0]
     one_of(name, list(files), "scene")
     seed = study.seeds[0] if seed is None else seed
     one_of(str(seed), [str(number) for number in study.seeds], "seed")

@@ -134,14 +134,15 @@ def paired(a: ByView, b: ByView) -> Interval:
         (0.5, False)
     """
     differences: dict[str, list[float]] = {}
+    largest = 0.0  # of the values that differences are of
     for scene in sorted(set(a) | set(b)):
         left, right = a.get(scene, {}), b.get(scene, {})
-        differences[scene] = [
-            right.get(v, np.nan) - left.get(v, np.nan) for v in sorted(set(left) | set(right))
-        ]
+        pairs = [(left.get(v, np.nan), right.get(v, np.nan)) for v in sorted({*left, *right})]
+        differences[scene] = [after - before for before, after in pairs]
+        shared = [max(map(abs, pair)) for pair in pairs if np.isfinite(pair).all()]
+        largest = max(largest, *shared, 0.0)
     result = interval(differences)
-    sizes = [abs(x) for side in (a, b) for views in side.values() for x in views.values()]
-    rounding = ROUNDING * max(filter(np.isfinite, sizes), default=0.0)
+    rounding = ROUNDING * largest
     if not result.detectable <= rounding:
         return result
     if abs(result.mean) <= rounding:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from attnwarp.errors import InputError
 from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cost import environment
-from attnwarp_eval.scene.file import load_scene, scene_name
+from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.cluster import run_on_scheduler, run_on_workers
@@ -86,7 +86,7 @@ def plan(study: Study, store: Store) -> Plan:
             todo.append(cell)
         else:
             other_code += not record.environment.same_code(this)
-    named = {scene_name(where): scene for where, scene in scenes.items()}
+    named = dict(zip(study.scene_names, scenes.values(), strict=True))
     return Plan(study, named, cells, todo, other_code)
 
 
@@ -138,10 +138,11 @@ def verify(store: Store) -> Problems:
     Raises:
         InputError: the folder is no run.
     """
-    stored = _by_name(store.read_study())
+    stored = store.read_study()
     problems = store.verify()
     try:
         study = parse_study(stored["study"])
+        stored = _by_name(stored, study)
         cells = [_entry(cell) for cell in cells_of(study, _scenes(study))]
     except (InputError, ValidationError) as error:
         text = explain_errors(error) if isinstance(error, ValidationError) else error
@@ -172,12 +173,13 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
         >>> [cell["title"] for cell in stored_study(store)[1]]
         ['spheres / calibration / calibration', 'spheres / a / depth']
     """
-    stored = _by_name(store.read_study())
+    stored = store.read_study()
     path, remedy = store.root / "study.json", _remedy(store)
     try:
         study = parse_study(stored["study"])
     except ValidationError as error:
         raise StoreError(f"{path}: {explain_errors(error)}; {remedy}") from None
+    stored = _by_name(stored, study)
     needs_scenes = {p.name: p.needs_scenes for p in probes()}
     for cell in stored["cells"]:
         on_scene = needs_scenes.get(cell["probe"], True)
@@ -193,12 +195,15 @@ def stored_study(store: Store) -> tuple[Study, list[dict[str, Any]]]:
     return study, stored["cells"]
 
 
-def _by_name(stored: dict[str, Any]) -> dict[str, Any]:
+def _by_name(stored: dict[str, Any], study: Study) -> dict[str, Any]:
     """A ``study.json`` whose scenes are called by name; former ones called them by their files."""
+    names = dict(zip(study.scenes, study.scene_names, strict=True))
     return {
         **stored,
-        "scenes": {scene_name(k): entry for k, entry in stored.get("scenes", {}).items()},
-        "cells": [{**cell, "scene": scene_name(cell["scene"])} for cell in stored["cells"]],
+        "scenes": {names.get(k, k): entry for k, entry in stored.get("scenes", {}).items()},
+        "cells": [
+            {**cell, "scene": names.get(cell["scene"], cell["scene"])} for cell in stored["cells"]
+        ],
     }
 
 

@@ -5,7 +5,6 @@ What only one probe reads stands in that probe's file; :mod:`attnwarp_eval.study
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -148,8 +147,12 @@ class Study(Part):
 
     @property
     def scene_names(self) -> list[str]:
-        """What cells and reports call the scenes, which ``scenes`` may name by their files."""
-        return [scene_name(where) for where in self.scenes]
+        """What cells and reports call the scenes: two files of one name by their paths."""
+        names = [scene_name(where) for where in self.scenes]
+        return [
+            where if names.count(name) > 1 else name
+            for where, name in zip(self.scenes, names, strict=True)
+        ]
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -179,12 +182,6 @@ class Study(Part):
                 )
         for key in ("scenes", "seeds", "views"):
             check_distinct(getattr(self, key), key)
-        for name, count in Counter(self.scene_names).items():
-            if count > 1:
-                one, other, *_ = (where for where in self.scenes if scene_name(where) == name)
-                raise ValueError(
-                    f"scenes: {one!r} and {other!r} are both called {name!r}; rename a file"
-                )
         return self
 
     def check_variants(self, names: Iterable[str], key: str, probe: str = "") -> None:

@@ -162,7 +162,8 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
         >>> [cell.labels for cell in cells if cell.probe == "warp"]
         [('a', 'b')]
     """
-    ordered = {scene_name(where): scenes[where] for where in study.scenes}
+    where = dict(zip(study.scene_names, study.scenes, strict=True))
+    ordered = {name: scenes[path] for name, path in where.items()}
     names: dict[str, list[str]] = {p.name: [] for p in probes() if p.always}
     names |= {name: variants for name, variants in study.probes.items()}
     cells = [
@@ -170,10 +171,9 @@ def cells_of(study: Study, scenes: dict[str, Scene]) -> list[Cell]:
         for name, variants in names.items()
         for cell in probe(name).cells(study, variants, ordered)
     ]
-    files = {scene_name(where): where for where in study.scenes if is_scene_file(where)}
     cells = [
-        replace(cell, sources={**cell.sources, "scene": files[cell.scene]})
-        if cell.scene in files
+        replace(cell, sources={**cell.sources, "scene": where[cell.scene]})
+        if is_scene_file(where.get(cell.scene))
         else cell
         for cell in cells
     ]
@@ -224,7 +224,11 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         )
     data = _beside(data, path.parent)
     every = data.get("scenes")
+    files = {scene_name(where): where for where in every or () if is_scene_file(where)}
     data.update({k: v for k, v in overrides.items() if v is not None})
+    if overrides.get("scenes") is not None:
+        # Reports call a scene of the file by its name.
+        data["scenes"] = [files.get(name, name) for name in data["scenes"]]
     if isinstance(data.get("scenes"), list):
         # The run is reported and inspected from other folders than this one.
         data["scenes"] = [

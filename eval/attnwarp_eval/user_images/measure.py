@@ -56,7 +56,7 @@ class Inputs:
         prompt: what the edited scene should show.
         source_prompt: what the scene showed before.
         masks: folder of masks, named as the renders: white counts for Edit PSNR and the perceptual
-            distance, black and transparent does not.
+            distance, black and transparent do not.
         background: sRGB in [0, 1] behind transparent pixels of pictures.
     """
 

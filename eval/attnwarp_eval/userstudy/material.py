@@ -11,12 +11,20 @@ import numpy as np
 
 from attnwarp.errors import InputError, suggest
 from attnwarp.io.picture import encode_picture
+from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.report import read_results
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.store import Store
 
 BEFORE, AFTER = "before", "render"
 """Contents of an edited scene's pictures: the view before the edit, and the edited splats."""
+
+
+OF_A_METHOD = (
+    "method", "settings", "start_protocol", "no_mask", "editor", "geometry", "mask", "fit",
+    "splats", "budget", "by_hand",
+)  # fmt: skip
+"""Entries of a cell's spec that decide its pictures, not how they are measured."""
 
 
 @dataclass
@@ -61,17 +69,17 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
         InputError: there is none, a method that no run has, or runs that contradict each other.
     """
     items: dict[tuple[str, str, int], Item] = {}
-    first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> its cell and run
+    first: dict[tuple[str, str], tuple[str, Path]] = {}  # item and method -> how, and the run
     for run in runs:
-        for key, one, method, cell in _edited(run):
+        for key, one, method, how in _edited(run):
             item = items.setdefault(key, one)
             if item.content != one.content:
                 raise InputError(
                     f"{run}: {item.name}: another scene, size, set of views or instruction than in"
                     " the runs before; build a page from runs of one study"
                 )
-            former, former_run = first.setdefault((item.name, method), (cell, run))
-            if former != cell:
+            former, former_run = first.setdefault((item.name, method), (how, run))
+            if former != how:
                 raise InputError(
                     f"{run}: {item.name}: {method!r} has other settings than in {former_run}; give"
                     " the variant another name in one of the studies"
@@ -98,8 +106,8 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
 
 
 def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
-    """(scene, edit and seed; the cell as an item of its own; method; the cell's id) of a run's
-    edited scenes.
+    """(scene, edit and seed; the cell as an item of its own; method; what decides its pictures) of
+    a run's edited scenes.
     """
     for cell in read_results(Store(run)).cells:
         record = cell.record
@@ -120,9 +128,10 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
                 own[view] = run / picture.path
         if not own:
             continue
+        how = digest({key: spec[key] for key in OF_A_METHOD if key in spec})
         for method in cell.variants:
             item.methods = {method: own}
-            yield (cell.scene, edit.name, cell.seed), item, method, cell.id
+            yield (cell.scene, edit.name, cell.seed), item, method, how
 
 
 def read_picture(path: Path) -> bytes:

@@ -429,6 +429,40 @@ def test_figures_that_became_undefined_with_other_seeds_are_seen(run, verdict, u
     assert (row.verdict, row.undefined) == (verdict, undefined)
 
 
+def test_views_that_other_seeds_leave_undefined_by_chance_fail_no_comparison():
+    generator = np.random.default_rng(0)
+
+    def side(first):
+        def values():
+            drawn = generator.normal(1, 0.1, 4)
+            return {
+                f"v{k}": float(v)
+                for k, v in enumerate(np.where(generator.random(4) < 0.1, np.nan, drawn))
+            }
+
+        return Snapshot("my", "", tuple(
+            Measured(f"s{k}", "warp", ("a",), first, "same", {}, {"warp.epe_median": Figure(1, values())})
+            for k in range(8)
+        ))  # fmt: skip
+
+    failed = sum(compare(side(0), side(1)).regressed for _ in range(200))
+    assert failed <= 200 * 0.05 + 3 * math.sqrt(200 * 0.05 * 0.95)
+
+
+def test_a_scene_that_lost_its_figure_with_other_seeds_is_worse():
+    def side(seed, lost):
+        return Snapshot("my", "", tuple(
+            Measured(f"s{k}", "warp", ("a",), seed, "same", {}, {"warp.epe_median": Figure(
+                1, {f"v{v}": math.nan if k == 0 and v < lost else 1.0 + k + v for v in range(4)})})
+            for k in range(8)
+        ))  # fmt: skip
+
+    (row,) = compare(side(0, 0), side(1, 4)).rows
+    assert (row.verdict, row.undefined) == ("worse", 4)
+    (row,) = compare(side(0, 0), side(1, 3)).rows
+    assert (row.verdict, row.undefined) == ("can't tell", 3)
+
+
 def test_hard_cases_are_no_scenes():
     def with_cases(seed, value, scenes):
         cases = tuple(

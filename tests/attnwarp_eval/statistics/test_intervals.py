@@ -93,6 +93,14 @@ def test_a_paired_difference_cancels_what_the_views_share():
     assert verdict(difference, "higher", atol=0.2) == "can't tell"
 
 
+def test_a_huge_value_that_one_side_alone_has_does_not_make_differences_equal():
+    gains = [0.010, 0.011, 0.012, 0.013, 0.014, 0.015, 0.016, 0.017]
+    a = {f"s{i}": {"v": 1.0} for i in range(8)}
+    b = {f"s{i}": {"v": 1.0 + gain} for i, gain in enumerate(gains)}
+    b["s0"]["other"] = 1e12
+    assert paired(a, b).p == pytest.approx(stats.ttest_1samp(gains, 0).pvalue, rel=1e-9)
+
+
 @pytest.mark.parametrize("scenes", [2, 5, 6, 9])
 @pytest.mark.parametrize("gain", [0.25, -0.1, 1e-4])
 def test_equal_differences_have_the_sign_tests_p_value_and_no_bounds_below_six_scenes(scenes, gain):

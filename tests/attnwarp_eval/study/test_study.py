@@ -222,13 +222,15 @@ def test_relative_paths_count_from_the_studys_file(tmp_path, monkeypatch):
     assert typed.scenes == [str(tmp_path / "elsewhere" / "x" / "y.yaml")]
 
 
-def test_two_scenes_of_one_name_are_refused(tmp_path):
+def test_two_files_of_one_name_are_called_by_their_paths_and_a_name_chooses_a_file(tmp_path):
     path = tmp_path / "study.yaml"
-    path.write_text("name: s\nscenes: [a/room.yaml, b/room.yaml]\nprobes: {sensitivity: []}\n")
-    with pytest.raises(
-        StudyError, match=r"a/room.yaml' and '.*b/room.yaml' are both called 'room'"
-    ):
-        load_study(str(path))
+    path.write_text(
+        "name: s\nscenes: [a/room.yaml, b/room.yaml, bear.yaml]\nprobes: {sensitivity: []}\n"
+    )
+    files = [str(tmp_path / name) for name in ("a/room.yaml", "b/room.yaml", "bear.yaml")]
+    assert load_study(str(path)).scene_names == [*files[:2], "bear"]
+    # The study's own file, not the scene of that name which comes along.
+    assert load_study(str(path), scenes=["bear"]).scenes == [files[2]]
 
 
 def test_a_scene_of_a_file_has_its_name_in_cells_and_its_file_beside_it(tmp_path):
@@ -245,7 +247,8 @@ def test_a_scene_of_a_file_has_its_name_in_cells_and_its_file_beside_it(tmp_path
     }
     written = expected(planned)
     # A former run called the scene by its path, as it was typed.
-    written["cells"] = [{**cell, "scene": "some/room.yaml"} for cell in written["cells"]]
+    file = written["study"]["scenes"][0]
+    written["cells"] = [{**cell, "scene": file} for cell in written["cells"]]
     store.write_study(written)
     assert {cell["scene"] for cell in stored_study(store)[1]} == {"room"}
     assert not verify(store).damaged

@@ -138,6 +138,7 @@ def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
         ({"steps": 50}, "'alone' has other settings than in {first}; give the variant another"),
         ({"instruction": "paint it bright"}, "instruction than in the runs before"),
         ({"methods": ["alone", "warped"]}, None),  # the same cells
+        ({"encoders": {"clip": "clip-parts"}}, None),  # the same pictures, measured otherwise
     ],
 )
 def test_one_name_is_one_method_in_all_runs(tmp_path, changes, message):

@@ -12,6 +12,7 @@ from ball_scene import SCENE
 
 from attnwarp.io import read_ply
 from attnwarp.render import render
+from attnwarp_eval.inspect import subject
 from attnwarp_eval.report.claims import load_claims
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, cells_of, load_study, parse_study
@@ -55,6 +56,10 @@ def test_probes_share_one_fit_and_its_depth_is_what_they_measure(folder):
     assert execute(plan(study, store), store).complete
     (file,) = (store.root / "fits").glob("*/splats.ply")  # the three cells share one fit
     splats = read_ply(file)
+    # The cell that times both variants says nothing of their splats.
+    shown = subject.of_run(store.root)
+    assert torch.equal(shown.pair("2D", shown.targets[0]).model.means, splats.means)
+    assert len(shown.pair("sampled", shown.targets[0]).model) == 300
     scene = world(study.scenes[0], 32)
     records = {
         (cell["probe"], *cell["variants"]): store.read(cell["id"])
