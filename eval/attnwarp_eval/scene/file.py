@@ -46,8 +46,9 @@ def list_scenes() -> list[str]:
 def is_scene_file(name: object) -> bool:
     """Whether :func:`load_scene` takes this for a file, not for a name to look up.
 
-    >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
-    (True, False)
+    Example:
+        >>> is_scene_file("my/scene.yaml"), is_scene_file("bear")
+        (True, False)
     """
     if not isinstance(name, str):
         return False
@@ -57,8 +58,9 @@ def is_scene_file(name: object) -> bool:
 def scene_name(name_or_path: str) -> str:
     """What a scene is called wherever its file may lie: its name, or its file's without a suffix.
 
-    >>> scene_name("my/room.yaml"), scene_name("bear")
-    ('room', 'bear')
+    Example:
+        >>> scene_name("my/room.yaml"), scene_name("bear")
+        ('room', 'bear')
     """
     return Path(name_or_path).stem if is_scene_file(name_or_path) else name_or_path
 
