@@ -336,7 +336,7 @@ def test_the_command_lists_and_shows_cases_and_fails_where_one_breaks(monkeypatc
     assert "refused: world_to_camera: rotation is not orthonormal" in shown.output
     lines = shown.output.splitlines()
     assert lines[-2].startswith("* must hold, or be refused; ! does not")
-    assert lines[-1] == "not_a_rotation holds at every required level"
+    assert lines[-1] == "not_a_rotation holds at every required level that is shown"
     # What is no rotation by 1e-3 must be refused, and so has its asterisk.
     assert "0.001 *" in shown.output
     for option in (["--out", "folder"], ["--jobs", "2"]):
