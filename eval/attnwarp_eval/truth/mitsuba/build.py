@@ -267,6 +267,8 @@ def forget() -> None:
 
     Dr.Jit keeps every freed array for the next one of its size, and pictures differ in size.
     """
+    if not _loaded:
+        return  # no picture since the last time, and looking for garbage takes its time
     _loaded.clear()
     if "drjit" in sys.modules:
         gc.collect()
