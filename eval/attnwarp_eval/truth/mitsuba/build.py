@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import math
 import sys
 import tempfile
@@ -267,11 +266,8 @@ def forget() -> None:
 
     Dr.Jit keeps every freed array for the next one of its size, and pictures differ in size.
     """
-    if not _loaded:
-        return  # no picture since the last time, and looking for garbage takes its time
     _loaded.clear()
     if "drjit" in sys.modules:
-        gc.collect()
         sys.modules["drjit"].flush_malloc_cache()
 
 
