@@ -15,6 +15,7 @@ from attnwarp_eval import metrics
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.edits import pick
 from attnwarp_eval.scene.scene import Scene
+from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.truth import appearance
 from attnwarp_eval.truth.edits import edit_mask
 from attnwarp_eval.world import World, changed, world
@@ -140,6 +141,24 @@ def edit_truth(
     if planned is not None and answers != tuple((name, content) for name, content in planned):
         raise changed(f"edit {edit!r} of scene {of.scene.name!r}")
     return _edit_truth(of.content_hash, answers, scene, size, spp, edit, views)
+
+
+def planned_truth(cell: Cell, views: Sequence[str]) -> EditTruth:
+    """The truth of the edit that a cell was planned for.
+
+    Raises:
+        InputError: the scene's file has another edit by now.
+    """
+    spec = cell.spec
+    edit = spec["edit"]
+    return edit_truth(
+        cell.scene_file,
+        spec["size"],
+        spec["spp"],
+        edit["name"],
+        tuple(views),
+        planned=edit["answers"],
+    )
 
 
 @lru_cache(maxsize=8)

@@ -39,8 +39,8 @@ from attnwarp_eval.study.edit_truth import (
     EditTruth,
     Judgement,
     answers_of,
-    edit_truth,
     neighbours,
+    planned_truth,
 )
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
 from attnwarp_eval.study.hand_made import Kind, hand_made
@@ -367,14 +367,7 @@ class EditingProbe(Probe[EditResult]):
         spec, world, meter = work.spec, work.world, work.meter
         names = [world.source.name, *spec["views"]]
         with meter.stage("truth"):
-            truth = edit_truth(
-                work.cell.scene_file,
-                spec["size"],
-                spec["spp"],
-                spec["edit"]["name"],
-                tuple(names),
-                planned=spec["edit"]["answers"],
-            )
+            truth = planned_truth(work.cell, names)
         with meter.stage("splats"):
             before = splats_of(work)
         with meter.stage("setup"):

@@ -20,7 +20,7 @@ from attnwarp_eval.document.numbers import number
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import Ratio, time_ratio
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import edit_truth
+from attnwarp_eval.study.edit_truth import planned_truth
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import InTurn, Layout, Place, Probe, Work
 from attnwarp_eval.study.probes.editing_sections import PARTS, WHOLE, is_alone
@@ -121,14 +121,7 @@ class EditingTimingProbe(Probe[Rounds]):
         spec, world = work.spec, work.world
         names = [world.source.name, *spec["views"]]
         with work.meter.stage("truth"):
-            truth = edit_truth(
-                work.cell.scene_file,
-                spec["size"],
-                spec["spp"],
-                spec["edit"]["name"],
-                tuple(names),
-                planned=spec["edit"]["answers"],
-            )
+            truth = planned_truth(work.cell, names)
         contestants = [self._contestant(work, k) for k in range(len(spec["contestants"]))]
         with work.meter.stage("splats"):
             scenes = [splats_of(contestant) for contestant in contestants]

@@ -24,7 +24,7 @@ from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
-from attnwarp_eval.study.edit_truth import EditTruth, edit_truth, neighbours
+from attnwarp_eval.study.edit_truth import EditTruth, neighbours, planned_truth
 from attnwarp_eval.study.probes import editing, register
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
 from attnwarp_eval.study.probes.variant_splats import splats_of
@@ -126,14 +126,7 @@ class VariabilityProbe(Probe[Varied]):
         names = [world.source.name, *spec["views"]]
         edit = spec["edit"]
         with meter.stage("truth"):
-            truth = edit_truth(
-                work.cell.scene_file,
-                spec["size"],
-                spec["spp"],
-                edit["name"],
-                tuple(names),
-                planned=edit["answers"],
-            )
+            truth = planned_truth(work.cell, names)
         with meter.stage("splats"):
             before = splats_of(work)
         edited: dict[int, dict[str, Image]] = {}
