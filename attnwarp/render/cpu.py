@@ -167,11 +167,14 @@ class _Composite(torch.autograd.Function):
         ctx.drawn = drawn
         ctx.origin = as_array(inputs.origin, np.float64)
         ctx.shapes = [(t.shape, t.dtype) for t in tensors]
-        # Saved so that torch notices when one of them is changed in place before the backward pass.
-        ctx.save_for_backward(*tensors)
         ctx.set_materialize_grads(False)
-        outputs = (*drawn.pictures[:-1], drawn.weight)
-        return tuple(torch.from_numpy(array) for array in outputs)
+        arrays = (*drawn.pictures[:-1], drawn.weight)
+        outputs = tuple(torch.from_numpy(array) for array in arrays)
+        _, alpha, depth, *_ = outputs
+        # Saved so that torch notices when one of them is changed in place before the backward pass,
+        # which reads alpha and depth in the caller's own memory.
+        ctx.save_for_backward(*tensors, alpha, depth)
+        return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable

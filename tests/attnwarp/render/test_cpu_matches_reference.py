@@ -5,7 +5,9 @@ parameter.
 from __future__ import annotations
 
 import dataclasses
+import gc
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -370,6 +372,49 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
         means += 1
     with pytest.raises(RuntimeError, match="modified by an inplace operation"):
         loss.backward()
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_changing_an_output_in_place_gives_its_gradients_or_an_error(
+    name: str, make_camera, make_splats
+) -> None:
+    """The backward pass reads some outputs. Oracle: the reference, and the output left as it was."""
+    camera = make_camera(4, 16, 16)
+    splats = make_splats(4, "2d", 20, camera)
+
+    def gradient(backend: str, change) -> torch.Tensor:
+        means = splats.means.clone().requires_grad_()
+        view = render(dataclasses.replace(splats, means=means), camera, backend=backend)
+        others = sum(getattr(view, each).nansum() for each in OUTPUTS if each != name)
+        (others + change(getattr(view, name)).nansum()).backward()
+        return means.grad
+
+    expected = gradient("reference", lambda output: output / 3)
+    try:
+        got = gradient("cpu", lambda output: output.div_(3))
+    except RuntimeError as error:
+        assert "modified by an inplace operation" in str(error)
+        assert name in ("alpha", "depth")
+    else:
+        assert (got - expected).abs().max() < 1e-3 * expected.abs().max()
+
+
+def test_a_picture_that_no_backward_pass_followed_leaves_no_memory_behind(
+    make_camera, make_splats
+) -> None:
+    """A cycle of references would hold each picture until the garbage is collected."""
+    camera = make_camera(4, 16, 16)
+    splats = make_splats(4, "2d", 20, camera)
+    means = splats.means.clone().requires_grad_()
+    gc.collect()
+    gc.disable()
+    try:
+        view = render(dataclasses.replace(splats, means=means), camera)
+        left = [weakref.ref(view.depth), weakref.ref(view.depth.grad_fn), weakref.ref(view.alpha)]
+        del view
+        assert [reference() for reference in left] == [None] * 3
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize("kind", ["2d", "3d"])
