@@ -132,7 +132,7 @@ def depth_slope(depth: Array) -> Tensor:
     The smaller side is the surface's own where the other one steps off an edge.
 
     Args:
-        depth: (H, W), NaN where undefined.
+        depth: (H, W), undefined where it is NaN, zero, negative or infinite.
 
     Returns:
         (H, W) float64; an axis without a defined neighbour adds 0, an undefined pixel gives NaN.
@@ -143,8 +143,8 @@ def depth_slope(depth: Array) -> Tensor:
         >>> depth_slope(torch.tensor([[1.0, 1.5, 2.0, 9.0]])).tolist()
         [[0.5, 0.5, 0.5, 7.0]]
     """
-    z = as_float64(depth, "depth")
-    check.shape(z, ("H", "W"), "depth")
+    # A hole coded 0 would be a slope of z, and the tolerance of depth agreement as large.
+    z = valid_depth(depth, "depth")
     slope = torch.zeros_like(z)
     for axis in (0, 1):
         step = z.diff(dim=axis).abs()

@@ -186,10 +186,15 @@ def _sample(image, taps):
 
 
 @exact
+def _step(z, neighbour):
+    """Depth's change to a neighbour, infinite where that is undefined."""
+    # An infinite neighbour is infinitely far: one comparison less.
+    return abs(z - neighbour) if neighbour > 0 else np.inf
+
+
+@exact
 def _smaller(before, after):
-    """The smaller of two steps that are numbers, 0 if neither is."""
-    before = before if before < np.inf else np.inf
-    after = after if after < np.inf else np.inf
+    """The smaller of two steps, 0 if both are infinite."""
     smaller = min(before, after)
     return smaller if smaller < np.inf else 0.0
 
@@ -199,13 +204,13 @@ def _slope(depth, i, j):
     """Depth's change per pixel, 0 where it is undefined."""
     h, w = depth.shape
     z = float(depth[i, j])
-    if not abs(z) < np.inf:
+    if not _valid(z):
         return 0.0
     one = np.uint64(1)
-    up = abs(z - depth[i - one, j]) if i > 0 else np.inf
-    down = abs(depth[i + one, j] - z) if i + one < np.uint64(h) else np.inf
-    left = abs(z - depth[i, j - one]) if j > 0 else np.inf
-    right = abs(depth[i, j + one] - z) if j + one < np.uint64(w) else np.inf
+    up = _step(z, float(depth[i - one, j])) if i > 0 else np.inf
+    down = _step(z, float(depth[i + one, j])) if i + one < np.uint64(h) else np.inf
+    left = _step(z, float(depth[i, j - one])) if j > 0 else np.inf
+    right = _step(z, float(depth[i, j + one])) if j + one < np.uint64(w) else np.inf
     return _smaller(up, down) + _smaller(left, right)
 
 
@@ -329,8 +334,11 @@ def _depth_passes(rules, depth, taps, u, v, z):
     """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
     h, w = depth.shape
     d = _blend_depth(depth, taps, INVERSE, rules.spread)
+    error, tolerance = abs(z - d), rules.relative * z
+    if error <= tolerance:  # most points; the slope only adds
+        return True
     change = _slope(depth, _clamp(np.floor(v), h), _clamp(np.floor(u), w))
-    return abs(z - d) <= rules.relative * z + rules.slope * change
+    return error <= tolerance + rules.slope * change
 
 
 @exact

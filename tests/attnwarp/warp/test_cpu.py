@@ -167,6 +167,21 @@ def test_undefined_depth_is_masked_and_never_filled(in_front):
     assert view.mask[2:].any()
 
 
+@pytest.mark.parametrize("hole", [np.nan, np.inf, 0.0, -1.0])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_no_hole_in_what_stands_before_it_makes_a_point_visible(hole, dtype):
+    # A wall at 1.5 hides all of the target's at 2. Beside a hole at the border it has one neighbour
+    # to each side, or none.
+    camera = orbit(0, size=6)
+    before = np.full((6, 6), 1.5, dtype)
+    before[:, 1] = before[4, :] = hole
+    behind = Surface(np.full((6, 6), 2.0, dtype))
+    settings = preset("corrected", normal_test="none", opaque=None)
+    view = agree(camera, camera, behind, Surface(before), settings, sizes=((3, 3), (2, 3)))
+    assert view.correspondence.defined.all()
+    assert not view.rules["depth_agrees"].any()
+
+
 def test_a_view_is_itself():
     # Hard case 6: features keep their bits.
     camera = orbit(33, size=48, height=0.7, width=56)

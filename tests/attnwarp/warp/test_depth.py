@@ -74,3 +74,11 @@ def test_slope_is_the_planes_own_on_both_sides_of_a_step():
     assert torch.isnan(depth_slope(hole)[3, 3])
     assert torch.isfinite(depth_slope(hole)).sum() == 63
     assert depth_slope(torch.full((1, 1), 2.0)).item() == 0
+
+
+@pytest.mark.parametrize("hole", [torch.nan, torch.inf, 0.0, -1.0])
+def test_a_hole_is_no_neighbour_whatever_codes_it(hole):
+    # One step is left on each side: 0.1, then 0.2.
+    slope = depth_slope(torch.tensor([[1.0, 1.1, hole, 2.0, 2.2]], dtype=torch.float64))[0]
+    assert torch.isnan(slope[2])
+    assert torch.allclose(slope[[0, 1, 3, 4]], torch.tensor([0.1, 0.1, 0.2, 0.2]).double())
