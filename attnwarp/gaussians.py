@@ -124,7 +124,7 @@ class Gaussians:
 
     def rotations(self) -> torch.Tensor:
         """(N, 3, 3) rotation matrices; column k is the splat's axis k in world coordinates."""
-        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=-1).unbind(-1)
+        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=-1, eps=0).unbind(-1)
         rows = [
             1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

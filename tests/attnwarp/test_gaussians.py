@@ -23,9 +23,11 @@ def splats(kind="2d", n=5, dtype=torch.float32, **changes):
     return Gaussians(kind, **{**fields, **changes})
 
 
-def test_rotations_are_scipys_for_quaternions_of_any_length():
+@pytest.mark.parametrize("length", [1e-14, 1.0, 1e14])
+def test_rotations_are_scipys_for_quaternions_of_any_length(length):
     model = splats(dtype=torch.float64)
     w, x, y, z = model.quats.T.numpy() * 7.0
+    model = dataclasses.replace(model, quats=length * model.quats)
     expected = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
     assert np.abs(model.rotations().numpy() - expected).max() < 1e-14
 
