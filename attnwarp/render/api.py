@@ -133,7 +133,7 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
         ([0.0, 0.0, -1.0], True)
     """
     check.shape(depth, (camera.height, camera.width), "depth")
-    rays = torch.as_tensor(camera.directions(), dtype=depth.dtype)
+    rays = torch.as_tensor(camera.directions(), dtype=depth.dtype, device=depth.device)
     defined = torch.isfinite(depth)
     points = rays * torch.where(defined, depth, 1.0)[..., None]
     result = torch.full_like(points, torch.nan)
@@ -154,7 +154,7 @@ def normal_from_depth(depth: Tensor, camera: Camera, pose: Tensor | None = None)
     around = around & (length > 0)
     unit = across / torch.where(around, length, 1.0).sqrt()[..., None]
     rotation = torch.tensor(camera.world_to_camera) if pose is None else pose
-    world = unit @ rotation[:3, :3].to(depth.dtype)
+    world = unit @ rotation[:3, :3].to(depth)
     inner = torch.where(around[..., None], world, torch.nan)
     return torch.nn.functional.pad(inner, (0, 0, 1, 1, 1, 1), value=torch.nan)
 

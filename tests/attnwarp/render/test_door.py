@@ -151,6 +151,15 @@ def test_normal_from_depth_refuses_a_depth_of_another_size() -> None:
         api.normal_from_depth(torch.ones(3, 3), camera())
 
 
+def test_normals_lie_where_their_depth_does() -> None:
+    # The device of shapes alone takes no tensor of the CPU beside its own, as a GPU takes none.
+    view = camera()
+    depth = torch.ones(view.height, view.width, device="meta")
+    normal = api.normal_from_depth(depth, view)
+    assert normal.device == depth.device
+    assert normal.shape == (view.height, view.width, 3)
+
+
 def test_importing_the_door_loads_neither_numba_nor_gsplat() -> None:
     modules = modules_after("import attnwarp.render")
     assert "attnwarp.render" in modules and not modules & {"numba", "gsplat", "scipy"}
