@@ -464,7 +464,12 @@ def _checked_segment(
         )
     tensor = segment if isinstance(segment, Tensor) else torch.from_numpy(np.array(segment))
     check.shape(tensor, (target.height, target.width), "target_segment")
-    return tensor.to(device="cpu", dtype=torch.bool)
+    if tensor.dtype != torch.bool:
+        raise ValueError(
+            f"target_segment: got {tensor.dtype}, expected bool; pass mask > 0.5 for a mask of"
+            " shares, mask > 127 for one of 8 bits"
+        )
+    return tensor.cpu()
 
 
 def _near_plane(gaussians: Gaussians, camera: Camera) -> float:

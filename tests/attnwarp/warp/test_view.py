@@ -388,6 +388,13 @@ def test_pictures_of_the_wrong_axes_or_range_are_refused_and_a_segment_may_be_an
         ),
         ({"source_image": first - 1}, r"source_image: got values in \[-1, -1\], expected sRGB"),
         ({"target_segment": np.ones((8, 8))}, r"target_segment: got shape \(8, 8\), expected \(12"),
+        # A share of 0.01 is no True, nor is NaN.
+        (
+            {"target_segment": np.full((12, 16), 0.01)},
+            "got torch.float64, expected bool; pass mask",
+        ),
+        ({"target_segment": torch.full((12, 16), torch.nan)}, "got torch.float32, expected bool"),
+        ({"target_segment": np.ones((12, 16), np.uint8)}, "got torch.uint8, expected bool; pass"),
     ):
         given = {"source_image": first, "target_image": second, **change}
         with pytest.raises(ValueError, match=message):
