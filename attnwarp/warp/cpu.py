@@ -163,7 +163,9 @@ def blend_tokens(
 
     A gradient flows back to ``source`` and ``new``, and none to ``alpha``.
     """
-    if in_place and new.is_contiguous():
+    # In one memory, rows of the source would be read after the blend had written them.
+    apart = source.untyped_storage().data_ptr() != new.untyped_storage().data_ptr()
+    if in_place and apart and new.is_contiguous():
         _blend(_values(source), _values(new), taps, mask, alpha)
         return new
     result: Tensor = _BlendTokens.apply(source, new, taps, mask, alpha)

@@ -119,6 +119,16 @@ def test_maps_of_any_size_and_tokens_that_are_not_contiguous_are_read_right(laye
     assert torch.equal(own, expected)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_tokens_of_the_source_may_lie_in_what_is_written(layer, backend, count):
+    warp = dataclasses.replace(layer, backend=backend)
+    tokens = tokens_of(random_maps(layer))
+    expected = warp.blend_tokens(tokens[:count].clone(), tokens.clone(), 1.0)
+    assert (expected - tokens).abs().max() > 0.1
+    assert torch.equal(warp.blend_tokens(tokens[:count], tokens, 1.0, in_place=True), expected)
+
+
 def test_taps_of_no_weight_are_never_read_and_undefined_pixels_give_0(layer):
     # Hard case 36. The identity has one tap of weight 1 a pixel; the others hold NaN.
     camera = layer.correspondence.target
