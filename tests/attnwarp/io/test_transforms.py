@@ -249,6 +249,17 @@ def test_an_image_of_another_size_is_refused_or_resizes_its_camera(tmp_path):
     assert cameras[1].K.tolist() == [[5, 0, 1.75], [0, 5.5, 1.625], [0, 0, 1]]
 
 
+def test_no_camera_is_resized_to_a_picture_of_another_shape(tmp_path):
+    # No resampling turns 4:3 into 3:4; a side may be rounded: 8 x 6 by 0.4 is 3.2 x 2.4.
+    path = folder_of(tmp_path)
+    image(tmp_path / "images/001.png", (3, 2))
+    assert read_transforms(path, resize_cameras=True).cameras[1].width == 3
+    image(tmp_path / "images/001.png", (6, 8))
+    message = r"001.png: got 8 x 6 \(height x width\), expected the aspect ratio of 6 x 8; turn"
+    with pytest.raises(FileFormatError, match=message):
+        read_transforms(path, resize_cameras=True)
+
+
 def test_a_file_that_is_no_image_is_refused(tmp_path):
     path = folder_of(tmp_path)
     (tmp_path / "images/001.png").write_text("not a picture")
