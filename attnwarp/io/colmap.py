@@ -410,8 +410,25 @@ def _text_images(path: Path) -> list[_Pose]:
                 path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
         # The line after it holds the keypoints and may be empty, or missing at the end.
-        next(lines, None)
+        number, line = next(lines, (number, ""))
+        if not _are_keypoints(line):
+            raise _damaged(
+                path,
+                number,
+                line,
+                "the keypoints X Y POINT3D_ID of the image before, or an empty line for none",
+            )
     return poses
+
+
+def _are_keypoints(line: str) -> bool:
+    """Whether a line of images.txt holds numbers in threes, or nothing. The next image has ten
+    fields, of which the last is a name.
+    """
+    try:
+        return len([float(field) for field in line.split()]) % 3 == 0
+    except ValueError:
+        return False
 
 
 def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:

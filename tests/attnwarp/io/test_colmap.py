@@ -245,6 +245,18 @@ def test_a_damaged_line_is_named(tmp_path, name, line, parts):
         assert part in str(caught.value), str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["b.png", "12"])
+def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path, name):
+    write_text(tmp_path)
+    first, second = "1 1 0 0 0 0 0 1 7 a.png", f"2 1 0 0 0 0 0 1 7 {name}"
+    (tmp_path / "images.txt").write_text(f"{first}\n{second}\n")
+    with pytest.raises(FileFormatError, match="images.txt: line 2: got '2 1 0.*an empty line for"):
+        read_colmap(tmp_path, missing_images="none")
+    for keypoints in ("", "1.5 2.5 -1 3 4e1 17"):
+        (tmp_path / "images.txt").write_text(f"{first}\n{keypoints}\n{second}\n")
+        assert len(read_colmap(tmp_path, missing_images="none")) == 2
+
+
 def test_an_empty_text_file_of_points_holds_none_and_an_empty_binary_one_is_damaged(tmp_path):
     (write_text(tmp_path / "text") / "points3D.txt").write_bytes(b"")
     data = read_dataset(tmp_path / "text", missing_images="none")
