@@ -121,6 +121,17 @@ def test_a_frames_own_intrinsics_win_over_those_at_the_top(tmp_path):
     np.testing.assert_allclose(b.K, [[f, 0, 8], [0, f, 3.25], [0, 0, 1]])
 
 
+@pytest.mark.parametrize(("own", "other"), [("fl_x", "fl_y"), ("fl_y", "fl_x")])
+def test_one_focal_length_beside_another_at_the_top_could_mean_two_things(tmp_path, own, other):
+    image(tmp_path / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": pose(), own: LENS[own]}
+    refused = rf"frames\[0\] \(a.png\): {own}: got {LENS[own]:g} without {other}, which is {LENS[other]:g}"
+    with pytest.raises(FileFormatError, match=refused):
+        read_transforms(write(tmp_path, [frame], **LENS))
+    square = read_transforms(write(tmp_path, [frame], **LENS | {other: LENS[own]})).cameras[0]
+    assert square.K[0, 0] == square.K[1, 1] == LENS[own]
+
+
 @pytest.mark.parametrize("noise", ["float32", "five digits"])
 def test_a_rotation_with_small_noise_becomes_the_nearest_rotation(tmp_path, noise):
     matrix = pose(4)
