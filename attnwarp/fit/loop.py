@@ -239,7 +239,8 @@ class _Run:
         centers = np.stack([camera.position for camera in views.cameras])
         self.start, self.first_degree = start.digest(), start.used_sh_degree()
         self.model = Model(start, settings, self.extent)
-        self.density = Density(settings, self.extent, centers.mean(0) - start.origin, len(start))
+        middle = centers.mean(0) - self.model.origin
+        self.density = Density(settings, self.extent, middle, len(start))
         self.random = torch.Generator().manual_seed(settings.seed)
         self.queue: list[int] = []
         self.iteration = 0

@@ -12,6 +12,7 @@ from torch.optim.adam import adam
 
 from attnwarp.fit.settings import FitSettings
 from attnwarp.gaussians import Gaussians
+from attnwarp.io.ply import split_origin
 
 Tensor = torch.Tensor
 
@@ -35,6 +36,7 @@ class Model:
     quaternions.
 
     Attributes:
+        origin: (3,) float64 world coordinates that "means" are relative to.
         tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
@@ -46,10 +48,13 @@ class Model:
 
     def __init__(self, start: Gaussians, settings: FitSettings, extent: float) -> None:
         self.settings, self.extent = settings, extent
-        self.origin, self.antialiased = start.origin, settings.antialiased
+        self.antialiased = settings.antialiased
         g = start.detach().to(dtype=torch.float32)
+        # float64 centres far from zero would be moved by float32.
+        offset, means = split_origin(start.means.detach().cpu().numpy())
+        self.origin = start.origin + offset
         self.tensors: dict[str, Tensor] = {
-            "means": g.means.clone(),
+            "means": torch.tensor(means, device=g.means.device),
             "dc": g.sh[:, :1].clone(),
             "rest": g.sh[:, 1:].clone(),
             "opacity": torch.logit(g.opacities, eps=1e-6),

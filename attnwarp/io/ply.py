@@ -134,7 +134,7 @@ def read_ply(
         )
     if antialiased is None:
         antialiased = header.antialiased(path)
-    offset, means = _split_origin(xyz)
+    offset, means = split_origin(xyz)
     if not np.isfinite(means).all():
         _refuse(
             path,
@@ -612,7 +612,7 @@ def _place(
     error = world_error(g)
     moved = int((~(error <= tolerance)).sum())
     if coordinates == "relative" or (coordinates == "auto" and moved):
-        offset, means = _split_origin(g.means.numpy())
+        offset, means = split_origin(g.means.numpy())
         origin = g.origin + offset
         if coordinates == "auto":
             _warn(
@@ -638,7 +638,7 @@ def _warn(message: str) -> None:
     warnings.warn(message, InputWarning, stacklevel=4)
 
 
-def _split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:
+def split_origin(points: npt.NDArray[np.floating[Any]]) -> tuple[Array, npt.NDArray[np.float32]]:
     """float64 (N, 3) points as an origin and float32 means with points = origin + means.
 
     The origin is zero when float32 holds the points exactly, or when none lies further from zero

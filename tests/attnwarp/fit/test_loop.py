@@ -187,6 +187,24 @@ def test_a_world_far_from_its_origin_is_fitted_as_well():
     np.testing.assert_allclose(figures[0], figures[1], atol=0.05)
 
 
+def test_float64_splats_far_from_zero_stay_where_they_are():
+    # No learning rate, so no splat may move. float32 resolves 1e6 to 0.06; relative to the splats'
+    # own middle it resolves 1e-7.
+    rates = dict.fromkeys(
+        ("lr_means", "lr_means_final", "lr_dc", "lr_rest", "lr_opacity", "lr_scales", "lr_quats"),
+        0.0,
+    )
+    settings = FitSettings(kind="3d", iterations=1, sh_degree=0, densify=False, **rates)
+    offset = (1e6, -2e6, 5e5)
+    near = blobs(offset=offset).to(dtype=torch.float64)
+    means = near.means + torch.tensor(offset, dtype=torch.float64)
+    far = dataclasses.replace(near, means=means, origin=np.zeros(3))
+    views = pictures(far, ring(offset=np.array(offset))[:2])
+    result = fit(far, views, settings, held_out=views)
+    assert np.abs(result.gaussians.world_means() - means.numpy()).max() < 1e-6
+    assert result.history[0].psnr > 100
+
+
 def test_scaling_the_world_changes_nothing():
     figures = []
     for scale in (1.0, 1e-3, 1e3):
