@@ -24,6 +24,16 @@ ORTHONORMAL_TOLERANCE = 1e-5
 below it.
 """
 
+EXACT_ROTATION = 1e-12
+"""Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
+
+
+def nearest_orthonormal(R: Array) -> Array:
+    """The orthonormal (3, 3) matrix nearest to ``R``, by SVD."""
+    U, _, Vt = np.linalg.svd(R)
+    nearest: Array = U @ Vt
+    return nearest
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -33,7 +43,8 @@ class Camera:
         K: (3, 3) intrinsics in pixels: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]. The principal
             point may lie outside the image.
         world_to_camera: (4, 4) rigid transform from world to camera axes (x right, y down, z
-            forward).
+            forward). A rotation that is orthonormal to 1e-12 is kept bit for bit; another is
+            replaced by the nearest one, about the same centre of projection.
         width, height: image size in pixels, at least 1.
         name: a label for people; it takes no part in any computation.
 
@@ -98,6 +109,11 @@ class Camera:
                 "world_to_camera: rotation has determinant -1 (it mirrors); flip one axis of the"
                 " pose"
             )
+        if error > EXACT_ROTATION:
+            # R^T stands for the inverse of R, and its error times |t| for the camera's place.
+            center = -np.linalg.solve(R, pose[:3, 3])
+            pose[:3, :3] = nearest_orthonormal(R)
+            pose[:3, 3] = -pose[:3, :3] @ center
         K.setflags(write=False)
         pose.setflags(write=False)
         object.__setattr__(self, "K", K)

@@ -11,15 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp import check
-from attnwarp.camera import Camera
+from attnwarp.camera import EXACT_ROTATION, Camera, nearest_orthonormal
 from attnwarp.io.file import FileFormatError, is_file
 from attnwarp.io.images import image_size
 from attnwarp.io.lens import Lens
 
 Array = npt.NDArray[np.float64]
-
-EXACT_ROTATION = 1e-12
-"""Up to here a rotation's error is float64 rounding, and it is kept bit for bit."""
 
 ROTATION_TOLERANCE = 1e-4
 """Largest |R R^T - I| that is taken for float32 or printing noise and repaired; Camera itself
@@ -154,9 +151,7 @@ def nearest_rotation(path: Path, name: str, R: Array) -> Array:
         )
     if error <= EXACT_ROTATION:
         return R
-    U, _, Vt = np.linalg.svd(R)
-    rotation: Array = U @ Vt
-    return rotation
+    return nearest_orthonormal(R)
 
 
 def with_images(

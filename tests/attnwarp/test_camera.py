@@ -106,6 +106,31 @@ def test_the_relative_pose_keeps_a_tiny_baseline_in_a_far_away_world():
     assert np.abs(relative[:3, :3] - np.eye(3)).max() < 1e-15
 
 
+@pytest.mark.parametrize("error", ["float32", "scale"])
+def test_a_rough_rotation_far_from_the_origin_gives_one_camera(error):
+    rough, there = pose(), np.array([6000.0, -7000.0, 4000.0])
+    R = rough[:3, :3]
+    R[:] = R.astype(np.float32) if error == "float32" else (1 + 4e-6) * R
+    assert 1e-8 < np.abs(R @ R.T - np.eye(3)).max() < 1e-5
+    rough[:3, 3] = -R @ there
+    cam = camera(world_to_camera=rough)
+    assert np.abs(cam.position - there).max() < 1e-8
+    # K (R p + t) by the pose that was given, and by the camera's own, which renders use.
+    points = there + np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3)) + 2 * cam.forward
+    xy, z = cam.project(points)
+    for matrix, bound in ((rough, 0.01), (cam.world_to_camera, 1e-6)):
+        h = (points @ matrix[:3, :3].T + matrix[:3, 3]) @ K.T
+        assert np.abs(h[:, :2] / h[:, 2:] - xy).max() < bound
+    assert np.abs(cam.unproject(xy, z) - points).max() < 1e-8
+    assert np.array_equal(Camera.from_dict(cam.to_dict()).world_to_camera, cam.world_to_camera)
+
+
+def test_a_rotation_exact_to_rounding_keeps_its_bits():
+    for seed in range(20):
+        given = pose(np.random.default_rng(seed).normal(size=3), (1e4, -2e4, 3e4))
+        assert np.array_equal(camera(world_to_camera=given).world_to_camera, given)
+
+
 def test_relative_poses_chain_as_matrices_do():
     a, b = camera(), camera(world_to_camera=pose((1.2, 0.1, -0.3), (0.0, 1.0, 2.0)))
     assert (
