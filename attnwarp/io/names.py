@@ -20,14 +20,25 @@ def file_stems(cameras: Sequence[Camera]) -> list[str]:
         >>> file_stems([Camera.look_at((3, 0, 0), (0, 0, 0), name=n, **view) for n in names])
         ['0000-1', '0001-1', '2']
     """
-    stems = [Path(camera.name).stem or "view" for camera in cameras]
-    counts = Counter(stems)
-    alone = {stem for stem, count in counts.items() if count == 1}
+    return numbered([Path(camera.name).stem or "view" for camera in cameras])
+
+
+def numbered(names: Sequence[str]) -> list[str]:
+    """The names, with a number before the last part of those that are the same.
+
+    Example:
+        >>> from attnwarp.io.names import numbered
+        >>> numbered(["left/a.png", "left/a.png", "b.png"])
+        ['left/0000-a.png', 'left/0001-a.png', 'b.png']
+    """
+    counts = Counter(names)
+    alone = {name for name, count in counts.items() if count == 1}
     result = []
-    for index, stem in enumerate(stems):
-        name = stem
+    for index, own in enumerate(names):
+        name = own
         # A numbered name may be that of another view.
-        while counts[stem] > 1 and (name == stem or name in alone):
-            name = f"{index:04d}-{name}"
+        while counts[own] > 1 and (name == own or name in alone):
+            folder, slash, last = name.rpartition("/")
+            name = f"{folder}{slash}{index:04d}-{last}"
         result.append(name)
     return result

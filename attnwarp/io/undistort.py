@@ -11,6 +11,7 @@ from attnwarp.io.dataset import Dataset
 from attnwarp.io.file import write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.lens import undistorted_camera, undistorted_image
+from attnwarp.io.names import numbered
 from attnwarp.io.transforms import write_transforms
 
 
@@ -27,7 +28,8 @@ def undistort(
 
     Args:
         dataset: read with ``distorted="keep"``; cameras without a picture are left out.
-        folder: receives transforms.json and images/NAME.png; made if need be.
+        folder: receives transforms.json and images/NAME.png, numbered where names are the same;
+            made if need be.
         progress: called with the number of pictures done and their total.
 
     Returns:
@@ -58,19 +60,18 @@ def undistort(
         camera if lens is None else undistorted_camera(camera, lens)
         for camera, lens in zip(dataset.cameras, dataset.lenses, strict=True)
     ]
-    paths: list[Path | None] = []
-    for i, (camera, lens, target, source) in enumerate(
-        zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, strict=True)
+    names = numbered([_name(camera.name, i) for i, camera in enumerate(dataset.cameras)])
+    paths: list[Path | None] = [folder / "images" / name for name in names]
+    for i, (camera, lens, target, source, path) in enumerate(
+        zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
     ):
-        assert source is not None
+        assert source is not None and path is not None
         image = read_image(source)
         if lens is not None:
             image = undistorted_image(image, camera, lens, target)
-        path = folder / "images" / _name(camera.name, i)
         path.parent.mkdir(parents=True, exist_ok=True)
         data = encode_png(image)
         write_atomically(path, lambda stream, data=data: stream.write(data))  # type: ignore[misc]
-        paths.append(path)
         if progress is not None:
             progress(i + 1, len(cameras))
     result = replace(dataset, cameras=cameras, image_paths=paths, lenses=[None] * len(cameras))

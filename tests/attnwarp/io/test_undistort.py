@@ -1,5 +1,6 @@
 """Lens distortion against OpenCV's formulas, and undistorted pictures against COLMAP's own."""
 
+import dataclasses
 import json
 
 import cv2
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from attnwarp import Camera
 from attnwarp.fit import load_views
 from attnwarp.io import (
+    Dataset,
     FileFormatError,
     Lens,
     read_colmap,
@@ -179,6 +181,38 @@ def test_a_data_set_is_undistorted_and_then_fitted_on(tmp_path):
     shown = read_image(back.image_paths[0])[15, 20]
     np.testing.assert_allclose(shown, patch, atol=1)
     assert len(load_views(back)) == 2
+
+
+def constant_pictures(folder, names, reds=(0, 80, 160)):
+    """A data set of pictures of one colour each; their files' names are apart."""
+    folder.mkdir(parents=True)
+    paths = [folder / f"{red}.png" for red in reds]
+    for path, red in zip(paths, reds, strict=True):
+        Image.new("RGB", SIZE, (red, 0, 0)).save(path)
+    cameras = [dataclasses.replace(camera_of("OPENCV"), name=name) for name in names]
+    return Dataset(cameras, paths, lenses=[Lens("brown", (-0.1,))] * len(cameras))
+
+
+@pytest.mark.parametrize(
+    ("names", "files"),
+    [
+        (["a.jpg", "a.png", "b.png"], ["0000-a.png", "0001-a.png", "b.png"]),
+        (["images/r.0001", "images/r.0002", "images/r.0003"], [f"000{i}-r.png" for i in range(3)]),
+        (["images/s/a", "s/a", "s/0000-a"], ["s/0000-0000-a.png", "s/0001-a.png", "s/0000-a.png"]),
+        (["", "000000.png", "c.v2.png"], ["0000-000000.png", "0001-000000.png", "c.v2.png"]),
+    ],
+)
+def test_every_view_has_a_picture_of_its_own(tmp_path, names, files):
+    data = constant_pictures(tmp_path / "in", names)
+    undistort(data, tmp_path / "out")
+    back = read_dataset(tmp_path / "out")
+    # One colour stays one colour, however it is resampled.
+    assert [np.unique(read_image(p)[..., 0]).tolist() for p in back.image_paths] == [
+        [0],
+        [80],
+        [160],
+    ]
+    assert [str(p.relative_to(tmp_path / "out/images")) for p in back.image_paths] == files
 
 
 def test_a_model_that_colmap_writes_is_read_with_its_lens(tmp_path):
