@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+from attnwarp.errors import InputError
 from attnwarp.io.dataset import Dataset
-from attnwarp.io.file import write_atomically
+from attnwarp.io.file import is_file, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.lens import undistorted_camera, undistorted_image
 from attnwarp.io.names import numbered
@@ -37,6 +38,7 @@ def undistort(
 
     Raises:
         FileFormatError: a picture that cannot be read.
+        InputError: a picture would be written over one that is read.
         ValueError: no camera has a picture, or a lens folds its picture over.
 
     Example:
@@ -62,6 +64,7 @@ def undistort(
     ]
     names = numbered([_name(camera.name, i) for i, camera in enumerate(dataset.cameras)])
     paths: list[Path | None] = [folder / "images" / name for name in names]
+    _check_apart(paths, dataset.image_paths)
     for i, (camera, lens, target, source, path) in enumerate(
         zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
     ):
@@ -77,6 +80,21 @@ def undistort(
     result = replace(dataset, cameras=cameras, image_paths=paths, lenses=[None] * len(cameras))
     write_transforms(folder, result)
     return result
+
+
+def _check_apart(written: list[Path | None], read: list[Path | None]) -> None:
+    """Refuse to write over any picture that is read, that of another camera too."""
+    # By what the system calls a file, so under another name or by a link as well.
+    files = [path.stat() for path in read if path is not None and is_file(path)]
+    sources = {(file.st_dev, file.st_ino) for file in files}
+    for path in written:
+        if path is None or not is_file(path):
+            continue
+        file = path.stat()
+        if (file.st_dev, file.st_ino) in sources:
+            raise InputError(
+                f"{path}: is a picture to undistort; name another folder for the result"
+            )
 
 
 def _name(name: str, index: int) -> str:

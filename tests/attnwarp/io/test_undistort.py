@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from attnwarp import Camera
+from attnwarp.errors import InputError
 from attnwarp.fit import load_views
 from attnwarp.io import (
     Dataset,
@@ -213,6 +214,20 @@ def test_every_view_has_a_picture_of_its_own(tmp_path, names, files):
         [160],
     ]
     assert [str(p.relative_to(tmp_path / "out/images")) for p in back.image_paths] == files
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_no_picture_that_is_read_is_written_over(tmp_path, link):
+    # The second of three is written to the place of the third.
+    data = constant_pictures(tmp_path / "out/images", ["a.png", "160.png", "b.png"])
+    folder = tmp_path / "out"
+    if link:
+        folder = tmp_path / "another name"
+        folder.symlink_to("out")
+    before = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")}
+    with pytest.raises(InputError, match=r"160.png: is a picture to undistort; name another"):
+        undistort(data, folder)
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
 
 
 def test_a_model_that_colmap_writes_is_read_with_its_lens(tmp_path):
