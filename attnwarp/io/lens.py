@@ -29,6 +29,9 @@ ever more pixels for them."""
 ROUND_TRIP = 0.01
 """Largest distance in px between a border pixel and its undistorted point distorted again."""
 
+FOLD_GRID = 200
+"""Points along each axis at which an undistorted picture is searched for folds: milliseconds."""
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -121,15 +124,10 @@ class Lens:
             with np.errstate(invalid="ignore", divide="ignore"):
                 factor = np.where(r > 0, np.tan(theta) / r, 1.0)
             return target * factor[..., None]
-        # Newton's method with the Jacobian from differences.
+        # Newton's method.
         point = target.copy()
-        step = 1e-6
-        right, below = np.array([step, 0.0]), np.array([0.0, step])
         for _ in range(50):
-            here = self.distort(point)
-            dx = (self.distort(point + right) - here) / step
-            dy = (self.distort(point + below) - here) / step
-            det = dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+            here, dx, dy, det = self._linear(point)
             error = here - target
             with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
                 point = point - np.stack(
@@ -140,6 +138,31 @@ class Lens:
                     axis=-1,
                 )
         return point
+
+    def _linear(self, point: Array) -> tuple[Array, Array, Array, Array]:
+        """:meth:`distort`, its slopes in x and in y by differences, and their determinant."""
+        step = 1e-6
+        here = self.distort(point)
+        dx = (self.distort(point + np.array([step, 0.0])) - here) / step
+        dy = (self.distort(point + np.array([0.0, step])) - here) / step
+        return here, dx, dy, dx[..., 0] * dy[..., 1] - dx[..., 1] * dy[..., 0]
+
+    def folds(self, xy: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+        """Where :meth:`distort` mirrors, beyond a fold that shows the same points again.
+
+        Args:
+            xy: (..., 2) undistorted normalised coordinates.
+
+        Returns:
+            (...) bool.
+
+        Example:
+            >>> from attnwarp.io import Lens
+            >>> Lens("brown", (-0.1,)).folds([[1.0, 0.0], [2.0, 0.0]]).tolist()  # 1 - 0.3 r^2
+            [False, True]
+        """
+        folded: npt.NDArray[np.bool_] = ~(self._linear(np.asarray(xy, dtype=np.float64))[3] > 0)
+        return folded
 
     def _angle(self, theta: Array) -> Array:
         k1, k2, k3, k4 = self.coefficients
@@ -176,21 +199,27 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
         np.stack([across, np.full(W, 0.5)], -1), np.stack([across, np.full(W, H - 0.5)], -1),
     ]  # fmt: skip
     points = [lens.undistort(camera.directions(side)[..., :2]) for side in sides]
+    folded = ValueError(
+        f"lens: the coefficients {lens.coefficients} fold the picture of camera {camera.name!r}"
+        " over, so it cannot be undistorted; calibrate the lens again"
+    )
     for side, point in zip(sides, points, strict=True):
         steep = np.linalg.norm(point, axis=-1) >= np.tan(STEEPEST) * (1 - 1e-9)
         error = np.abs(_pixels(camera, lens.distort(point)) - side).max(axis=-1)
         if not (steep | (error <= ROUND_TRIP)).all():
-            raise ValueError(
-                f"lens: the coefficients {lens.coefficients} fold the picture of camera"
-                f" {camera.name!r} over, so it cannot be undistorted; calibrate the lens again"
-            )
+            raise folded
     left, right, top, bottom = (_pixels(camera, point) for point in points)
     cx, cy = camera.K[0, 2], camera.K[1, 2]
     x0, x1 = _window(left[:, 0].max(), right[:, 0].min(), cx, W)
     y0, y1 = _window(top[:, 1].max(), bottom[:, 1].min(), cy, H)
     K = camera.K.copy()
     K[:2, 2] -= [x0, y0]
-    return Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
+    target = Camera(K, camera.world_to_camera, x1 - x0, y1 - y0, camera.name)
+    # The border may lie beyond a fold, and be right there.
+    grid = [np.linspace(0.5, n - 0.5, min(n, FOLD_GRID)) for n in (target.width, target.height)]
+    if lens.folds(target.directions(np.stack(np.meshgrid(*grid), -1))[..., :2]).any():
+        raise folded
+    return target
 
 
 def undistorted_image(
