@@ -13,9 +13,8 @@ edited.ply  result.json  times.json  the edited splats; counters; seconds by par
 from __future__ import annotations
 
 import tempfile
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
@@ -42,6 +41,7 @@ from attnwarp.propagate.scene import (
     near_of,
     render_picture,
 )
+from attnwarp.propagate.times import Times
 from attnwarp.propagate.tune import TrainingView
 
 FOLDERS = ("rounds", "views", "renders/before", "renders/after")
@@ -171,8 +171,7 @@ class _Run:
         self.folder = Folder(folder, work.scene.cameras, folders)
         self.names = self.folder.names
         self.fitting = Fitting(work.frozen, work.scene.cameras, work.settings, work.backend)
-        self.seconds: dict[str, float] = {}
-        self._part, self._since = "", 0.0
+        self.times = Times(self.folder)
         self.done, self.rows, self.edits = 0, 0, 0
         self.latest: dict[int, int] = {}
         self.total = sum(
@@ -203,8 +202,6 @@ class _Run:
         )
 
     def go(self) -> Baseline:
-        if self.folder.has("times.json"):
-            self.seconds = dict(self.folder.read_json("times.json"))
         for number in range(len(self.method.rounds)):
             if self._ended_before(number):
                 break
@@ -239,7 +236,7 @@ class _Run:
 
     def _out_of_seconds(self) -> bool:
         limit = self.budget.seconds
-        return limit is not None and sum(self.seconds.values()) + self._running() >= limit
+        return limit is not None and sum(self.times.seconds.values()) >= limit
 
     def _limit(self, rows: int) -> str | None:
         """The limit that forbids an edit of so many rows through the network."""
@@ -276,16 +273,16 @@ class _Run:
         )
         # Rounds before are tuned by now: this is the current model.
         model = self.fitting.gaussians()
-        with self._timed("edit"):
+        with self.times.part("edit"):
             edits = self.method.edit(number, group, model, lambda: self._tell(text, len(group)))
-        with self._timed("write"):
+        with self.times.part("write"):
             for view, edit in zip(group, edits, strict=True):
                 pixels = to_bytes(self.work.composite(view, edit.picture))
                 self.folder.write_picture(self._picture(number, view), pixels)
                 about = {"view": self.names[view], "round": number + 1, **edit.about}
                 # Last: a view counts as edited once this is there.
                 self.folder.write_json(record_of(self._picture(number, view)), about)
-        self._write_times()
+        self.times.write()
 
     def _picture(self, number: int, view: int) -> str:
         return f"rounds/{number + 1}/{self.names[view]}.png"
@@ -309,7 +306,7 @@ class _Run:
         if not views or over or (self.folder.has(state) and self.fitting.iteration >= end):
             return
         text = f"round {number + 1} of {len(self.method.rounds)}: tuning"
-        with self._timed("tune"):
+        with self.times.part("tune"):
             self.fitting.advance(
                 begin,
                 end,
@@ -318,11 +315,11 @@ class _Run:
                 checkpoint_seconds=self.checkpoint_seconds,
                 spent=self._out_of_seconds,
                 watch=lambda: self._tell(f"{text}, loss {self.fitting.loss:.4f}", 1),
-                saved=self._write_times,
+                saved=self.times.write,
             )
         if self.fitting.iteration < end:
             self._cut("seconds", number, len(part.groups))
-        self._write_times()
+        self.times.write()
 
     def _training(self, view: int) -> TrainingView:
         camera = self.work.scene.cameras[view]
@@ -338,7 +335,7 @@ class _Run:
     def _finish(self) -> Baseline:
         final, cut = self.fitting.gaussians(), self.cut
         edited = {view: self._edited(view) for view in sorted(self.latest)}
-        with self._timed("render"):
+        with self.times.part("render"):
             write_ply(self.folder.path / "edited.ply", final)
             for view, pixels in edited.items():
                 self.folder.write_picture(f"views/{self.names[view]}.png", pixels)
@@ -360,8 +357,8 @@ class _Run:
         tuned = {self.names[view]: n for view, n in sorted(self.fitting.visits.items())}
         limit = None if cut is None else cut["limit"]
         self.folder.write_json("result.json", {"counters": counters, "tuned": tuned, "cut": limit})
-        self._write_times()
-        return Baseline(self.name, final, edited, counters, dict(self.seconds), limit)
+        self.times.write()
+        return Baseline(self.name, final, edited, counters, self.times.seconds, limit)
 
     def _sheet(self) -> Bytes:
         """Rows: before, the edits (black where none), the edited scene. Columns: views."""
@@ -387,27 +384,7 @@ class _Run:
         ]
         return np.concatenate(rows)
 
-    # --- time and progress
-
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        self._part, self._since = part, time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[part] = self.seconds.get(part, 0.0) + self._running()
-            self._part = ""
-
-    def _running(self) -> float:
-        """Seconds of the part at work so far."""
-        return time.perf_counter() - self._since if self._part else 0.0
-
-    def _write_times(self) -> None:
-        seconds = dict(self.seconds)
-        if self._part:
-            seconds[self._part] = seconds.get(self._part, 0.0) + self._running()
-        rounded = {part: round(value, 3) for part, value in seconds.items()}
-        self.folder.write_json("times.json", rounded)
+    # --- progress
 
     def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
         self.done = self.done + steps if done is None else done

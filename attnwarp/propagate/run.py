@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -55,6 +54,7 @@ from attnwarp.propagate.scene import (
 from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
 from attnwarp.propagate.stages import Plan, choose_chain
+from attnwarp.propagate.times import Times
 from attnwarp.propagate.tune import TrainingView, Tuning
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 
@@ -240,9 +240,7 @@ class _Run:
         self.view_editor = ViewEditor(editor, instruction, settings, store=place, announce=announce)
         self.near = near_of(scene.cameras, gaussians)
         self._frozen_surfaces: dict[int, Surface] = {}
-        self.seconds: dict[str, float] = {}
-        if self.folder.has("times.json"):
-            self.seconds = dict(self.folder.read_json("times.json"))
+        self.times = Times(self.folder)
         self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
         if announce is not None:
             self._announce_changes(announce, source, multiple)
@@ -326,7 +324,7 @@ class _Run:
             surface = warp.rules["defined"].numpy()
             return warp.mask.numpy(), surface if segments is None else surface & segments[target]
 
-        with self._timed("warp"):
+        with self.times.part("warp"):
             views = len(self.scene.cameras)
             return choose_chain(views, source, s.sources, s.chain_coverage, seen)
 
@@ -352,7 +350,7 @@ class _Run:
         # Edited again for its features, it is no progress.
         step = 0 if stored else 1
         sight = self._sight(view, self.frozen, len(before)) if before else None
-        with self._timed("source"):
+        with self.times.part("source"):
             source = self.view_editor.source(
                 self._target(view, self.frozen, sight),
                 before,
@@ -422,7 +420,7 @@ class _Run:
         sources = self.sources  # first, so that their time is not counted here
         # Stages before are tuned by now: this is the current model.
         model = self.tuning.gaussians()
-        with self._timed("warp"):
+        with self.times.part("warp"):
             sights = [self._sight(view, model, len(sources)) for view in batch]
         text = (
             f"stage {number + 1} of {len(self.plan.stages)}: editing view"
@@ -431,14 +429,14 @@ class _Run:
         targets = [
             self._target(view, model, sight) for view, sight in zip(batch, sights, strict=True)
         ]
-        with self._timed("edit"):
+        with self.times.part("edit"):
             pictures = self.view_editor.targets(
                 sources, targets, number, watch=lambda: self._tell(text, len(batch))
             )
-        with self._timed("write"):
+        with self.times.part("write"):
             for view, picture, sight in zip(batch, pictures, sights, strict=True):
                 self._write_view(number + 1, view, picture, sight, sources)
-        self._write_times()
+        self.times.write()
 
     def _target(self, view: int, model: Gaussians, sight: Sight | None) -> Target:
         return Target(view, self._guide(view, model), self._start_picture(view, model), sight)
@@ -599,7 +597,7 @@ class _Run:
             def tell() -> None:
                 self._tell(f"{text}, loss {self.tuning.loss:.4f}", 1)
 
-            with self._timed("tune"):
+            with self.times.part("tune"):
                 self.tuning.stage(
                     number,
                     views,
@@ -607,10 +605,11 @@ class _Run:
                     checkpoint=self.folder.path / state,
                     checkpoint_seconds=self.checkpoint_seconds,
                     watch=tell,
+                    saved=self.times.write,
                 )
         if not self.folder.has(splats):
             write_ply(self.folder.path / splats, self.tuning.gaussians())
-        self._write_times()
+        self.times.write()
 
     def _training(self, view: int) -> TrainingView:
         camera = self.scene.cameras[view]
@@ -633,7 +632,7 @@ class _Run:
 
     def _finish(self) -> Propagation:
         final = self.tuning.gaussians()
-        with self._timed("render"):
+        with self.times.part("render"):
             write_ply(self.folder.path / "edited.ply", final)
             for part, model in (("before", self.frozen), ("after", final)):
                 for camera, name in zip(self.scene.cameras, self.names, strict=True):
@@ -651,9 +650,9 @@ class _Run:
                 "tuned": {self.names[v]: n for v, n in sorted(self.tuning.visits.items())},
             },
         )
-        self._write_times()
+        self.times.write()
         edited = {view: self._edited(view) for view in self.plan.edited}
-        return Propagation(final, self.plan, edited, psnr, counters, dict(self.seconds))
+        return Propagation(final, self.plan, edited, psnr, counters, self.times.seconds)
 
     def _edit_psnr(self, final: Gaussians) -> dict[str, Any]:
         views = list(self.plan.edited)
@@ -696,17 +695,7 @@ class _Run:
         if recording.is_dir():
             shutil.rmtree(recording)
 
-    # --- time and progress
-
-    @contextmanager
-    def _timed(self, part: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begin
-
-    def _write_times(self) -> None:
-        rounded = {part: round(seconds, 3) for part, seconds in self.seconds.items()}
-        self.folder.write_json("times.json", rounded)
+    # --- progress
 
     def _tell(self, text: str, steps: int = 0, *, done: int | None = None) -> None:
         self.done = self.done + steps if done is None else done

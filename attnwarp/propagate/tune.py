@@ -111,6 +111,7 @@ class Tuning:
         checkpoint: Path,
         checkpoint_seconds: float = 30.0,
         watch: Callable[[], None] | None = None,
+        saved: Callable[[], None] | None = None,
     ) -> None:
         """Tune through a stage, from wherever it stands to its end.
 
@@ -120,6 +121,7 @@ class Tuning:
             source: the source view.
             checkpoint: file that is written every ``checkpoint_seconds`` and at the end.
             watch: called after each iteration.
+            saved: called after each checkpoint but the last.
         """
         end = (number + 1) * self.settings.iterations
         if self.iteration == number * self.settings.iterations:
@@ -131,6 +133,8 @@ class Tuning:
                 watch()
             if self.iteration < end and time.perf_counter() - written >= checkpoint_seconds:
                 save(checkpoint, self.state())
+                if saved is not None:
+                    saved()
                 written = time.perf_counter()
         save(checkpoint, self.state())
 

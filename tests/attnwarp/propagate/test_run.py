@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
@@ -359,6 +360,29 @@ def test_killed_at_a_random_moment_and_resumed_it_gives_the_same_bytes(
     moment = int(np.random.default_rng(seed).integers(1, 60))
     killed_and_resumed(scene, editor, tmp_path, [moment])
     assert files(tmp_path) == files(finished[1])
+
+
+def test_the_seconds_of_a_sitting_that_was_killed_are_counted_up_to_its_last_checkpoint(
+    scene, editor, tmp_path, monkeypatch
+):
+    """Oracle: a clock on which each iteration takes one second, and all else none."""
+    now, iterations = 0, 0
+
+    def watch(step):
+        nonlocal now, iterations
+        if "tuning" in step.text:
+            now, iterations = now + 1, iterations + 1
+        if iterations == 5:
+            raise Killed
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    settings = replace(QUICK, stages=1, iterations=6, perceptual=0.0)
+    options = {"checkpoint_seconds": 0, "watch": watch}
+    with pytest.raises(Killed):
+        run(scene, editor, tmp_path, settings, **options)
+    assert json.loads((tmp_path / "times.json").read_text())["tune"] == 4
+    iterations = 10
+    assert run(scene, editor, tmp_path, settings, **options).seconds["tune"] == 4 + 2
 
 
 @pytest.mark.slow
