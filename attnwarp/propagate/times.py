@@ -35,13 +35,14 @@ class Times:
 
     def write(self) -> None:
         """Write the file; the part at work counts up to now."""
-        rounded = {part: round(seconds, 3) for part, seconds in self._exact().items()}
-        self.folder.write_json(FILE, rounded)
+        self.folder.write_json(FILE, self.seconds)
 
     @property
     def seconds(self) -> dict[str, float]:
-        """By part, the part at work up to now."""
-        return self._exact()
+        """By part, the part at work up to now, as the file has them: a limit in the seconds of a
+        finished run is then the same in every sitting.
+        """
+        return {part: round(seconds, 3) for part, seconds in self._exact().items()}
 
     def _exact(self) -> dict[str, float]:
         seconds = dict(self._ended)

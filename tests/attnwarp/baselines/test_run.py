@@ -60,6 +60,7 @@ def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth
     assert torch.allclose(read_ply(folder / "edited.ply").sh, result.gaussians.sh, atol=1e-6)
     assert read_image(folder / "sheet.png").shape == (3 * 32, 3 * 32, 3)
     assert set(result.seconds) == {"edit", "write", "tune", "render"}
+    assert result.seconds == json.loads((folder / "times.json").read_text())
     # The folder's views are the result's, and a second call makes nothing anew.
     before = files(folder)
     network = (depth_editor if name == "gaussctrl" else editor).unet
@@ -68,6 +69,7 @@ def test_counters_are_what_hooks_and_files_count(name, whole, run, editor, depth
     assert files(folder) == before
     for view, pixels in result.edited.items():
         assert np.array_equal(again.edited[view], pixels)
+    assert all(again.seconds[part] == result.seconds[part] for part in ("edit", "tune"))
 
 
 # --- killed and resumed

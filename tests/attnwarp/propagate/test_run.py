@@ -276,6 +276,12 @@ def test_the_folder_holds_what_a_person_wants(finished, scene):
     assert all(value > 0 for value in seconds.values())
 
 
+def test_seconds_are_those_of_the_file(finished):
+    """A later sitting reads no others, and the limit of another method must not change with it."""
+    result, folder = finished
+    assert result.seconds == json.loads((folder / "times.json").read_text())
+
+
 def test_counters_are_what_was_done(scene, editor):
     settings = replace(QUICK, batch=2)
     rows, result = rows_of(editor.unet, lambda: run(scene, editor, settings=settings))
