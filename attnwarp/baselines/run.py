@@ -46,6 +46,9 @@ from attnwarp.propagate.tune import TrainingView
 
 FOLDERS = ("rounds", "views", "renders/before", "renders/after")
 
+BUDGETED = ("edit", "tune")
+"""Parts of the seconds that a budget limits; files and renders are for people."""
+
 SHEET_VIEWS = 8
 """Views on the sheet, evenly spread."""
 
@@ -235,8 +238,8 @@ class _Run:
         self.folder.write_json("cut.json", {"limit": limit, "round": number + 1, "groups": groups})
 
     def _out_of_seconds(self) -> bool:
-        limit = self.budget.seconds
-        return limit is not None and sum(self.times.seconds.values()) >= limit
+        limit, seconds = self.budget.seconds, self.times.seconds
+        return limit is not None and sum(seconds.get(part, 0.0) for part in BUDGETED) >= limit
 
     def _limit(self, rows: int) -> str | None:
         """The limit that forbids an edit of so many rows through the network."""

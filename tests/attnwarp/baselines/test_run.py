@@ -179,8 +179,8 @@ def test_no_iteration_begins_once_the_seconds_are_spent(run, scene, tmp_path, mo
     assert result.cut == "seconds"
     assert 0 < result.counters["iterations"] < 100
     assert len(result.edited) == 3
-    # Rendering the results is not counted, nor is the look at the clock that ends it.
-    assert 1.0 <= sum(result.seconds[part] for part in ("edit", "write", "tune")) < 1.1
+    # Files and renders are not counted, nor is the look at the clock that ends it.
+    assert 1.0 <= sum(result.seconds[part] for part in ("edit", "tune")) < 1.05
     again = run("igs2gs", long, folder=tmp_path, budget=Budget(seconds=1.0))
     assert again.counters == result.counters
 
