@@ -287,6 +287,7 @@ class _Run:
             )
 
     def go(self) -> Propagation:
+        self._clear_recording()  # of a sitting that was killed: it is never read again
         self._write_segments()
         self._edited_sources()
         for number, stage in enumerate(self.plan.stages):

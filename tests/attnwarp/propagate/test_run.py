@@ -339,6 +339,21 @@ def test_a_recording_on_disk_gives_the_same_bytes_and_goes_away(finished, scene,
     assert not (tmp_path / ".recording").exists()
 
 
+def test_a_recording_on_disk_that_a_kill_left_goes_away_in_the_next_sitting(
+    scene, editor, tmp_path
+):
+    """Oracle: the files of the first sitting."""
+    recorded = []
+    for _ in range(2):
+        with pytest.MonkeyPatch.context() as patch:
+            watch, _ = events(patch, 7)
+            with pytest.raises(Killed):
+                run(scene, editor, tmp_path, store="disk", watch=watch)
+        paths = (tmp_path / ".recording").rglob("*")
+        recorded.append(sorted(path.stat().st_size for path in paths if path.is_file()))
+    assert recorded[0] == recorded[1] != []
+
+
 def killed_and_resumed(scene, editor, folder, moments):
     """Kill a run at one moment after another, each counted from where the last sitting began."""
     for moment in moments:
