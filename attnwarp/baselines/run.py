@@ -345,7 +345,7 @@ class _Run:
             for part, model in (("before", self.work.frozen), ("after", final)):
                 for camera, name in zip(self.work.scene.cameras, self.names, strict=True):
                     path = f"renders/{part}/{name}.png"
-                    if not self.folder.has(path):
+                    if not self.folder.has_picture(path):
                         picture = render_picture(model, camera, self.work.near, self.work.backend)
                         self.folder.write_picture(path, to_bytes(picture))
             self.folder.write_picture("sheet.png", self._sheet())

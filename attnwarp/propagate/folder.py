@@ -124,15 +124,21 @@ class Folder:
         record = record_of(picture)
         if not self.has(record):
             return False
-        try:
-            self.read_picture(picture)
-        except (FileFormatError, FileNotFoundError):
+        if not self.has_picture(picture):
             (self.path / record).unlink()
             warnings.warn(
                 f"{self.path / picture}: missing or damaged; the view is edited again",
                 InputWarning,
                 stacklevel=2,
             )
+            return False
+        return True
+
+    def has_picture(self, name: str) -> bool:
+        """Whether a picture is there and can be read: a disk or a person may have damaged it."""
+        try:
+            self.read_picture(name)
+        except (FileFormatError, FileNotFoundError):
             return False
         return True
 

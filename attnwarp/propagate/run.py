@@ -304,7 +304,7 @@ class _Run:
         (self.folder.path / SEGMENTS_FOLDER).mkdir(exist_ok=True)
         for name, segment in zip(self.names, self.scene.segments, strict=True):
             path = f"{SEGMENTS_FOLDER}/{name}.png"
-            if not self.folder.has(path):
+            if not self.folder.has_picture(path):
                 self.folder.write_picture(path, mask_picture(torch.from_numpy(segment)))
 
     # --- editing
@@ -608,8 +608,7 @@ class _Run:
                     watch=tell,
                     saved=self.times.write,
                 )
-        if not self.folder.has(splats):
-            write_ply(self.folder.path / splats, self.tuning.gaussians())
+        write_ply(self.folder.path / splats, self.tuning.gaussians())
         self.times.write()
 
     def _training(self, view: int) -> TrainingView:
@@ -638,7 +637,7 @@ class _Run:
             for part, model in (("before", self.frozen), ("after", final)):
                 for camera, name in zip(self.scene.cameras, self.names, strict=True):
                     path = f"renders/{part}/{name}.png"
-                    if not self.folder.has(path):
+                    if not self.folder.has_picture(path):
                         pixels = to_bytes(render_picture(model, camera, self.near, self.backend))
                         self.folder.write_picture(path, pixels)
             psnr = self._edit_psnr(final)

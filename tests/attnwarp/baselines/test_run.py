@@ -1,6 +1,7 @@
 """Oracles: rows counted by hooks on the network, bytes of files, a clock that counts."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -148,6 +149,16 @@ def test_a_damaged_edit_of_a_run_that_was_cut_is_made_again(whole, run, tmp_path
     with pytest.warns(InputWarning, match="missing or damaged; the view is edited again"):
         run("igs2gs", folder=tmp_path, budget=cut)
     assert files(tmp_path) == before
+
+
+def test_damaged_renders_of_a_finished_run_are_made_again(whole, run, tmp_path):
+    """Oracle: the bytes before the damage."""
+    folder = shutil.copytree(whole("by_view")[0], tmp_path / "run")
+    before = files(folder)
+    for path in (*folder.glob("renders/*/*.png"), folder / "sheet.png"):
+        path.write_bytes(path.read_bytes()[:40])
+    run("by_view", folder=folder)
+    assert files(folder) == before
 
 
 def test_igs2gs_with_rows_for_a_part_of_a_round_ends_after_its_tuning(run, whole):

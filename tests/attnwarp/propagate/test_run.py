@@ -354,6 +354,23 @@ def test_a_recording_on_disk_that_a_kill_left_goes_away_in_the_next_sitting(
     assert recorded[0] == recorded[1] != []
 
 
+def test_files_of_a_finished_edit_that_are_damaged_are_written_again(scene, editor, tmp_path):
+    """Oracle: the bytes before the damage."""
+    settings = replace(QUICK, stages=1, steps=1, iterations=1, perceptual=0.0)
+    everything = [np.ones((32, 32), dtype=bool)] * 5
+    run(scene, editor, tmp_path, settings, segments=everything)
+    before = files(tmp_path)
+    for name in (
+        "renders/before/v0.png",
+        "renders/after/v1.png",
+        "segments/v2.png",
+        "stages/1.ply",
+    ):
+        (tmp_path / name).write_bytes(before[name][: len(before[name]) // 2])
+    run(scene, editor, tmp_path, settings, segments=everything)
+    assert files(tmp_path) == before
+
+
 def killed_and_resumed(scene, editor, folder, moments):
     """Kill a run at one moment after another, each counted from where the last sitting began."""
     for moment in moments:
