@@ -135,12 +135,13 @@ class ViewEditor:
         value = s.guidance(0) if first_guidance is None else first_guidance
         features: Recording | None = None
         with guided(self.editor, value), ExitStack() as stack:
+            branches = self.editor.branches
             task = self.editor.task([target.guide], self.instruction)
             maps = None if by_hand is None else self._inversion(task, by_hand)
-            self._inject(stack, before, [target], task.branches)
+            self._inject(stack, before, [target], branches)
             if self.layers:
                 # After the injection: what the next source gets is what this one went on with.
-                plan = self._plan(task.branches, target)
+                plan = self._plan(branches, target)
                 features = stack.enter_context(
                     record(self.editor.unet, plan, announce=self.announce)
                 )
@@ -152,7 +153,7 @@ class ViewEditor:
                 picture = by_hand
                 estimates = [self.editor.encode([by_hand])[0]] * s.steps
         noise = self.noise_order(target, before) if s.noise == "surface" else None
-        return Source(picture, features, task.branches, noise, estimates)
+        return Source(picture, features, branches, noise, estimates)
 
     def targets(
         self,
@@ -170,9 +171,13 @@ class ViewEditor:
             watch: called after each step.
         """
         with guided(self.editor, self.settings.guidance(stage)), ExitStack() as stack:
-            branches = self._branches(sources[0], targets)
-            self._inject(stack, sources, targets, branches)
+            self._inject(stack, sources, targets, self.editor.branches)
             return self._edit(targets, sources, watch)
+
+    def branches(self, stage: int) -> tuple[str, ...]:
+        """Of the batch of a stage's views. Further sources have those of the first stage."""
+        with guided(self.editor, self.settings.guidance(stage)):
+            return self.editor.branches
 
     def _inject(
         self,
@@ -317,13 +322,6 @@ class ViewEditor:
             dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
             store=self.store / str(target.view) if isinstance(self.store, Path) else self.store,
         )
-
-    def _branches(self, source: Source, targets: Sequence[Target]) -> tuple[str, ...]:
-        """Of the targets' batch; they differ from the source's where guidance of 1 drops some."""
-        s = self.settings
-        if s.text_guidance is None and s.source_text_guidance is None:
-            return source.branches
-        return self.editor.task([targets[0].guide], self.instruction).branches
 
     def _inversion(self, task: Any, picture: Image) -> Any:
         s = self.settings

@@ -678,12 +678,15 @@ class _Run:
         shares = [
             self.folder.read_json(f"views/{self.names[view]}.json")["injected"] for view in targets
         ]
-        rows = (1 + len(targets)) * self.settings.steps * len(source["branches"])
         sources = len(self.plan.sources)
+        # An edit made by hand is inverted before it is replayed.
+        rows = len(source["branches"]) * (1 if self.by_hand is None else 2)
+        for stage, views in ((0, self.plan.chain), *enumerate(self.plan.stages)):
+            rows += len(views) * len(self.view_editor.branches(stage))
         return {
             "views": 1 + len(targets),
             **({"sources": sources} if sources > 1 else {}),
-            "network_rows": rows,
+            "network_rows": rows * self.settings.steps,
             "feature_bytes": sources * source["feature_bytes"],
             "injected": sum(shares) / len(shares) if shares else 0.0,
             "iterations": self.tuning.iteration,

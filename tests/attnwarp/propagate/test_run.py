@@ -294,6 +294,23 @@ def test_counters_are_what_was_done(scene, editor):
     assert alone == rows
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        None,  # a source made by hand: inverted and replayed
+        {"source_text_guidance": 1.5},  # s_T = s_I leaves no image branch
+        {"source_text_guidance": 7.0, "text_guidance": 2.5, "guidance_drop": 1.0},
+    ],
+)
+def test_network_rows_are_those_that_hooks_count(changes, scene, editor):
+    settings = replace(QUICK, steps=1, iterations=0, **(changes or {}))
+    by_hand = scene[2][0] if changes is None else None
+    rows, result = rows_of(
+        editor.unet, lambda: run(scene, editor, settings=settings, source_picture=by_hand)
+    )
+    assert result.counters["network_rows"] == sum(rows)
+
+
 def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, editor):
     result, folder = finished
     errors = {}
@@ -654,7 +671,8 @@ def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_gui
 
     pipe = controlnet()
     names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
-    net = DepthControlNet(*(getattr(pipe, name) for name in names))
+    # The editor's own guidance, which has one branch, runs in no pass.
+    net = DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
     settings = quick("released-controlnet")
     values, result = guidance_of_passes(
         net, "guidance", lambda: run(scene, net, tmp_path, settings)
@@ -662,6 +680,7 @@ def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_gui
     assert values == [7.5, 12.5]
     source = json.loads((tmp_path / "source.json").read_text())
     assert source["branches"] == ["uncond", "text"]
+    assert result.counters["network_rows"] == 5 * 2 * 2
     # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
     assert source["feature_bytes"] == (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
     assert len(result.edited) == 5
