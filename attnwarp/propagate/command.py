@@ -21,6 +21,7 @@ from attnwarp.gaussians import Gaussians
 from attnwarp.io import THIRD_SCALE, Dataset, read_image, write_ply
 from attnwarp.io.names import file_stems
 from attnwarp.process import asked_to_stop
+from attnwarp.propagate.editing import ViewEditor
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
 from attnwarp.propagate.pictures import check_source_picture
@@ -28,6 +29,7 @@ from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.scene import images_of, to_float
 from attnwarp.propagate.settings import PropagateSettings
+from attnwarp.propagate.tune import perceptual_net
 
 FIT_FOLDER = "fit"
 
@@ -128,6 +130,9 @@ def edit_dataset(
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
+        # So are settings that the editor or the tuning cannot use.
+        ViewEditor(editor, instruction, settings)
+        perceptual_net(settings)
         splats = _fitted(dataset, views, fit_plan, settings.seed, out / FIT_FOLDER, say)
     torch.set_num_threads(thread_count(editor, threads))
     with progress_display(title=out.name) as watch:

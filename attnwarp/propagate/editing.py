@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from attnwarp import check
 from attnwarp.editing.attention import (
     Layer,
     Recording,
@@ -85,6 +86,9 @@ class ViewEditor:
 
     Attributes:
         timestep: Stable Diffusion's, drawn to start from; None for pure noise.
+
+    Raises:
+        ValueError: layers or branches that the editor lacks; a start too low for the steps.
     """
 
     def __init__(
@@ -106,6 +110,7 @@ class ViewEditor:
                 kinds=settings.kinds,
                 blocks=settings.blocks,
             )
+            self._check_branches()
         self.timestep: int | None = None
         if settings.start is not None:
             low, high = settings.start
@@ -131,10 +136,9 @@ class ViewEditor:
             watch: called after each step.
         """
         s = self.settings
-        first_guidance = s.source_text_guidance if not before else None
-        value = s.guidance(0) if first_guidance is None else first_guidance
         features: Recording | None = None
-        with guided(self.editor, value), ExitStack() as stack:
+        guidance = s.guidance(0) if before else self._source_guidance()
+        with guided(self.editor, guidance), ExitStack() as stack:
             branches = self.editor.branches
             task = self.editor.task([target.guide], self.instruction)
             maps = None if by_hand is None else self._inversion(task, by_hand)
@@ -178,6 +182,19 @@ class ViewEditor:
         """Of the batch of a stage's views. Further sources have those of the first stage."""
         with guided(self.editor, self.settings.guidance(stage)):
             return self.editor.branches
+
+    def _source_guidance(self) -> float | None:
+        """Of the first source."""
+        s = self.settings
+        return s.guidance(0) if s.source_text_guidance is None else s.source_text_guidance
+
+    def _check_branches(self) -> None:
+        with guided(self.editor, self._source_guidance()):
+            available = self.editor.branches
+        if self.settings.branches == ():
+            raise ValueError(f"branches: got none, expected some of {', '.join(available)}")
+        for branch in self.settings.branches or ():
+            check.one_of(branch, available, "branches")
 
     def _inject(
         self,

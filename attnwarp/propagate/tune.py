@@ -36,6 +36,17 @@ class PerceptualLoss(Protocol):
         ...
 
 
+def perceptual_net(settings: PropagateSettings) -> PerceptualLoss | None:
+    """The perceptual distance of the settings; None where no iteration takes it.
+
+    Raises:
+        InputError: no such encoder, or one of another kind.
+    """
+    if not (settings.perceptual and settings.iterations):
+        return None
+    return cast(PerceptualLoss, load_encoder(settings.perceptual_encoder, "perceptual"))
+
+
 @dataclass(frozen=True, eq=False)
 class TrainingView:
     """A view to tune on.
@@ -65,6 +76,10 @@ class Tuning:
         iteration: iterations done, over all stages.
         loss: of the last iteration.
         visits: how often each view was tuned on, by its number.
+        perceptual: the perceptual distance; None where no iteration takes it.
+
+    Raises:
+        InputError: no such perceptual distance.
     """
 
     def __init__(
@@ -96,7 +111,8 @@ class Tuning:
         self.iteration = 0
         self.loss = math.nan
         self.visits: dict[int, int] = {}
-        self._perceptual: PerceptualLoss | None = None
+        # Here and not at its first use: before it, views are edited for hours.
+        self.perceptual = perceptual_net(settings)
 
     def gaussians(self) -> Gaussians:
         """The splats as they stand, outside autograd."""
@@ -214,21 +230,14 @@ class Tuning:
         image = view.color.float()
         target = target.to(image.device)
         loss = s.l1 * losses.l1(image, target)
-        if s.perceptual:
-            distance = self.perceptual_net().loss(image.clamp(0, 1), target)
+        if self.perceptual is not None:
+            distance = self.perceptual.loss(image.clamp(0, 1), target)
             loss = loss + s.perceptual * distance.to(loss)
         if s.normal:
             loss = loss + s.normal * losses.normal_consistency(view)
         if s.distortion:
             loss = loss + s.distortion * losses.depth_distortion(view, scale=self.model.extent)
         return loss
-
-    def perceptual_net(self) -> PerceptualLoss:
-        """The perceptual distance, loaded when it is first asked for."""
-        if self._perceptual is None:
-            net = load_encoder(self.settings.perceptual_encoder, "perceptual")
-            self._perceptual = cast(PerceptualLoss, net)
-        return self._perceptual
 
     def _background(self) -> Tensor:
         choice = self.settings.background

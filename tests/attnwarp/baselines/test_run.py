@@ -15,6 +15,7 @@ from attnwarp.baselines import (
     METHODS,
     Budget,
     ByViewSettings,
+    DGESettings,
     GaussCtrlSettings,
     IGS2GSSettings,
     dge,
@@ -240,9 +241,10 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
         ("dge", replace(QUICK["dge"], steps=20, starts=(998, 10)), "starts: 10 .* for 20 steps"),
         ("igs2gs", IGS2GSSettings(start=(18, 980)), "start: 18 .* for 20 steps"),
         ("by_view", ByViewSettings(start=(18, 980)), "start: 18 .* for 20 steps"),
+        ("dge", DGESettings(perceptual_encoder="bogus"), "encoder 'bogus': unknown"),
     ],
 )
-def test_a_start_too_low_for_the_steps_is_named_before_any_work(
+def test_settings_that_a_run_cannot_have_are_named_before_any_work(
     name, settings, message, run, editor, tmp_path
 ):
     def refused():
@@ -251,7 +253,7 @@ def test_a_start_too_low_for_the_steps_is_named_before_any_work(
 
     rows, _ = rows_of(editor.unet, refused)
     assert not rows
-    assert not any(tmp_path.iterdir())
+    assert not files(tmp_path)
 
 
 def test_the_lowest_start_that_the_steps_fit_below_is_taken(run):

@@ -318,6 +318,25 @@ def test_what_cannot_be_used_is_one_clear_line(more, message, place, tmp_path, m
     assert len(result.output.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("perceptual_encoder=bogus", "encoder 'bogus': unknown"),
+        ("perceptual_encoder=clip-small", "is of kind 'clip', expected 'perceptual'"),
+        ('branches=["bogus"]', "branches: got 'bogus', expected one of 'text', 'image', 'uncond'"),
+        ("branches=[]", "branches: got none, expected some of text, image, uncond"),
+        ("start=[0, 0]", "start, steps: got 0, 2, expected at least one step and start"),
+    ],
+)
+def test_settings_that_an_edit_cannot_have_are_refused_before_the_fit(
+    setting, message, place, tmp_path
+):
+    result = run(place, tmp_path, "--set", setting)
+    assert result.exit_code == 2
+    assert message in result.output
+    assert not any(tmp_path.iterdir())
+
+
 def test_splats_that_no_camera_sees_are_refused_by_name_before_the_edit(place, tmp_path):
     """Oracle: the cameras' own projection; all centres lie outside every picture."""
     model = splats()

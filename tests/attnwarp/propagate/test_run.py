@@ -630,6 +630,26 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         run((model, views, images), editor, checkpoint_seconds=None)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"perceptual_encoder": "bogus"}, "encoder 'bogus': unknown"),
+        ({"branches": ("bogus",)}, "branches: got 'bogus', expected one of 'text', 'image', "),
+        ({"branches": ("image",), "source_text_guidance": 1.5}, "branches: got 'image'"),
+    ],
+)
+def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
+    changes, message, scene, editor, tmp_path
+):
+    def refused():
+        with pytest.raises(ValueError, match=message):
+            run(scene, editor, tmp_path, replace(QUICK, **changes))
+
+    rows, _ = rows_of(editor.unet, refused)
+    assert not rows
+    assert not files(tmp_path)  # which would hold the folder to the wrong setting
+
+
 def guidance_of_passes(editor, name, call):
     """The text guidance that each pass of the UNet has, without repetitions; and the result."""
     values = []
