@@ -67,7 +67,9 @@ def resized(image: Image, size: Size) -> Image:
 
 
 def enlarged_change(original: Image, edited: Image) -> Image:
-    """The full-size picture plus the enlarged change of a smaller edit of it.
+    """The full-size picture plus the change of an edit of another size.
+
+    The change is enlarged linearly; that of an edit larger than the picture is averaged.
 
     Args:
         original: (H, W, 3) in [0, 1].
@@ -85,8 +87,11 @@ def enlarged_change(original: Image, edited: Image) -> Image:
     if edited.shape[:2] == (h, w):
         return edited
     change = edited - resized(original, (edited.shape[0], edited.shape[1]))
-    large = cv2.resize(change, (w, h), interpolation=cv2.INTER_LINEAR)
-    return np.clip(original + large, 0, 1).astype(np.float32)
+    # Linear weights read 2 x 2 px of a change, however many fall on one pixel.
+    shrinks = edited.shape[0] >= h and edited.shape[1] >= w
+    how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    fitted = cv2.resize(change, (w, h), interpolation=how)
+    return np.clip(original + fitted, 0, 1).astype(np.float32)
 
 
 def composite(edited: Image, original: Image, segment: Mask, how: str, blur: float) -> Image:

@@ -23,6 +23,15 @@ def test_the_change_of_a_small_edit_is_enlarged_and_the_detail_stays():
     assert np.allclose(enlarged_change(original, small), original, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_the_change_of_a_larger_edit_is_the_mean_of_its_pixels(factor):
+    """Oracle: means of blocks."""
+    original = np.full((16, 16, 3), 0.5, np.float32)
+    edited = np.random.default_rng(0).random((16 * factor, 16 * factor, 3)).astype(np.float32)
+    means = edited.reshape(16, factor, 16, factor, 3).mean((1, 3))
+    assert np.allclose(enlarged_change(original, edited), means, rtol=0, atol=1e-6)
+
+
 def test_an_edit_of_full_size_is_taken_as_it_is():
     original, edited = np.random.default_rng(0).random((2, 8, 8, 3)).astype(np.float32)
     assert np.array_equal(enlarged_change(original, edited), edited)
