@@ -32,7 +32,7 @@ from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.folder import Folder, record_of
-from attnwarp.propagate.pictures import Bytes, enlarged, enlarged_change, resized, to_bytes
+from attnwarp.propagate.pictures import Bytes, enlarged, full_size, resized, to_bytes
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
     Scene,
@@ -328,7 +328,9 @@ class _Run:
         camera = self.work.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
         if self.work.settings.detail == "change":
-            picture = enlarged_change(self.work.scene.picture(view), edited)
+            segments = self.work.scene.segments
+            segment = None if segments is None else segments[view]
+            picture = full_size(self.work.scene.picture(view), edited, segment, "original", 0.0)
             return TrainingView(view, camera, picture)
         h, w = self.work.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)

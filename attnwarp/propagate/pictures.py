@@ -118,6 +118,31 @@ def composite(edited: Image, original: Image, segment: Mask, how: str, blur: flo
     return np.clip(share * edited + (1 - share) * behind, 0, 1).astype(np.float32)
 
 
+def full_size(original: Image, edited: Image, segment: Mask | None, how: str, blur: float) -> Image:
+    """:func:`enlarged_change` of an edit that was composited, held to its segment.
+
+    An enlarged change reaches beyond the pixels of the edit that it comes from, and brings back the
+    original's detail where :func:`composite` left black.
+
+    Args:
+        original: (H, W, 3) in [0, 1].
+        edited: (h, w, 3) in [0, 1], of :func:`composite`.
+        segment: (H, W) bool; None where all is edited.
+        how, blur: of :func:`composite`.
+    """
+    picture = enlarged_change(original, edited)
+    if segment is None or how == "none" or edited.shape == original.shape:
+        return picture
+    reached = segment
+    if blur > 0:
+        import cv2
+
+        sigma = blur * original.shape[1] / edited.shape[1]
+        reached = cv2.GaussianBlur(segment.astype(np.float32), (0, 0), sigma) > 0
+    behind = original if how == "original" else np.zeros_like(original)
+    return np.where(reached[..., None], picture, behind)
+
+
 def to_bytes(image: npt.NDArray[Any]) -> Bytes:
     """(H, W, 3) uint8 of a picture in [0, 1]."""
     return np.asarray(np.rint(255 * np.clip(image, 0, 1)), dtype=np.uint8)

@@ -35,7 +35,7 @@ from attnwarp.propagate.pictures import (
     composite,
     edit_size,
     enlarged,
-    enlarged_change,
+    full_size,
     mask_picture,
     resized,
     sight_picture,
@@ -614,8 +614,11 @@ class _Run:
     def _training(self, view: int) -> TrainingView:
         camera = self.scene.cameras[view]
         edited = self._edited(view).astype(np.float32) / np.float32(255)
-        if self.settings.detail == "change":
-            picture = enlarged_change(self.scene.picture(view), edited)
+        s, segments = self.settings, self.scene.segments
+        if s.detail == "change":
+            segment = None if segments is None else segments[view]
+            original = self.scene.picture(view)
+            picture = full_size(original, edited, segment, s.composite, s.composite_blur)
             return TrainingView(view, camera, picture)
         h, w = self.sizes[view]
         return TrainingView(view, camera.resize(w, h), edited)

@@ -23,6 +23,7 @@ from attnwarp.baselines import (
     igs2gs,
     preset,
 )
+from attnwarp.baselines.fitting import Fitting
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate.pictures import to_bytes
@@ -298,3 +299,18 @@ def test_segments_leave_the_original_outside(run, scene):
     for view in range(3):
         assert np.array_equal(half.edited[view][:, :16], whole.edited[view][:, :16])
         assert np.array_equal(half.edited[view][:, 16:], to_bytes(scene[2][view])[:, 16:])
+
+
+def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
+    run, scene, monkeypatch
+):
+    tuned = []
+    monkeypatch.setattr(Fitting, "advance", lambda fit, begin, end, views, **_: tuned.extend(views))
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :15] = True  # ends within a pixel of the edit
+    run("by_view", ByViewSettings(steps=1, iterations=1, size=16), segments=[left] * 3)
+    assert len(tuned) == 3
+    for view in tuned:
+        before = scene[2][view.number]
+        assert np.array_equal(view.picture[:, 15:], before[:, 15:])
+        assert np.abs(view.picture - before)[:, :15].max() > 0.1

@@ -11,6 +11,7 @@ from attnwarp.propagate.pictures import (
     composite,
     edit_size,
     enlarged_change,
+    full_size,
     mask_picture,
 )
 
@@ -45,6 +46,33 @@ def test_outside_a_segment_stands_what_was_asked_for(how, outside):
     result = composite(edited, original, segment, how, 0.0)
     assert (result[:, :4] == 0.75).all()
     assert (result[:, 4:] == np.float32(outside)).all()
+
+
+@pytest.mark.parametrize("how", ["black", "original"])
+def test_the_enlarged_change_of_an_edit_stays_in_its_segment(how):
+    """Oracle: the picture before the edit, and black."""
+    original = np.random.default_rng(0).random((32, 32, 3)).astype(np.float32)
+    segment = np.zeros((32, 32), bool)
+    segment[:, :14] = True  # ends within a pixel of the edit
+    small = original.reshape(8, 4, 8, 4, 3).mean((1, 3))
+    edited = composite(np.clip(small + 0.2, 0, 1), small, segment, how, 0.0)
+    result = full_size(original, edited, segment, how, 0.0)
+    assert np.array_equal(
+        result[~segment], 0 * original[~segment] if how == "black" else original[~segment]
+    )
+    inner = np.s_[:, :8]  # a pixel of the edit away from the segment's end
+    assert np.array_equal(result[inner], enlarged_change(original, edited)[inner])
+    assert np.abs(enlarged_change(original, edited) - result)[~segment].max() > 0.05  # as it was
+
+
+def test_a_blurred_segment_reaches_four_sigma_of_the_edits_pixels_beyond_its_end():
+    original = np.full((64, 64, 3), 0.25, np.float32)
+    segment = np.zeros((64, 64), bool)
+    segment[:, :24] = True
+    edited = np.full((32, 32, 3), 0.75, np.float32)  # everywhere
+    row = full_size(original, edited, segment, "original", 1.5)[32, :, 0]
+    assert (row[:36] == 0.75).all()  # 4 sigma of 1.5 px at half the size are 12 px
+    assert (row[36:] == 0.25).all()
 
 
 def test_a_blurred_segment_is_a_gaussian_step():

@@ -24,6 +24,7 @@ from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate.pictures import to_bytes
+from attnwarp.propagate.tune import Tuning
 from attnwarp.warp import Surface, warp_surfaces
 
 QUICK = preset("corrected", stages=2, views_per_stage=2, steps=2, iterations=3)
@@ -510,6 +511,29 @@ def test_segments_leave_the_original_or_black_outside(scene, editor):
         run(scene, editor, settings=settings, segments=[left * 1.0] * 5)
     with pytest.raises(ValueError, match="segments: every one is empty"):
         run(scene, editor, settings=settings, segments=[left & False] * 5)
+
+
+@pytest.mark.parametrize("how", ["black", "original"])
+def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_alone(
+    how, scene, editor, monkeypatch
+):
+    tuned, stage = [], Tuning.stage
+
+    def watched(tuning, number, views, source, **options):
+        tuned.extend([*views, source])
+        stage(tuning, number, views, source, **options)
+
+    monkeypatch.setattr(Tuning, "stage", watched)
+    left = np.zeros((32, 32), dtype=bool)
+    left[:, :15] = True  # ends within a pixel of the edit
+    settings = replace(QUICK, stages=1, steps=1, iterations=0, size=16, composite=how)
+    result = run(scene, editor, settings=settings, segments=[left] * 5)
+    assert {view.number for view in tuned} == {*result.plan.edited}
+    for view in tuned:
+        before = scene[2][view.number]
+        outside = before if how == "original" else 0 * before
+        assert np.array_equal(view.picture[:, 15:], outside[:, 15:])
+        assert np.abs(view.picture - before)[:, :15].max() > 0.1
 
 
 def test_a_picture_edited_by_hand_is_the_source(scene, editor):
