@@ -83,9 +83,9 @@ class Fitting(Tuning):
         """
         if self.iteration == begin:
             self.queue = []  # of the round before, whose views were others
-        written = time.perf_counter()
+        written, first = time.perf_counter(), views[0]
         while self.iteration < end and not spent():
-            self._iterate(0, views, views[0])
+            self._iterate(0, views, first)
             watch()
             if self.iteration < end and time.perf_counter() - written >= checkpoint_seconds:
                 save(checkpoint, self.state())

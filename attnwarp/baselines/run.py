@@ -16,6 +16,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict, Unpack
 
@@ -42,7 +43,7 @@ from attnwarp.propagate.scene import (
     render_picture,
 )
 from attnwarp.propagate.times import Times
-from attnwarp.propagate.tune import TrainingView
+from attnwarp.propagate.tune import DrawnViews, TrainingView
 
 FOLDERS = ("rounds", "views", "renders/before", "renders/after")
 
@@ -303,11 +304,12 @@ class _Run:
         if self.folder.has(state):
             self.fitting.restore(self.folder.path / state)
             self.done += self.fitting.iteration - begin
-        views = [self._training(view) for view in part.training if view in self.latest]
+        training = [view for view in part.training if view in self.latest]
         cut = self.cut
         over = cut is not None and cut["limit"] == "seconds"
-        if not views or over or (self.folder.has(state) and self.fitting.iteration >= end):
+        if not training or over or (self.folder.has(state) and self.fitting.iteration >= end):
             return
+        views = DrawnViews([partial(self._training, view, self._edited(view)) for view in training])
         text = f"round {number + 1} of {len(self.method.rounds)}: tuning"
         with self.times.part("tune"):
             self.fitting.advance(
@@ -324,9 +326,9 @@ class _Run:
             self._cut("seconds", number, len(part.groups))
         self.times.write()
 
-    def _training(self, view: int) -> TrainingView:
+    def _training(self, view: int, pixels: Bytes) -> TrainingView:
         camera = self.work.scene.cameras[view]
-        edited = self._edited(view).astype(np.float32) / np.float32(255)
+        edited = pixels.astype(np.float32) / np.float32(255)
         if self.work.settings.detail == "change":
             segments = self.work.scene.segments
             segment = None if segments is None else segments[view]

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,7 +55,7 @@ from attnwarp.propagate.settings import PRESETS, PropagateSettings
 from attnwarp.propagate.sight import Sight
 from attnwarp.propagate.stages import Plan, choose_chain
 from attnwarp.propagate.times import Times
-from attnwarp.propagate.tune import TrainingView, Tuning
+from attnwarp.propagate.tune import DrawnViews, TrainingView, Tuning
 from attnwarp.warp import Surface, WarpedView, render_surface, warp_view
 
 RECORDING = ".recording"
@@ -593,7 +593,8 @@ class _Run:
         end = (number + 1) * s.iterations
         if self.tuning.iteration < end or not self.folder.has(state):
             text = f"stage {number + 1} of {len(self.plan.stages)}: tuning"
-            views = [self._training(view) for view in self.plan.training(number, s.training)]
+            training = self.plan.training(number, s.training)
+            makers = [partial(self._training, view, self._edited(view)) for view in training]
 
             def tell() -> None:
                 self._tell(f"{text}, loss {self.tuning.loss:.4f}", 1)
@@ -601,8 +602,8 @@ class _Run:
             with self.times.part("tune"):
                 self.tuning.stage(
                     number,
-                    views,
-                    self._training(self.plan.source),
+                    DrawnViews(makers),
+                    self._training(self.plan.source, self._edited(self.plan.source)),
                     checkpoint=self.folder.path / state,
                     checkpoint_seconds=self.checkpoint_seconds,
                     watch=tell,
@@ -611,9 +612,9 @@ class _Run:
         write_ply(self.folder.path / splats, self.tuning.gaussians())
         self.times.write()
 
-    def _training(self, view: int) -> TrainingView:
+    def _training(self, view: int, pixels: Bytes) -> TrainingView:
         camera = self.scene.cameras[view]
-        edited = self._edited(view).astype(np.float32) / np.float32(255)
+        edited = pixels.astype(np.float32) / np.float32(255)
         s, segments = self.settings, self.scene.segments
         if s.detail == "change":
             segment = None if segments is None else segments[view]
@@ -663,7 +664,7 @@ class _Run:
             views = [view for view in views if view not in self.plan.stages[-1]]
         errors = []
         for view in views:
-            target = self._training(view)
+            target = self._training(view, self._edited(view))
             picture = render_picture(final, target.camera, self.near, self.backend)
             errors.append(float(np.square(picture.astype(np.float64) - target.picture).mean()))
         each = [losses.psnr_of_mse(error) for error in errors]

@@ -62,6 +62,25 @@ class TrainingView:
     picture: Image
 
 
+class DrawnViews(Sequence[TrainingView]):
+    """Views to tune on that are made when they are drawn: floating pictures of all at once would
+    take four times the memory of their photographs.
+
+    Args:
+        makers: one a view.
+    """
+
+    def __init__(self, makers: Sequence[Callable[[], TrainingView]]) -> None:
+        self._makers = makers
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    def __getitem__(self, index: Any) -> Any:
+        """The view of a number, made anew."""
+        return self._makers[index]()
+
+
 class Tuning:
     """Splats, their optimiser and its place in the work; goes on through all stages.
 

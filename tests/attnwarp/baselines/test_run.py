@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -23,10 +24,11 @@ from attnwarp.baselines import (
     igs2gs,
     preset,
 )
+from attnwarp.baselines import run as run_module
 from attnwarp.baselines.fitting import Fitting
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import read_image, read_ply
-from attnwarp.propagate.pictures import to_bytes
+from attnwarp.propagate.pictures import full_size, to_bytes
 
 
 @pytest.fixture(scope="module")
@@ -314,3 +316,20 @@ def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_
         before = scene[2][view.number]
         assert np.array_equal(view.picture[:, 15:], before[:, 15:])
         assert np.abs(view.picture - before)[:, :15].max() > 0.1
+
+
+def test_of_the_pictures_a_round_tunes_on_two_are_held_at_a_time(run, monkeypatch):
+    """Oracle: references that do not hold their objects."""
+    made, most = [], 0
+
+    def watched(*args):
+        nonlocal most
+        picture = full_size(*args)
+        made.append(weakref.ref(picture))
+        most = max(most, sum(one() is not None for one in made))
+        return picture
+
+    monkeypatch.setattr(run_module, "full_size", watched)
+    run("by_view", ByViewSettings(steps=1, iterations=3, perceptual=0))
+    assert len(made) >= 3
+    assert most == 2  # the first view's, and the iteration's

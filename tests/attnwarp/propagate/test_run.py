@@ -23,7 +23,8 @@ from attnwarp.editing.schedule import Schedule
 from attnwarp.errors import InputError
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate import preset, propagate
-from attnwarp.propagate.pictures import to_bytes
+from attnwarp.propagate import run as run_module
+from attnwarp.propagate.pictures import full_size, to_bytes
 from attnwarp.propagate.tune import Tuning
 from attnwarp.warp import Surface, warp_surfaces
 
@@ -741,6 +742,25 @@ def test_a_stage_tunes_on_the_views_that_the_settings_name(scene, editor, tmp_pa
     drawn = {path.stem for path in (tmp_path / "all" / "views").glob("*.png")}
     assert visits(tmp_path / "stage") == drawn
     assert visits(tmp_path / "all") == drawn | {"v0"}
+
+
+def test_of_the_pictures_a_stage_tunes_on_two_are_held_at_a_time(scene, editor, monkeypatch):
+    """Oracle: references that do not hold their objects."""
+    made, most = [], 0
+
+    def watched(*args):
+        nonlocal most
+        picture = full_size(*args)
+        made.append(weakref.ref(picture))
+        most = max(most, sum(one() is not None for one in made))
+        return picture
+
+    monkeypatch.setattr(run_module, "full_size", watched)
+    settings = replace(QUICK, stages=1, views_per_stage=4, steps=1, iterations=5, perceptual=0)
+    result = run(scene, editor, settings=settings)
+    assert len(result.plan.edited) == 5
+    assert len(made) >= 5
+    assert most == 2  # the source's, and the iteration's
 
 
 def test_progress_ends_at_its_total_and_never_falls(scene, editor, tmp_path):
