@@ -490,7 +490,14 @@ class _Run:
         if s.method != "warp" and s.noise != "surface" and s.estimate == 0:
             return None
         chosen = self.plan.sources[:sources]
-        return Sight([self._warp(source, view, model) for source in chosen], s.confidence)
+        warps = [self._warp(source, view, model) for source in chosen]
+        scales = [self._edit_share(source) / self._edit_share(view) for source in chosen]
+        return Sight(warps, s.confidence, scales)
+
+    def _edit_share(self, view: int) -> float:
+        """Pixels of a view's edit for each of its picture."""
+        camera, (h, w) = self.scene.cameras[view], self.sizes[view]
+        return h * w / (camera.height * camera.width)
 
     def _warp(self, source: int, target: int, model: Gaussians) -> WarpedView:
         """The warp from one view to another along a model, or along the one before the edit."""

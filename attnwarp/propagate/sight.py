@@ -82,6 +82,9 @@ class Sight:
     Args:
         views: the warp from each source, in the order of the sources.
         soft: weigh features by confidence instead of the mask alone.
+        scales: of each source: its edit's pixels per pixel of its photograph, over the same of the
+            target. Features have the edits' resolution, which photographs of several sizes need not
+            differ in. None where all are 1.
 
     Example:
         >>> import numpy as np
@@ -100,14 +103,19 @@ class Sight:
 
     views: Sequence[WarpedView]
     soft: bool = False
+    scales: Sequence[float] | None = None
     _choices: dict[Size, Tensor] = field(default_factory=dict, repr=False)
 
     @cached_property
     def quality(self) -> list[Tensor]:
-        """(H, W) float64 of each source: its :func:`pixel_ratio`, at most 1, where its mask passes;
-        more pixels than the target has show nothing more.
+        """(H, W) float64 of each source: its :func:`pixel_ratio` of edits, at most 1, where its
+        mask passes; more pixels than the target has show nothing more.
         """
-        return [view.mask * pixel_ratio(view).clamp_max(1.0) for view in self.views]
+        scales = [1.0] * len(self.views) if self.scales is None else self.scales
+        return [
+            view.mask * (scale * pixel_ratio(view)).clamp_max(1.0)
+            for view, scale in zip(self.views, scales, strict=True)
+        ]
 
     @cached_property
     def confidence(self) -> list[Tensor]:

@@ -814,6 +814,21 @@ def test_each_idea_alone_changes_the_views(idea, finished, scene, editor, tmp_pa
     assert any(after.get(name) != before[name] for name in first)
 
 
+def test_confidence_counts_pixels_of_edits_and_not_of_photographs(scene, editor, tmp_path):
+    """Oracle: one place photographed at two sizes and edited at one is an identity warp."""
+    model, view = scene[0], scene[1][0]
+    settings = replace(QUICK, stages=1, iterations=0, steps=1, size=32, confidence=True)
+    for factor in (1, 3):
+        views = [view, view.resize(32 * factor, 32 * factor)]
+        folder = tmp_path / str(factor)
+        propagate(model, views, pictures(model, views), editor, "red", settings, folder=folder)
+    one, other = (
+        json.loads(next((tmp_path / f / "views").glob("*.json")).read_text()) for f in "13"
+    )
+    assert one["injected"] > 0.8
+    assert other["injected"] == pytest.approx(one["injected"], abs=0.05)
+
+
 @pytest.fixture(scope="module")
 def extended(scene, editor, tmp_path_factory):
     folder = tmp_path_factory.mktemp("extended")

@@ -80,6 +80,23 @@ def test_a_pixel_takes_the_source_that_sees_it_best_by_a_loop(size):
     assert torch.equal(torch.stack(layers).sum(dim=0), torch.stack(masks).any(dim=0).long())
 
 
+def test_sources_are_compared_by_their_edits_whatever_the_size_of_their_photographs():
+    """Oracle: the same sources, photographed at one size."""
+    large = camera(SIDE.position, 3 * SIZE)
+    # The mask's rules read depths pixel by pixel, so they are left out.
+    alike, unlike = (
+        [warp(source, depth_agreement=False) for source in sources]
+        for sources in ((SIDE, FAR), (large, FAR))
+    )
+    # All edits have one size, so that of the large photograph is a ninth of it.
+    expected, result = Sight(alike), Sight(unlike, scales=[1 / 9, 1.0])
+    assert {0, 1} <= set(expected.choice((8, 8)).flatten().tolist())
+    assert torch.equal(result.choice((8, 8)), expected.choice((8, 8)))
+    inside = result.views[0].mask & expected.views[0].mask
+    ratios = [sight.quality[0][inside] for sight in (result, expected)]
+    assert torch.allclose(*ratios, rtol=1e-9, atol=0)
+
+
 def test_one_source_without_confidence_is_the_plain_warp_bit_for_bit():
     view = warp(SIDE)
     random = torch.Generator().manual_seed(0)
