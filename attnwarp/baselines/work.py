@@ -16,6 +16,7 @@ from attnwarp.editing.editor import Editor, shared_noise
 from attnwarp.editing.schedule import steps_as_published
 from attnwarp.gaussians import Gaussians
 from attnwarp.propagate.editing import Guide, guided
+from attnwarp.propagate.noise import own_seed
 from attnwarp.propagate.pictures import Image, Size, composite, edit_size, resized
 from attnwarp.propagate.scene import Scene, near_of, render_picture
 from attnwarp.warp import WarpSettings, render_surface
@@ -180,8 +181,7 @@ class Work:
 
     def seed(self, purpose: int, *numbers: int) -> int:
         """A seed of its own for each purpose and numbers such as a round and a view."""
-        entropy = np.random.SeedSequence([self.settings.seed, purpose, *numbers])
-        return int(entropy.generate_state(1, np.uint64)[0] >> np.uint64(1))
+        return own_seed(self.settings.seed, purpose, *numbers)
 
     def generator(self, purpose: int, *numbers: int) -> torch.Generator:
         """Random numbers of their own for each purpose and numbers."""

@@ -24,6 +24,13 @@ It stands for Stable Diffusion's share of signal (:func:`steps_as_published`). U
 step of the editor's own schedule. Manifests and studies record it, so that no run mixes the two.
 """
 
+FRESH_PROTOCOL = 2
+"""Of edits by ``propagate`` whose views have noise of their own: how it is drawn.
+
+Each seed and view has a draw that no other has. Up to 1, neighbouring seeds shared draws. Manifests
+and studies record it, as they do :data:`START_PROTOCOL`.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class Schedule:

@@ -26,7 +26,7 @@ from attnwarp.editing.attention import (
 from attnwarp.editing.editor import Editor, edit, shared_noise
 from attnwarp.editing.inversion import edit_friendly_invert, replay
 from attnwarp.editing.schedule import steps_as_published
-from attnwarp.propagate.noise import carried, unmoved
+from attnwarp.propagate.noise import FRESH, carried, own_seed, unmoved
 from attnwarp.propagate.pictures import Image
 from attnwarp.propagate.settings import PropagateSettings
 from attnwarp.propagate.sight import Sight
@@ -298,7 +298,9 @@ class ViewEditor:
                     for row, order in zip(rows, orders, strict=True)
                 ]
             )
-        return torch.cat([shared_noise(self._shape(t), s.seed + 1 + t.view) for t in targets])
+        seeds = [own_seed(s.seed, FRESH, target.view) for target in targets]
+        rows = zip(targets, seeds, strict=True)
+        return torch.cat([shared_noise(self._shape(target), seed) for target, seed in rows])
 
     def noise_order(self, target: Target, sources: Sequence[Source]) -> Tensor:
         """(h, w) int64: the order of a view's noise where noise sticks to the surface; sources of

@@ -17,6 +17,20 @@ from torch import Tensor
 
 from attnwarp import check
 
+FRESH = 4
+"""What a view's own noise is drawn for, beside the purposes of :mod:`attnwarp.baselines.work`."""
+
+
+def own_seed(*numbers: int) -> int:
+    """A seed that no other numbers have, such as a run's seed, a purpose and a view.
+
+    Example:
+        >>> own_seed(0, FRESH, 1) != own_seed(1, FRESH, 0)  # as their sums would be
+        True
+    """
+    entropy = np.random.SeedSequence(numbers)
+    return int(entropy.generate_state(1, np.uint64)[0] >> np.uint64(1))
+
 
 def unmoved(size: tuple[int, int]) -> Tensor:
     """(h, w) int64: the order of a first source, each pixel with its own value.

@@ -20,7 +20,7 @@ from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
-from attnwarp.editing.schedule import START_PROTOCOL
+from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
@@ -257,6 +257,7 @@ class _Run:
                 "instruction": instruction,
                 "settings": settings.to_dict(),
                 **({"start_protocol": START_PROTOCOL} if settings.start else {}),
+                **({"fresh_noise": FRESH_PROTOCOL} if settings.noise == "fresh" else {}),
                 "source": self.names[source],
                 **({"chain": [self.names[view] for view in chain]} if chain else {}),
                 "stages": [[self.names[view] for view in stage] for stage in self.plan.stages],

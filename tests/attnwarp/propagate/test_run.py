@@ -588,6 +588,29 @@ def test_fresh_noise_is_each_views_own_and_shared_noise_is_one(scene, editor):
     assert torch.equal(first[1], fresh.noise(targets[1:])[0])
 
 
+def test_no_two_seeds_and_views_have_the_same_fresh_noise_nor_the_shared_one_of_any(scene, editor):
+    from attnwarp.propagate.editing import Target, ViewEditor
+
+    targets = [Target(view, scene[2][0]) for view in range(8)]
+    draws = []
+    for seed in range(3):
+        fresh = ViewEditor(editor, "a bear", replace(QUICK, noise="fresh", seed=seed))
+        draws.extend(noise.numpy().tobytes() for noise in fresh.noise(targets))
+    draws.extend(shared_noise((1, 4, 16, 16), seed).numpy().tobytes() for seed in range(16))
+    assert len(set(draws)) == 3 * 8 + 16
+
+
+def test_a_folder_whose_fresh_noise_was_drawn_as_before_is_refused(
+    finished, scene, editor, tmp_path
+):
+    settings = replace(QUICK, stages=1, steps=1, iterations=0, noise="fresh")
+    run(scene, editor, tmp_path, settings)
+    without(tmp_path, "fresh_noise")
+    with pytest.raises(InputError, match=r"an edit of other fresh_noise \(null, now 2\)\. Go on"):
+        run(scene, editor, tmp_path, settings)
+    assert "fresh_noise" not in json.loads((finished[1] / "manifest.json").read_text())
+
+
 def test_the_released_start_is_one_timestep_in_the_range(scene, editor):
     from attnwarp.propagate.editing import ViewEditor
 

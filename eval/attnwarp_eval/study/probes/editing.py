@@ -23,7 +23,7 @@ import torch
 from pydantic import Field
 
 from attnwarp import Camera, Gaussians, check
-from attnwarp.editing.schedule import START_PROTOCOL
+from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.render import render
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
@@ -308,11 +308,13 @@ class EditingProbe(Probe[EditResult]):
         own = variant.part(VariantPart)
         settings = settings_of(study, variant, seed)
         noised = settings.get("start") or settings.get("starts")
+        fresh = own.method == "propagate" and settings.get("noise") == "fresh"
         return {
             "spp": study.spp,
             "method": own.method,
             "settings": settings,
             **({"start_protocol": START_PROTOCOL} if noised else {}),
+            **({"fresh_noise": FRESH_PROTOCOL} if fresh else {}),
             # Features once went to pixels without depth too.
             **({"no_mask": "where there is depth"} if settings.get("mask") is False else {}),
             "editor": editor_identity(editor_of(study, variant)),
