@@ -24,7 +24,7 @@ from attnwarp.process import asked_to_stop
 from attnwarp.propagate.editing import ViewEditor
 from attnwarp.propagate.folder import SEGMENTS_FOLDER, VIEWER_PLY, Folder
 from attnwarp.propagate.page import write_page
-from attnwarp.propagate.pictures import check_source_picture
+from attnwarp.propagate.pictures import check_view_aspect
 from attnwarp.propagate.progress import progress_display
 from attnwarp.propagate.run import Propagation, propagate
 from attnwarp.propagate.scene import images_of, to_float
@@ -126,7 +126,7 @@ def edit_dataset(
         by_hand = (pixels / top).astype(np.float32)
         h, w, _ = by_hand.shape
         # Again in the edit, but here before a fit spends its minutes.
-        check_source_picture((h, w), views.cameras[index], f"--source-picture: {source_picture}")
+        check_view_aspect((h, w), views.cameras[index], f"--source-picture: {source_picture}")
     if settings.size is None:
         settings = replace(settings, size=editor.unet.config.sample_size * editor.factor)
     if splats is None:
@@ -256,7 +256,12 @@ def _coverage(masks: list[npt.NDArray[np.bool_]], cameras: Any) -> str:
 
 
 def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
-    """(H, W) bool of a picture: what is white and opaque."""
+    """(H, W) bool of a picture: what is white and opaque.
+
+    Raises:
+        InputError: it is coloured.
+        ValueError: another aspect ratio than the camera's.
+    """
     import cv2
 
     pixels, top = read_over_black(path)
@@ -266,6 +271,7 @@ def read_mask(path: Path, camera: Camera) -> npt.NDArray[np.bool_]:
         )
     bright = pixels.mean(axis=-1) / top
     size = (camera.width, camera.height)
+    check_view_aspect(bright.shape, camera, f"--masks: {path}")
     if bright.shape != size[::-1]:
         bright = cv2.resize(bright, size, interpolation=cv2.INTER_AREA)
     return np.asarray(bright > 0.5)

@@ -37,8 +37,8 @@ MULTIPLES = (8, 16, 32, 64)
 """Editors round the sides of a picture to multiples of these."""
 
 
-def check_source_picture(size: Size, camera: Camera, name: str) -> None:
-    """Refuse a picture of the source view that would be stretched to the view's shape.
+def check_view_aspect(size: Size, camera: Camera, name: str) -> None:
+    """Refuse a picture or mask of a view that would be stretched to the view's shape.
 
     Args:
         size: (h, w) of the picture: the view's aspect ratio, or what an editor makes of it by

@@ -31,7 +31,7 @@ from attnwarp.propagate.pictures import (
     Image,
     Mask,
     Principal,
-    check_source_picture,
+    check_view_aspect,
     composite,
     edit_size,
     enlarged,
@@ -194,7 +194,7 @@ def propagate(
         check.shape(np.asarray(source_picture), ("H", "W", 3), "source_picture")
         by_hand = to_float(checked_image(source_picture, "source_picture"))
         h, w, _ = by_hand.shape
-        check_source_picture((h, w), cameras[source], "source_picture")
+        check_view_aspect((h, w), cameras[source], "source_picture")
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
             gaussians, scene, editor, instruction, settings, source, by_hand, warps,

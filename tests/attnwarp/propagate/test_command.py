@@ -269,6 +269,20 @@ def test_a_mask_that_could_be_that_of_two_views_is_refused_with_both(first, mess
         mask_files(tmp_path, views_of_one_name()[first:])
 
 
+def test_a_mask_of_another_shape_is_refused_and_one_of_another_size_is_not(tmp_path):
+    view = Camera.look_at((3, 0, 0), (0, 0, 0), width=48, height=32, fov_y=40)
+    path = tmp_path / "mask.png"
+    upper = np.zeros((16, 24, 3), np.uint8)
+    upper[:8] = 255
+    path.write_bytes(encode_png(upper))
+    mask = read_mask(path, view)
+    assert mask.shape == (32, 48)
+    assert mask[:16].all() and not mask[16:].any()
+    path.write_bytes(encode_png(np.zeros((48, 32, 3), np.uint8)))  # turned
+    with pytest.raises(ValueError, match=r"--masks: .*mask\.png: got 48 x 32 .* ratio of 32 x 48"):
+        read_mask(path, view)
+
+
 def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
     """Oracle: the alpha, in numbers that 8 bits hold exactly."""
     colour = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)

@@ -7,7 +7,7 @@ import torch
 from attnwarp import Camera
 from attnwarp.propagate.pictures import (
     Principal,
-    check_source_picture,
+    check_view_aspect,
     composite,
     edit_size,
     enlarged_change,
@@ -129,7 +129,7 @@ def test_a_picture_of_the_source_is_the_views_shape_at_any_size_or_what_an_edito
         (32, 64),
         (256, 448),
     ):
-        check_source_picture(size, camera, "picture")
+        check_view_aspect(size, camera, "picture")
     for size in ((1920, 1080), (1080, 1080), (540, 1000), (512, 512)):
         with pytest.raises(ValueError, match="picture: got .* expected the aspect ratio of 1080 x"):
-            check_source_picture(size, camera, "picture")
+            check_view_aspect(size, camera, "picture")
