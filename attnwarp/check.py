@@ -125,6 +125,19 @@ def seconds(value: Any, name: str) -> None:
         raise ValueError(f"{name}: got {value!r}, expected seconds >= 0")
 
 
+def text(value: Any, name: str) -> None:
+    """Raise ValueError unless ``value`` is a string.
+
+    Example:
+        >>> from attnwarp import check
+        >>> check.text(2024, "suffix")
+        Traceback (most recent call last):
+        ValueError: suffix: got 2024, expected a string
+    """
+    if not isinstance(value, str):
+        raise ValueError(f"{name}: got {value!r}, expected a string")
+
+
 def one_of(value: str, allowed: Sequence[str], name: str) -> str:
     """Return ``value`` if it is among ``allowed``, else raise ValueError that lists what is."""
     if value not in allowed:

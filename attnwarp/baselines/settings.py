@@ -29,7 +29,7 @@ class Budget:
             beyond does not begin, and the round's tuning is the last.
 
     Raises:
-        ValueError: a negative number.
+        ValueError: a negative number, or one that is not finite.
 
     Example:
         >>> from attnwarp.baselines import Budget
@@ -43,8 +43,8 @@ class Budget:
     def __post_init__(self) -> None:
         for name in ("seconds", "network_rows"):
             value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise ValueError(f"{name}: got {value!r}, expected None or a number >= 0")
+            if value is not None and not 0 <= value < math.inf:
+                raise ValueError(f"{name}: got {value!r}, expected None or a finite number >= 0")
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,8 @@ class BaselineSettings:
                 check.one_of(value, get_args(_CHOICES[field.name]), field.name)
             elif field.name in _NUMBERS:
                 _check_number(field.name, value)
+            elif field.name in _TEXTS and not (value is None and field.name in _OPTIONAL):
+                check.text(value, field.name)
             elif field.name in ("start", "starts"):
                 _check_timesteps(field.name, getattr(self, field.name))
 
@@ -277,7 +279,12 @@ _NUMBERS: dict[str, tuple[type, float, float]] = {
     ),
 }  # fmt: skip
 
-_OPTIONAL = {"size", "text_guidance", "image_guidance", "control_share", "epipolar"}
+_TEXTS = {"perceptual_encoder", "source_prompt", "suffix", "negative_prompt"}
+
+_OPTIONAL = {
+    "size", "text_guidance", "image_guidance", "control_share", "epipolar", "source_prompt",
+    "negative_prompt",
+}  # fmt: skip
 
 
 def _check_number(name: str, value: Any) -> None:

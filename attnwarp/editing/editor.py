@@ -247,9 +247,20 @@ class Latent:
             part.eval().requires_grad_(False)
 
     def timesteps(self, steps: int) -> list[int]:
-        """Steps from pure noise, as the model's own scheduler spaces them."""
+        """Steps from pure noise, as the model's own scheduler spaces them.
+
+        Raises:
+            ValueError: more steps than the scheduler has.
+        """
         self.scheduler.set_timesteps(steps)
-        return [int(t) for t in self.scheduler.timesteps]
+        timesteps = [int(t) for t in self.scheduler.timesteps]
+        last = len(self.schedule.alphas) - 1
+        if max(timesteps) > last:  # an offset moves the first of as many as were trained
+            raise ValueError(
+                f"steps: got {steps}, the first of which would be timestep {max(timesteps)} of this"
+                f" editor's schedule, that ends at {last}; take fewer"
+            )
+        return timesteps
 
     def raw_latents(self, pictures: Tensor) -> Tensor:
         """(B, C, h, w) of (B, 3, H, W) in [0, 1], the mode, not scaled."""

@@ -195,7 +195,7 @@ def _view_of(cameras: Any, name: str | None) -> int:
     for candidates in (names, files, stems):
         if candidates.count(name) == 1:
             return candidates.index(name)
-    if name.isdigit() and int(name) < len(names):
+    if name.isdecimal() and int(name) < len(names):
         return int(name)
     raise InputError(
         f"--source: got {name!r}, expected a view's name or a number below {len(names)}"

@@ -92,16 +92,19 @@ class Folder:
         write_atomically(self.path / name, lambda stream: stream.write(text.encode()))
 
     def read_json(self, name: str) -> Any:
-        """Read JSON.
+        """Read the object of a JSON file.
 
         Raises:
             FileFormatError: it is damaged.
         """
         path = self.path / name
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            value = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise FileFormatError(path, f"not JSON ({error}); remove it, it is made anew") from None
+        if not isinstance(value, dict):
+            raise FileFormatError(path, "holds no JSON object; remove it, it is made anew")
+        return value
 
     def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
         """Write an (H, W, 3) uint8 PNG atomically."""

@@ -168,6 +168,7 @@ class PropagateSettings:
         for name in ("mask", "confidence"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
+        check.text(self.perceptual_encoder, "perceptual_encoder")
         if not isinstance(self.warp, WarpSettings):
             raise ValueError(f"warp: got {self.warp!r}, expected WarpSettings")
         for name in ("fractions", "kinds", "blocks", "branches", "start"):
@@ -337,6 +338,8 @@ def preset(name: str, **changes: Any) -> PropagateSettings:
     values = PRESETS[name].to_dict()
     for key, value in changes.items():
         if key.startswith("warp."):
+            if not isinstance(values["warp"], dict):
+                raise ValueError(f"warp: got {values['warp']!r}, expected its fields by name")
             values["warp"] = {**values["warp"], key.removeprefix("warp."): value}
         else:
             values[key] = value

@@ -229,8 +229,15 @@ def test_arguments_that_do_not_fit_are_named(run, scene, editor, depth_editor, t
     wide = [*views[:2], Camera.look_at((0, 0, 3), (0, 0, 0), width=64, height=32, fov_y=40, up=(0, 1, 0))]  # fmt: skip
     with pytest.raises(ValueError, match="cameras: dge edits views together, got edits of 32 x 32 and 64 x 32"):  # fmt: skip
         dge(model, wide, None, editor, "a bear", QUICK["dge"])
-    with pytest.raises(ValueError, match="seconds: got -1"):
-        Budget(seconds=-1)
+    for seconds in (-1, np.inf, np.nan):
+        with pytest.raises(ValueError, match=f"seconds: got {seconds}, expected None or a finite"):
+            Budget(seconds=seconds)
+    for field in ("suffix", "negative_prompt", "source_prompt", "perceptual_encoder"):
+        with pytest.raises(ValueError, match=f"{field}: got 2024, expected a string"):
+            preset("gaussctrl", **{field: 2024})
+    for field in ("suffix", "perceptual_encoder"):
+        with pytest.raises(ValueError, match=f"{field}: got None, expected a string"):
+            preset("gaussctrl", **{field: None})
     with pytest.raises(ValueError, match="method: got 'dgee'.*dge"):
         preset("dgee")
     for wrong in ((9, 3), (700, 1000)):

@@ -286,6 +286,10 @@ def test_what_does_not_fit_is_refused_by_name():
     for steps in (0, 2.5, 1001):
         with pytest.raises(ValueError, match=f"steps: got {steps}, expected a whole number in"):
             edit(editor, [picture()], "a bear", steps=steps)
+    # The scheduler's offset of 1 would move the first of 1000 steps beyond the last that it has.
+    with pytest.raises(ValueError, match="steps: got 1000, .* timestep 1000 .* ends at 999"):
+        edit(editor, [picture()], "a bear", steps=1000)
+    assert max(editor.timesteps(999)) == 999
     latents = torch.zeros(1, 4, H // 2, W // 2)
     for name, value in (("start", 700), ("noise", latents)):
         with pytest.raises(ValueError, match=f"latents: got latents and {name}, expected one of"):

@@ -302,6 +302,7 @@ def test_transparent_pixels_of_a_mask_or_a_picture_by_hand_are_black(tmp_path):
     ("more", "message"),
     [
         (("--source", "v9"), "--source: got 'v9', expected a view's name or a number below 5"),
+        (("--source", "²"), "--source: got '²', expected a view's name or a number below 5"),
         (("--preset", "corected"), "preset: got 'corected', expected one of 'corrected', "),
         (("--preset", "corected"), "; did you mean 'corrected'?"),
         (("--editor", "smal"), "editor 'smal': neither bundled"),

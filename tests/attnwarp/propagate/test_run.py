@@ -21,7 +21,7 @@ from attnwarp import Camera, Gaussians
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import Schedule
 from attnwarp.errors import InputError
-from attnwarp.io import read_image, read_ply
+from attnwarp.io import FileFormatError, read_image, read_ply
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate import run as run_module
 from attnwarp.propagate.pictures import full_size, to_bytes
@@ -469,6 +469,14 @@ def test_a_folder_of_another_edit_is_refused_by_name(
     with pytest.raises(InputError, match=message):
         run(scene, editor, finished[1], replace(QUICK, **settings), words)
     assert files(finished[1]) == before
+
+
+@pytest.mark.parametrize("name", ["times.json", "manifest.json"])
+def test_json_that_is_no_object_is_refused_by_its_file(name, scene, editor, tmp_path):
+    (tmp_path / name).write_text("[1]")
+    settings = replace(QUICK, sources=2)  # which the manifest is asked for first
+    with pytest.raises(FileFormatError, match=f"{name}: holds no JSON object; remove it"):
+        run(scene, editor, tmp_path, settings)
 
 
 def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):
