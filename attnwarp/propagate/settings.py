@@ -66,7 +66,8 @@ class PropagateSettings:
             (:func:`attnwarp.editing.schedule.steps_as_published`).
         start_picture: what is noised to ``start``: the current "render" (IGS2GS) or the "original".
         text_guidance: s_T of the first stage; None for the editor's own.
-        guidance_drop: what each further stage takes off s_T, which may fall to 0 and not below.
+        guidance_drop: what each further stage takes off ``text_guidance``, which may fall to 0 and
+            not below.
         source_text_guidance: s_T of the source; None for the first stage's.
         batch: target views that go through the network together. Another batch gives other bits.
         warp: correspondences and masks, :class:`attnwarp.warp.WarpSettings`.
@@ -184,6 +185,11 @@ class PropagateSettings:
             if value is not None or name not in _OPTIONAL:
                 check.number(value, low, high, name, whole=name in _WHOLE)
         _check_start(self.start)
+        if self.guidance_drop > 0 and self.text_guidance is None:
+            raise ValueError(
+                f"guidance_drop: got {self.guidance_drop:g} without text_guidance, which it is"
+                " taken off; give text_guidance too, or set guidance_drop to 0"
+            )
         last = self.guidance(self.stages - 1)
         if last is not None and last < -1e-9:  # 0.3 - 3 * 0.1 is not below 0
             raise ValueError(

@@ -72,6 +72,7 @@ def test_settings_survive_json(name):
             {"text_guidance": 1.5, "guidance_drop": 1.0, "stages": 3},
             "text_guidance, guidance_drop: got 1.5 and 1, so stage 3 has -0.5, expected at least 0",
         ),
+        ({"guidance_drop": 1.5}, "guidance_drop: got 1.5 without text_guidance, which it is taken"),
         ({"perceptual_encoder": 5}, "perceptual_encoder: got 5, expected a string"),
         ({"perceptual_encoder": None}, "perceptual_encoder: got None, expected a string"),
         ({"warp": 3, "warp.opaque": 0.9}, "warp: got 3, expected its fields by name"),
