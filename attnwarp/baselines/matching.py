@@ -139,20 +139,24 @@ class KeyViews:
             for values in (tokens, self._tokens[name], self._outputs[name])
         )
         result = torch.zeros_like(own)
-        for k, view in enumerate(now.views):
+        for k in range(len(now.views)):
             for key, weight in now.nearest[k]:
-                excluded = self._excluded(view, now.keys[key], self.layers[name], tokens.device)
+                excluded = self._excluded(now, k, key, self.layers[name], tokens.device)
                 index = matches(own[branch, k], key_tokens[branch, key], excluded)
                 result[:, k] += weight * outputs[:, key, index]
         return result.reshape(tokens.shape)
 
     def _excluded(
-        self, view: Camera, key: Camera, size: Size, device: torch.device
+        self, now: _ViewPass, view: int, key: int, size: Size, device: torch.device
     ) -> Tensor | None:
         if self.epipolar is None:
             return None
-        distances = line_distances(view, key, size)
-        return None if distances is None else (distances > self.epipolar).to(device)
+        place = view, key, size
+        if place not in now.excluded:
+            distances = line_distances(now.views[view], now.keys[key], size)
+            far = None if distances is None else (distances > self.epipolar).to(device)
+            now.excluded[place] = far
+        return now.excluded[place]
 
 
 @dataclass(frozen=True)
@@ -165,6 +169,9 @@ class _ViewPass:
     views: list[Camera]
     keys: list[Camera]
     nearest: list[list[tuple[int, float]]]
+    # By view, key and size: layers of one size share what is as large as their attention. Kept for
+    # one pass, since those of all views at once would fill the memory.
+    excluded: dict[tuple[int, int, Size], Tensor | None] = field(default_factory=dict)
 
 
 @contextmanager

@@ -10,8 +10,10 @@ import torch
 from drawn_lines import drawn_distances
 
 from attnwarp import Camera
+from attnwarp.baselines import matching
 from attnwarp.baselines.attention import aligned, self_attention
 from attnwarp.baselines.dge import by_angle
+from attnwarp.baselines.epipolar import line_distances
 from attnwarp.baselines.matching import key_views, matches
 
 SIDE = 8  # of the latents; half of it in the lower layers
@@ -158,6 +160,25 @@ def test_dges_attention_is_a_loop_over_tokens_in_every_layer(network, nearest, r
         anywhere = matched(*split, views, keys, (side, side), nearest, None)
         excluded += (np.abs(anywhere - expected).max(axis=(0, 3)) > 0).sum()
     assert (excluded > 50) == (radius is not None)
+
+
+def test_layers_of_one_size_share_the_distances_from_a_views_lines(network, monkeypatch):
+    asked = []
+
+    def watched_distances(view, key, size):
+        asked.append((id(view), id(key), size))
+        return line_distances(view, key, size)
+
+    monkeypatch.setattr(matching, "line_distances", watched_distances)
+    views, keys = ring()
+    with key_views(network, ("text",), (SIDE, SIDE), 1.0) as attention_of:
+        with attention_of.key_pass():
+            forward(network, 2)
+        with attention_of.view_pass(views, keys, 2):
+            forward(network, 3)
+    sizes = {(side, side) for side in (SIDE, SIDE // 2)}
+    assert len(layers(network)) > len(sizes)
+    assert sorted(asked) == sorted((id(v), id(k), s) for v in views for k in keys for s in sizes)
 
 
 def test_a_match_is_the_best_of_the_pairs_that_count_and_of_all_where_none_does():
