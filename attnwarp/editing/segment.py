@@ -27,6 +27,10 @@ Mask = npt.NDArray[np.bool_]
 WORKING_SIDE = 256
 """Larger pictures are cut at this short side in px."""
 
+LONGEST_SIDE = 1024
+"""In px, of what is rated and cut: a panorama would take memory without bound. Pictures up to 4:1
+stay below it."""
+
 
 @runtime_checkable
 class Segmenter(Protocol):
@@ -372,11 +376,11 @@ class ClipSegmenter:
 
 
 def _resized(picture: Image, short: int) -> Image:
-    """The picture with a short side of that many px."""
+    """The picture with a short side of that many px, or a long side of :data:`LONGEST_SIDE`."""
     import cv2
 
     height, width = picture.shape[:2]
-    scale = short / min(height, width)
+    scale = min(short / min(height, width), LONGEST_SIDE / max(height, width))
     if scale == 1:
         return picture
     size = (max(1, round(scale * width)), max(1, round(scale * height)))

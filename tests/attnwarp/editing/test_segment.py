@@ -149,17 +149,23 @@ def test_the_bundled_segmenter_cuts_parts_of_held_out_things_out(clip):
     assert np.mean(overlaps) > 0.5
 
 
+class Halves:
+    """Says that a ball is in the left half; keeps the sizes of the pictures that it is shown."""
+
+    def __init__(self):
+        self.sizes = []
+
+    def shown(self, image, texts):
+        assert texts == ["a photo of ball"]
+        self.sizes.append(image.shape[:2])
+        height, width = (max(1, side // 8) for side in image.shape[:2])
+        probability = np.full((height, width, 1), 0.1)
+        probability[:, : width // 2] = 0.9
+        return probability
+
+
 def test_a_segmenter_follows_the_probabilities_of_its_encoder():
     """Oracle: two halves of one colour each, of which an encoder that is made by hand says which it is."""
-
-    class Halves:
-        def shown(self, image, texts):
-            assert texts == ["a photo of ball"]
-            height, width = image.shape[0] // 8, image.shape[1] // 8
-            probability = np.full((height, width, 1), 0.1)
-            probability[:, : width // 2] = 0.9
-            return probability
-
     image = np.full((96, 128, 3), 0.2)
     image[:, 64:] = 0.8
     segmenter = ClipSegmenter(Halves())
@@ -169,6 +175,17 @@ def test_a_segmenter_follows_the_probabilities_of_its_encoder():
     assert (segmenter.segment(image, "ball") == (image[..., 0] < 0.5)).all()
     with pytest.raises(NoDetectionError):
         dataclasses.replace(segmenter, detection=0.95).segment(image, "ball")
+    assert {(128, 171), (192, 256), (256, 341)} <= set(segmenter.encoder.sizes)
+
+
+def test_a_long_picture_is_rated_at_a_bounded_size():
+    image = np.full((48, 2400, 3), 0.2)
+    image[:, 1200:] = 0.8
+    segmenter = ClipSegmenter(Halves())
+    mask = segmenter.segment(image, "ball")
+    assert {max(size) for size in segmenter.encoder.sizes} == {1024}
+    expected = image[..., 0] < 0.5
+    assert (mask & expected).sum() / (mask | expected).sum() > 0.99
 
 
 def test_nothing_in_an_empty_picture_is_an_error(clip):
