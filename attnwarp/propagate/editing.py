@@ -298,9 +298,9 @@ class ViewEditor:
                     for row, order in zip(rows, orders, strict=True)
                 ]
             )
-        seeds = [own_seed(s.seed, FRESH, target.view) for target in targets]
-        rows = zip(targets, seeds, strict=True)
-        return torch.cat([shared_noise(self._shape(target), seed) for target, seed in rows])
+        return torch.cat(
+            [shared_noise(self._shape(t), own_seed(s.seed, FRESH, t.view)) for t in targets]
+        )
 
     def noise_order(self, target: Target, sources: Sequence[Source]) -> Tensor:
         """(h, w) int64: the order of a view's noise where noise sticks to the surface; sources of
