@@ -4,6 +4,7 @@ import json
 import shutil
 import weakref
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from attnwarp.baselines.fitting import Fitting
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import read_image, read_ply
 from attnwarp.propagate.pictures import full_size, to_bytes
+from attnwarp.propagate.tune import DrawnViews
 
 
 @pytest.fixture(scope="module")
@@ -325,7 +327,8 @@ def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_
         assert np.abs(view.picture - before)[:, :15].max() > 0.1
 
 
-def test_of_the_pictures_a_round_tunes_on_two_are_held_at_a_time(run, monkeypatch):
+@pytest.mark.parametrize("held", [0, 1, 8])
+def test_of_the_pictures_a_round_tunes_on_as_many_are_kept_as_fit(run, monkeypatch, held):
     """Oracle: references that do not hold their objects."""
     made, most = [], 0
 
@@ -337,6 +340,10 @@ def test_of_the_pictures_a_round_tunes_on_two_are_held_at_a_time(run, monkeypatc
         return picture
 
     monkeypatch.setattr(run_module, "full_size", watched)
-    run("by_view", ByViewSettings(steps=1, iterations=3, perceptual=0))
-    assert len(made) >= 3
-    assert most == 2  # the first view's, and the iteration's
+    limited = partial(DrawnViews, held_bytes=held * 32 * 32 * 3 * 4)
+    monkeypatch.setattr(run_module, "DrawnViews", limited)
+    run("by_view", ByViewSettings(steps=1, iterations=9, perceptual=0))
+    views = 3
+    # Beside those that are kept: the first view's, which the round holds, and the iteration's.
+    assert most == {0: 2, 1: 2, 8: views}[held]
+    assert len(made) == {0: 10, 1: 7, 8: views}[held]
