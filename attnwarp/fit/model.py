@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 
 # The function, not the class: torch.optim.Adam imports torch's compiler, which takes a second.
 from torch.optim.adam import adam
 
+from attnwarp import check
 from attnwarp.fit.settings import FitSettings
 from attnwarp.gaussians import Gaussians
 from attnwarp.io.ply import split_origin
@@ -37,6 +39,7 @@ class Model:
 
     Attributes:
         origin: (3,) float64 world coordinates that "means" are relative to.
+        start_origin: (3,) the origin of the splats that the fit began with.
         tensors: the leaves by name: "means" (N, 3), "dc" (N, 1, 3), "rest" (N, K - 1, 3), "opacity"
             (N,) logits, "scales" (N, 2 or 3) logarithms, "quats" (N, 4).
         first, second: Adam's moments by name.
@@ -52,7 +55,7 @@ class Model:
         g = start.detach().to(dtype=torch.float32)
         # float64 centres far from zero would be moved by float32.
         offset, means = split_origin(start.means.detach().cpu().numpy())
-        self.origin = start.origin + offset
+        self.start_origin, self.origin = start.origin, start.origin + offset
         self.tensors: dict[str, Tensor] = {
             "means": torch.tensor(means, device=g.means.device),
             "dc": g.sh[:, :1].clone(),
@@ -164,6 +167,7 @@ class Model:
         """Everything that the next step depends on."""
         return {
             "steps": self.steps,
+            "origin": [float(v) for v in self.origin],
             "tensors": {name: tensor.detach().clone() for name, tensor in self.tensors.items()},
             "first": {name: moment.clone() for name, moment in self.first.items()},
             "second": {name: moment.clone() for name, moment in self.second.items()},
@@ -171,7 +175,10 @@ class Model:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from what :meth:`state` gave."""
-        self.steps = int(state["steps"])
+        # States once held no origin: the one of the start was the model's own.
+        origin = np.array(state.get("origin", self.start_origin), dtype=np.float64)
+        check.shape(origin, (3,), "origin")
+        self.steps, self.origin = int(state["steps"]), origin
         for name in NAMES:
             self.tensors[name] = state["tensors"][name].clone().requires_grad_(True)
             self.first[name], self.second[name] = (
