@@ -657,14 +657,17 @@ def _camera(values: _Values, image: Path) -> Camera:
                 )
             f = extent / 2 / math.tan(angle / 2)
         focal.append(f)
-    for k, (axis, other) in enumerate((("x", "y"), ("y", "x"))):
+    for f, axis, other in zip(focal, ("x", "y"), ("y", "x"), strict=True):
+        given = values.number(f"fl_{other}", level)
+        if f is not None or given is None:
+            continue
         outer = values.number(f"fl_{axis}")
-        if focal[k] is None and f"fl_{other}" in level and outer not in (None, focal[1 - k]):
+        if outer not in (None, given):
             # Square pixels, or the top's other axis?
             raise values.refuse(
                 f"fl_{other}",
-                f"got {focal[1 - k]:g} without fl_{axis}, which is {outer:g} at the top of the"
-                " file; write both in the frame",
+                f"got {given:g} without fl_{axis}, which is {outer:g} at the top of the file; write"
+                " both in the frame",
             )
     # One focal length means square pixels.
     fx, fy = focal[0] or focal[1], focal[1] or focal[0]

@@ -132,6 +132,34 @@ def test_one_focal_length_beside_another_at_the_top_could_mean_two_things(tmp_pa
     assert square.K[0, 0] == square.K[1, 1] == LENS[own]
 
 
+@pytest.mark.filterwarnings("ignore:.*frames have intrinsics other than the top")
+@pytest.mark.parametrize(
+    ("top", "frame", "focal"),
+    [
+        ({"fl_y": 11.0}, {"fl_x": None, "camera_angle_x": 1.0}, 4 / math.tan(0.5)),
+        ({"fl_x": "auto"}, {"camera_angle_x": 1.0}, 4 / math.tan(0.5)),
+        ({"fl_x": 10.0, "fl_y": 11.0}, {"fl_x": 9.0, "fl_y": None}, 9.0),
+    ],
+)
+def test_a_focal_length_that_the_frame_leaves_open_is_not_compared(tmp_path, top, frame, focal):
+    """w / 2 / tan(angle / 2) by hand; pixels are square."""
+    image(tmp_path / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": pose(), **frame}
+    (camera,) = read_transforms(write(tmp_path, [frame], w=8, h=6, **top)).cameras
+    np.testing.assert_allclose(camera.K[[0, 1], [0, 1]], focal, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("top", "frame"),
+    [({"fl_x": 5}, {"fl_y": None}), ({"fl_x": 5, "fl_y": 6}, {"fl_x": None})],
+)
+def test_a_frame_whose_focal_length_is_null_has_none(tmp_path, top, frame):
+    image(tmp_path / "a.png")
+    frame = {"file_path": "a.png", "transform_matrix": pose(), **frame}
+    with pytest.raises(FileFormatError, match="fl_x: got None, None; expected positive fl_x"):
+        read_transforms(write(tmp_path, [frame], w=8, h=6, **top))
+
+
 @pytest.mark.parametrize("noise", ["float32", "five digits"])
 def test_a_rotation_with_small_noise_becomes_the_nearest_rotation(tmp_path, noise):
     matrix = pose(4)
