@@ -16,7 +16,7 @@ Threads follow ``torch.set_num_threads``; the result has the same bits for any n
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,12 @@ from attnwarp.render.binned import (
 from attnwarp.render.dispatch import call
 from attnwarp.render.interface import OUTPUTS, Inputs, Outputs
 from attnwarp.render.threads import ranges, run_jobs, thread_count
+
+MAP_READERS = {
+    "alpha": ("depth", "distortion_l1", "distortion_l2_ndc", "background"),
+    "depth": ("depth", "distortion_l1"),
+}
+"""Outputs whose gradients read a map that the caller holds, and the background, whose own does."""
 
 GRADIENT_ROWS = 1 << 16
 """Rows of gradients held before they are summed: a few megabytes, which stay in the cache."""
@@ -171,16 +177,21 @@ class _Composite(torch.autograd.Function):
         arrays = (*drawn.pictures[:-1], drawn.weight)
         outputs = tuple(torch.from_numpy(array) for array in arrays)
         _, alpha, depth, *_ = outputs
-        # Saved so that torch notices when one of them is changed in place before the backward pass,
-        # which reads alpha and depth in the caller's own memory.
-        ctx.save_for_backward(*tensors, alpha, depth)
+        # Saved so that torch notices when one of them is changed in place before the backward pass.
+        ctx.save_for_backward(*tensors)
+        # Not saved, as most gradients read neither. Detached, they hold no graph, but they share
+        # the caller's memory and its count of changes in place.
+        ctx.maps = {"alpha": alpha.detach(), "depth": depth.detach()}
         return outputs
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: torch.Tensor | None) -> tuple[Any, ...]:
-        drawn: _Drawn = ctx.drawn
         _ = ctx.saved_tensors
+        wanted = {name for name, grad in zip(OUTPUTS, upstream, strict=True) if grad is not None}
+        if ctx.needs_input_grad[8]:
+            wanted.add("background")
+        drawn = _with_sound_maps(ctx.drawn, ctx.maps, wanted)
         shapes = [array.shape for array in (*drawn.pictures[:-1], drawn.weight)]
         given = layout.Upstream(
             *(
@@ -231,6 +242,32 @@ class _Composite(torch.autograd.Function):
                 )
             ),
         )
+
+
+def _with_sound_maps(drawn: _Drawn, maps: dict[str, torch.Tensor], wanted: set[str]) -> _Drawn:
+    """The drawn picture, with ones for a map that was changed since and that no gradient reads.
+
+    Zero times a changed value need not be zero.
+
+    Args:
+        maps: "alpha" and "depth" as the caller holds them.
+        wanted: names of the outputs that have a gradient, and "background" if it needs one.
+
+    Raises:
+        RuntimeError: a gradient reads a map that was changed in place.
+    """
+    for name, tensor in maps.items():
+        if tensor._version == 0:
+            continue
+        readers = [reader for reader in MAP_READERS[name] if reader in wanted]
+        if readers:
+            raise RuntimeError(
+                f"{name}: this output of a render was modified by an inplace operation, and the"
+                f" gradient of {', '.join(readers)} reads it; change a copy of it, {name}.clone()"
+            )
+        array = getattr(drawn.pictures, name)
+        drawn = replace(drawn, pictures=drawn.pictures._replace(**{name: np.ones_like(array)}))
+    return drawn
 
 
 def _table_gradients(drawn: _Drawn, upstream: layout.Upstream) -> np.ndarray:

@@ -374,6 +374,12 @@ def test_changing_a_parameter_in_place_before_the_backward_pass_is_an_error(
         loss.backward()
 
 
+READ_BY_OWN_GRADIENTS = {
+    "alpha": {"depth", "distortion_l1", "distortion_l2_ndc"},
+    "depth": {"depth", "distortion_l1"},
+}
+
+
 @pytest.mark.parametrize("name", OUTPUTS)
 def test_changing_an_output_in_place_gives_its_gradients_or_an_error(
     name: str, make_camera, make_splats
@@ -394,9 +400,47 @@ def test_changing_an_output_in_place_gives_its_gradients_or_an_error(
         got = gradient("cpu", lambda output: output.div_(3))
     except RuntimeError as error:
         assert "modified by an inplace operation" in str(error)
-        assert name in ("alpha", "depth")
+        assert name in READ_BY_OWN_GRADIENTS
     else:
         assert (got - expected).abs().max() < 1e-3 * expected.abs().max()
+
+
+@pytest.mark.parametrize("width", [16, 13])  # a whole tile and a part of one
+@pytest.mark.parametrize("value", [0.0, math.nan, math.inf])
+@pytest.mark.parametrize("changed", READ_BY_OWN_GRADIENTS)
+def test_a_changed_map_hinders_only_the_gradients_that_read_it(
+    changed: str, value: float, width: int, make_camera, make_splats
+) -> None:
+    """Oracle: the gradients of a render whose maps are left as they were, bit for bit."""
+    camera = make_camera(4, width, 16)
+    splats = make_splats(4, "2d", 20, camera)
+
+    def gradient(name: str, change: bool) -> torch.Tensor:
+        means = splats.means.clone().requires_grad_()
+        view = render(dataclasses.replace(splats, means=means), camera, background=(0.2, 0.5, 0.9))
+        output = getattr(view, name)
+        upstream = torch.linspace(-1, 1, output.numel()).reshape(output.shape)
+        if change:
+            with torch.no_grad():
+                getattr(view, changed).fill_(value)
+        return torch.autograd.grad(output, means, upstream)[0]
+
+    for name in OUTPUTS:
+        if name in READ_BY_OWN_GRADIENTS[changed]:
+            with pytest.raises(RuntimeError, match=rf"{changed}: .*inplace.*gradient of {name}"):
+                gradient(name, True)
+        else:
+            assert torch.equal(gradient(name, True), gradient(name, False))
+
+
+def test_a_changed_alpha_is_refused_by_a_backgrounds_gradient(make_camera, make_splats) -> None:
+    camera = make_camera(4, 16, 16)
+    background = torch.zeros(3, requires_grad=True)
+    view = render(make_splats(4, "2d", 20, camera), camera, background=background)
+    loss = view.color.sum()
+    view.alpha.clamp_(0, 0.5)
+    with pytest.raises(RuntimeError, match=r"gradient of background reads it; .*alpha\.clone"):
+        loss.backward()
 
 
 def test_a_picture_that_no_backward_pass_followed_leaves_no_memory_behind(
