@@ -124,7 +124,11 @@ class Gaussians:
 
     def rotations(self) -> torch.Tensor:
         """(N, 3, 3) rotation matrices; column k is the splat's axis k in world coordinates."""
-        w, x, y, z = torch.nn.functional.normalize(self.quats, dim=-1, eps=0).unbind(-1)
+        # Squares of tiny or huge numbers leave the float's range. A power of two costs no bit.
+        largest = self.quats.detach().abs().amax(dim=-1, keepdim=True)
+        scale = torch.frexp(largest).mantissa / largest
+        quats = self.quats * scale.clamp(max=1 / torch.finfo(scale.dtype).tiny)
+        w, x, y, z = torch.nn.functional.normalize(quats, dim=-1, eps=0).unbind(-1)
         rows = [
             1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
             2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),

@@ -106,8 +106,7 @@ def read_ply(
     xyz = _stack(path, columns, ("x", "y", "z"), np.float64)
     opacity = _column(path, columns, "opacity", np.float64, infinities=True)
     quats = _stack(path, columns, ("rot_0", "rot_1", "rot_2", "rot_3"), np.float32)
-    # In float32, as the model normalises: 1e-30 is as good as zero there, and 1e30 as bad as
-    # infinite.
+    # In float32, as the model checks: the square of 1e-30 is zero there, and that of 1e30 infinite.
     norm = torch.from_numpy(quats).norm(dim=-1).numpy()
     _refuse(path, "rot_0..3", norm == 0, "a zero quaternion has no rotation", "remove the row")
     _refuse(

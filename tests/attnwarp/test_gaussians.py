@@ -23,13 +23,44 @@ def splats(kind="2d", n=5, dtype=torch.float32, **changes):
     return Gaussians(kind, **{**fields, **changes})
 
 
-@pytest.mark.parametrize("length", [1e-14, 1.0, 1e14])
-def test_rotations_are_scipys_for_quaternions_of_any_length(length):
-    model = splats(dtype=torch.float64)
-    w, x, y, z = model.quats.T.numpy() * 7.0
-    model = dataclasses.replace(model, quats=length * model.quats)
+@pytest.mark.parametrize(
+    ("dtype", "power"),
+    # From where the squares are hardly above zero to the largest numbers.
+    [(torch.float32, p) for p in (-72, -63, 0, 80, 127)]
+    + [(torch.float64, p) for p in (-530, -46, 0, 46, 600, 1023)],
+)
+def test_rotations_are_scipys_for_quaternions_of_any_length(dtype, power):
+    model = splats(dtype=dtype)
+    w, x, y, z = model.quats.double().T.numpy() * 7.0
+    length = 2.0 ** (power - power // 2)
+    quats = model.quats * length * 2.0 ** (power // 2)
+    model = dataclasses.replace(model, quats=quats)
     expected = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
-    assert np.abs(model.rotations().numpy() - expected).max() < 1e-14
+    error = np.abs(model.rotations().numpy() - expected).max()
+    assert error < 8 * torch.finfo(dtype).eps
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_quaternions_of_ordinary_length_turn_with_the_bits_of_the_plain_formula(dtype):
+    """And so do their gradients: results of fits keep their bits."""
+    quats = torch.randn(500, 4, generator=torch.Generator().manual_seed(0), dtype=dtype)
+    quats *= 10 ** torch.linspace(-4, 4, 500, dtype=dtype)[:, None]
+    upstream = torch.randn(500, 3, generator=torch.Generator().manual_seed(1), dtype=dtype)
+
+    def plain(q):
+        w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
+        return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+
+    def gradient(function):
+        leaf = quats.clone().requires_grad_()
+        result = function(leaf)
+        return result, *torch.autograd.grad(result, leaf, upstream)
+
+    def turned(leaf):
+        return splats("2d", 500, dtype, quats=leaf).rotations()[:, :, 2]
+
+    for got, expected in zip(gradient(turned), gradient(plain), strict=True):
+        assert torch.equal(got, expected)
 
 
 def test_the_normal_is_the_third_axis_of_a_disc_and_the_shortest_of_an_ellipsoid():
