@@ -399,19 +399,14 @@ def _text_images(path: Path) -> list[_Pose]:
         if not line:
             continue
         try:
-            _, *pose, camera, name = line.split(maxsplit=9)
-            poses.append(
-                _Pose(tuple(map(float, pose[:4])), tuple(map(float, pose[4:])), int(camera), name)
-            )
-            if len(pose) != 7:
-                raise ValueError(len(pose))
+            poses.append(_text_pose(line))
         except ValueError as error:
             raise _damaged(
                 path, number, line, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from error
         # The line after it holds the keypoints and may be empty, or missing at the end.
         number, line = next(lines, (number, ""))
-        if not _are_keypoints(line):
+        if _is_image(line):
             raise _damaged(
                 path,
                 number,
@@ -421,14 +416,32 @@ def _text_images(path: Path) -> list[_Pose]:
     return poses
 
 
-def _are_keypoints(line: str) -> bool:
-    """Whether a line of images.txt holds numbers in threes, or nothing. The next image has ten
-    fields, of which the last is a name.
+def _text_pose(line: str) -> _Pose:
+    """The fields of an image's line; ValueError if there are others."""
+    _, qw, qx, qy, qz, tx, ty, tz, camera, name = line.split(maxsplit=9)
+    rotation, translation = (qw, qx, qy, qz), (tx, ty, tz)
+    return _Pose(tuple(map(float, rotation)), tuple(map(float, translation)), int(camera), name)
+
+
+def _is_image(line: str) -> bool:
+    """Whether a line in the place of keypoints is the next image. As nothing reads keypoints, all
+    else may stand there.
     """
     try:
-        return len([float(field) for field in line.split()]) % 3 == 0
+        name = _text_pose(line).name
     except ValueError:
         return False
+    # Keypoints may begin like an image, but go on with numbers, and these in threes.
+    first, *others = name.split(maxsplit=2)
+    return len(others) < 2 or not (_is_number(first) and _is_number(name.rsplit(maxsplit=1)[-1]))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _text_points(path: Path) -> tuple[Array, npt.NDArray[np.uint8]]:

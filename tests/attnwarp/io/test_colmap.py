@@ -245,16 +245,35 @@ def test_a_damaged_line_is_named(tmp_path, name, line, parts):
         assert part in str(caught.value), str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["b.png", "12"])
+@pytest.mark.parametrize("name", ["b.png", "12", "b c d.png", "1 2 d.png"])
 def test_an_image_where_keypoints_belong_is_refused_and_not_skipped(tmp_path, name):
     write_text(tmp_path)
     first, second = "1 1 0 0 0 0 0 1 7 a.png", f"2 1 0 0 0 0 0 1 7 {name}"
     (tmp_path / "images.txt").write_text(f"{first}\n{second}\n")
     with pytest.raises(FileFormatError, match="images.txt: line 2: got '2 1 0.*an empty line for"):
         read_colmap(tmp_path, missing_images="none")
-    for keypoints in ("", "1.5 2.5 -1 3 4e1 17"):
-        (tmp_path / "images.txt").write_text(f"{first}\n{keypoints}\n{second}\n")
-        assert len(read_colmap(tmp_path, missing_images="none")) == 2
+
+
+@pytest.mark.parametrize(
+    "keypoints",
+    [
+        "",
+        "1.5 2.5 -1 3 4e1 17",
+        " ".join(["1.5 2.5 -1"] * 4),
+        " ".join(["1 2 3"] * 4),
+        "0",
+        "None",
+        "1.5 2.5 3.5 4.5 5.5 6.5 7.5 8.5 9.5 10.5",
+        "  # no keypoints",
+    ],
+)
+def test_keypoints_of_any_form_are_skipped(tmp_path, keypoints):
+    """As by the readers of COLMAP's own scripts, which split the line and use none of it here."""
+    write_text(tmp_path)
+    first, second = (f"{n} 1 0 0 0 0 0 1 7 {n}.png" for n in (1, 2))
+    (tmp_path / "images.txt").write_text(f"{first}\n{keypoints}\n{second}\n")
+    cameras = read_colmap(tmp_path, missing_images="none").cameras
+    assert [camera.name for camera in cameras] == ["1.png", "2.png"]
 
 
 def test_an_empty_text_file_of_points_holds_none_and_an_empty_binary_one_is_damaged(tmp_path):
