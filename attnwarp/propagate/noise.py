@@ -22,7 +22,10 @@ FRESH = 4
 
 
 def own_seed(*numbers: int) -> int:
-    """A seed that no other numbers have, such as a run's seed, a purpose and a view.
+    """A seed of several numbers, such as a run's seed, a purpose and a view.
+
+    No other numbers have it, of the same count and each in [0, 2^32): all are hashed together. (0
+    at the end counts as nothing there, and a larger number as two.)
 
     Example:
         >>> own_seed(0, FRESH, 1) != own_seed(1, FRESH, 0)  # as their sums would be
