@@ -56,6 +56,19 @@ def test_poses_are_float64_rigid_and_do_not_mirror():
         Camera(camera().K, np.diag([-1.0, 1, 1, 1]), 8, 4)
 
 
+def test_the_nearest_rotation_about_the_same_centre_is_taken():
+    clean, noisy = np.eye(4), np.eye(4)
+    clean[0, 0] += 1e-13
+    assert Camera(camera().K, clean, 8, 4).rotation[0, 0] == 1 + 1e-13
+    # A scaled rotation's nearest is itself without the scale.
+    noisy[:3, :3] *= 1 + 2**-20
+    noisy[:3, 3] = [1, 2, 3]
+    taken = Camera(camera().K, noisy, 8, 4)
+    assert np.allclose(taken.rotation, np.eye(3), rtol=0, atol=1e-15)
+    center = -np.array([1, 2, 3]) / (1 + 2**-20)
+    assert np.allclose(taken.position, center, rtol=0, atol=1e-14)
+
+
 def test_the_centre_of_pixel_j_is_at_j_plus_a_half():
     assert camera().pixel_centers()[3, 7].tolist() == [7.5, 3.5]
     c = correspond(camera(), camera(), np.full((4, 8), 2.0))
@@ -257,6 +270,7 @@ PINNED = {
     "camera axes": [test_axes_are_x_right_y_down_z_forward],
     "pose": [
         test_poses_are_float64_rigid_and_do_not_mirror,
+        test_the_nearest_rotation_about_the_same_centre_is_taken,
         test_a_poses_rotation_is_orthonormal_to_1e_5,
     ],
     "pixels": [test_the_centre_of_pixel_j_is_at_j_plus_a_half],
