@@ -194,10 +194,8 @@ def with_images(
                 " use the images the cameras were made for, or pass resize_cameras=True"
                 " (--resize-cameras) if they are the same pictures at another size",
             )
+        remedy = "turn or crop it as the camera saw it, or use the picture the camera was made for"
         try:
-            remedy = (
-                "turn or crop it as the camera saw it, or use the picture the camera was made for"
-            )
             check.same_aspect((height, width), (camera.height, camera.width), str(path), remedy)
         except ValueError as error:
             raise FileFormatError(source, str(error)) from None

@@ -199,15 +199,11 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
         np.stack([across, np.full(W, 0.5)], -1), np.stack([across, np.full(W, H - 0.5)], -1),
     ]  # fmt: skip
     points = [lens.undistort(camera.directions(side)[..., :2]) for side in sides]
-    folded = ValueError(
-        f"lens: the coefficients {lens.coefficients} fold the picture of camera {camera.name!r}"
-        " over, so it cannot be undistorted; calibrate the lens again"
-    )
     for side, point in zip(sides, points, strict=True):
         steep = np.linalg.norm(point, axis=-1) >= np.tan(STEEPEST) * (1 - 1e-9)
         error = np.abs(_pixels(camera, lens.distort(point)) - side).max(axis=-1)
         if not (steep | (error <= ROUND_TRIP)).all():
-            raise folded
+            raise _folded(camera, lens)
     left, right, top, bottom = (_pixels(camera, point) for point in points)
     cx, cy = camera.K[0, 2], camera.K[1, 2]
     x0, x1 = _window(left[:, 0].max(), right[:, 0].min(), cx, W)
@@ -218,8 +214,15 @@ def undistorted_camera(camera: Camera, lens: Lens) -> Camera:
     # The border may lie beyond a fold, and be right there.
     grid = [np.linspace(0.5, n - 0.5, min(n, FOLD_GRID)) for n in (target.width, target.height)]
     if lens.folds(target.directions(np.stack(np.meshgrid(*grid), -1))[..., :2]).any():
-        raise folded
+        raise _folded(camera, lens)
     return target
+
+
+def _folded(camera: Camera, lens: Lens) -> ValueError:
+    return ValueError(
+        f"lens: the coefficients {lens.coefficients} fold the picture of camera {camera.name!r}"
+        " over, so it cannot be undistorted; calibrate the lens again"
+    )
 
 
 def undistorted_image(
