@@ -38,7 +38,8 @@ def undistort(
 
     Raises:
         FileFormatError: a picture that cannot be read.
-        InputError: a picture would be written over one that is read.
+        InputError: a picture would be written over one that is read, or transforms.json over one
+            of a folder that holds a picture that is read.
         ValueError: no camera has a picture, or a lens folds its picture over.
 
     Example:
@@ -64,7 +65,7 @@ def undistort(
     ]
     names = numbered([_name(camera.name, i) for i, camera in enumerate(dataset.cameras)])
     paths: list[Path | None] = [folder / "images" / name for name in names]
-    _check_apart(paths, dataset.image_paths)
+    _check_apart(folder, paths, dataset.image_paths)
     for i, (camera, lens, target, source, path) in enumerate(
         zip(dataset.cameras, dataset.lenses, cameras, dataset.image_paths, paths, strict=True)
     ):
@@ -82,8 +83,16 @@ def undistort(
     return result
 
 
-def _check_apart(written: list[Path | None], read: list[Path | None]) -> None:
-    """Refuse to write over any picture that is read, that of another camera too."""
+def _check_apart(folder: Path, written: list[Path | None], read: list[Path | None]) -> None:
+    """Refuse to write over any picture that is read, that of another camera too, or over the
+    transforms.json of the folder that they come from.
+    """
+    scene, place = folder / "transforms.json", folder.resolve()
+    if is_file(scene) and any(path and path.resolve().is_relative_to(place) for path in read):
+        raise InputError(
+            f"{scene}: stands in the folder of the pictures to undistort; name another folder for"
+            " the result"
+        )
     # By what the system calls a file, so under another name or by a link as well.
     files = [path.stat() for path in read if path is not None and is_file(path)]
     sources = {(file.st_dev, file.st_ino) for file in files}

@@ -247,6 +247,26 @@ def test_no_picture_that_is_read_is_written_over(tmp_path, link):
     assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*.*")} == before
 
 
+def test_the_transforms_of_the_pictures_that_are_read_are_not_written_over(tmp_path):
+    """JPEGs: the new pictures are PNGs beside them, and so over none of them."""
+    folder = tmp_path / "in"
+    (folder / "images").mkdir(parents=True)
+    for name in "ab":
+        Image.new("RGB", SIZE).save(folder / f"images/{name}.jpg")
+    frames = [
+        {"file_path": f"images/{name}.jpg", "transform_matrix": np.eye(4).tolist()} for name in "ab"
+    ]
+    top = {"w": SIZE[0], "h": SIZE[1], "fl_x": 40, "fl_y": 40, "k1": -0.1}
+    (folder / "transforms.json").write_text(json.dumps({**top, "frames": frames}))
+    before = {path: path.read_bytes() for path in folder.rglob("*.*")}
+    data = read_dataset(folder, distorted="keep")
+    with pytest.raises(InputError, match=r"transforms.json: stands in the folder of the pictures"):
+        undistort(data, folder)
+    assert {path: path.read_bytes() for path in folder.rglob("*.*")} == before
+    inside = undistort(data, folder / "flat")
+    assert undistort(data, folder / "flat").image_paths == inside.image_paths
+
+
 def test_a_model_that_colmap_writes_is_read_with_its_lens(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     for model, (_, lens) in MODELS.items():
