@@ -12,7 +12,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from attnwarp import check
 from attnwarp.editing.attention import (
     Layer,
     Recording,
@@ -180,8 +179,7 @@ class ViewEditor:
 
     def branches(self, stage: int) -> tuple[str, ...]:
         """Of the batch of a stage's views. Further sources have those of the first stage."""
-        with guided(self.editor, self.settings.guidance(stage)):
-            return self.editor.branches
+        return self._branches(self.settings.guidance(stage))
 
     def _source_guidance(self) -> float | None:
         """Of the first source."""
@@ -189,12 +187,63 @@ class ViewEditor:
         return s.guidance(0) if s.source_text_guidance is None else s.source_text_guidance
 
     def _check_branches(self) -> None:
-        with guided(self.editor, self._source_guidance()):
-            available = self.editor.branches
+        guidance = self._source_guidance()
+        available = self._branches(guidance)
         if self.settings.branches == ():
             raise ValueError(f"branches: got none, expected some of {', '.join(available)}")
         for branch in self.settings.branches or ():
-            check.one_of(branch, available, "branches")
+            if branch not in available:
+                raise ValueError(
+                    f"branches: got {branch!r}, expected one of"
+                    f" {', '.join(map(repr, available))}, which the source has at"
+                    f" {_in_words(guidance)}"
+                )
+
+    def check_batches(self, stages: Sequence[int], *, further: bool) -> None:
+        """Refuse, before any work, branches of the source that a later batch does not have.
+
+        Args:
+            stages: numbers of the stages that edit views, from 0.
+            further: whether there are further sources.
+
+        Raises:
+            ValueError: a batch takes none of the recorded branches, or cannot record all that the
+                settings name.
+        """
+        if not self.layers:
+            return
+        s = self.settings
+        guidances = {"a further source": s.guidance(0)} if further else {}
+        recorded = [
+            self._kept(self._branches(guidance))
+            for guidance in (self._source_guidance(), *guidances.values())
+        ]
+        guidances |= {f"stage {number + 1}": s.guidance(number) for number in stages}
+        for name, guidance in guidances.items():
+            branches = self._branches(guidance)
+            # A further source records what the settings name, too.
+            needs_all = name == "a further source" and s.branches is not None
+            for keep in recorded:
+                shared = set(keep) & set(branches)
+                if not shared or (needs_all and len(shared) < len(set(keep))):
+                    raise ValueError(
+                        f"branches: {', '.join(keep) or 'none'} would be recorded, but at"
+                        f" {_in_words(guidance)} {name} has {', '.join(branches)}; choose other"
+                        " branches, text_guidance, source_text_guidance or guidance_drop"
+                    )
+
+    def _branches(self, guidance: float | None) -> tuple[str, ...]:
+        """Of a batch with a text guidance."""
+        with guided(self.editor, guidance):
+            return self.editor.branches
+
+    def _kept(self, branches: tuple[str, ...]) -> tuple[str, ...]:
+        """Branches to record, of a source that has these."""
+        if self.settings.branches is not None:
+            return self.settings.branches
+        if self.editor.guide == "picture":
+            return tuple(branch for branch in BRANCHES if branch in branches)
+        return branches
 
     def _inject(
         self,
@@ -326,17 +375,11 @@ class ViewEditor:
     def _plan(self, branches: tuple[str, ...], target: Target) -> RecordingPlan:
         s = self.settings
         _, _, h, w = self._shape(target)
-        if s.branches is not None:
-            keep = s.branches
-        elif self.editor.guide == "picture":
-            keep = tuple(branch for branch in BRANCHES if branch in branches)
-        else:
-            keep = branches
         return RecordingPlan(
             self.layers,
             (h, w),
             branches,
-            keep,
+            self._kept(branches),
             s.steps,
             dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
             store=self.store / str(target.view) if isinstance(self.store, Path) else self.store,
@@ -372,6 +415,11 @@ def guided(editor: Any, value: float | None) -> Iterator[None]:
         yield
     finally:
         setattr(editor, name, before)
+
+
+def _in_words(guidance: float | None) -> str:
+    own = "the editor's own text guidance"
+    return own if guidance is None else f"text guidance {guidance:g}"
 
 
 def _ignoring(watch: Callable[[], None] | None) -> Callable[[int, int, Tensor], None] | None:

@@ -242,6 +242,8 @@ class _Run:
         self._frozen_surfaces: dict[int, Surface] = {}
         self.times = Times(self.folder)
         self.plan = Plan.draw(len(scene.cameras), source, settings, self._chain(source))
+        editing = [number for number, stage in enumerate(self.plan.stages) if stage]
+        self.view_editor.check_batches(editing, further=bool(self.plan.chain))
         if announce is not None:
             self._announce_changes(announce, source, multiple)
         self.tuning = Tuning(

@@ -313,6 +313,15 @@ def test_network_rows_are_those_that_hooks_count(changes, scene, editor):
     assert result.counters["network_rows"] == sum(rows)
 
 
+def test_a_guidance_of_a_stage_that_does_not_come_hinders_nothing(scene, editor):
+    """Five views leave two stages; s_T = s_I would come in the third."""
+    settings = replace(
+        QUICK, stages=3, steps=1, iterations=0, branches=("image",),
+        text_guidance=4.5, guidance_drop=1.5,
+    )  # fmt: skip
+    assert run(scene, editor, settings=settings).counters["views"] == 5
+
+
 def test_edit_psnr_counts_the_views_that_the_settings_name(finished, scene, editor):
     result, folder = finished
     errors = {}
@@ -691,7 +700,27 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
     [
         ({"perceptual_encoder": "bogus"}, "encoder 'bogus': unknown"),
         ({"branches": ("bogus",)}, "branches: got 'bogus', expected one of 'text', 'image', "),
-        ({"branches": ("image",), "source_text_guidance": 1.5}, "branches: got 'image'"),
+        (
+            {"branches": ("image",), "source_text_guidance": 1.5},  # s_T = s_I
+            "branches: got 'image', expected one of 'text', 'uncond', .* at text guidance 1.5",
+        ),
+        (
+            {"branches": ("image",), "source_text_guidance": 7.0, "text_guidance": 1.5},
+            "branches: image would be .* text guidance 1.5 stage 1 has text, uncond; choose",
+        ),
+        (
+            {"branches": ("image",), "text_guidance": 3.0, "guidance_drop": 1.5},
+            "branches: image would be .* text guidance 1.5 stage 2 has text, uncond; choose",
+        ),
+        (
+            {
+                "branches": ("image", "text"),
+                "source_text_guidance": 7.0,
+                "text_guidance": 1.5,
+                "sources": 2,
+            },
+            "text guidance 1.5 a further source has text, uncond; choose",
+        ),
     ],
 )
 def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
