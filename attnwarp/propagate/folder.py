@@ -28,6 +28,7 @@ from attnwarp.errors import InputError, InputWarning
 from attnwarp.io.file import FileFormatError, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.names import file_stems
+from attnwarp.io.ply import read_ply
 
 FORMAT = 1
 """Raised when a folder's files change meaning; older folders are then refused."""
@@ -49,9 +50,9 @@ class Folder:
     """Files of one edit.
 
     Args:
-        path: made if need be.
+        path: made by :meth:`claim` if need be.
         cameras: of the views, whose names the files have.
-        folders: inside it, made if need be.
+        folders: inside it, made likewise.
 
     Attributes:
         path: see there.
@@ -61,23 +62,18 @@ class Folder:
     def __init__(
         self, path: Path, cameras: Sequence[Camera], folders: Sequence[str] = FOLDERS
     ) -> None:
-        self.path = path
+        self.path, self.folders = path, folders
         self.names = file_stems(cameras)
-        for name in folders:
-            (path / name).mkdir(parents=True, exist_ok=True)
 
     def claim(self, manifest: dict[str, Any]) -> None:
-        """Write the manifest, or hold the one that is there against it.
+        """Write the manifest, or hold the one that is there against it; make the folders.
 
         Raises:
             InputError: the folder holds an edit of other settings or inputs, by name.
         """
         path = self.path / MANIFEST
         manifest = json.loads(json.dumps({"format": FORMAT, "protocol": PROTOCOL, **manifest}))
-        if not path.exists():
-            self.write_json(MANIFEST, manifest)
-            return
-        stored = self.read_json(MANIFEST)
+        stored = self.read_json(MANIFEST) if path.exists() else manifest
         differing = list(_differences(stored, manifest))
         if differing:
             raise InputError(
@@ -85,6 +81,10 @@ class Folder:
                 f"{'; ...' if len(differing) > 3 else ''}. Go on with the same ones, or name"
                 " another folder"
             )
+        for name in self.folders:
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            self.write_json(MANIFEST, manifest)
 
     def write_json(self, name: str, value: Any) -> None:
         """Write JSON atomically."""
@@ -141,6 +141,14 @@ class Folder:
         """Whether a picture is there and can be read: a disk or a person may have damaged it."""
         try:
             self.read_picture(name)
+        except (FileFormatError, FileNotFoundError):
+            return False
+        return True
+
+    def has_splats(self, name: str) -> bool:
+        """Whether splats are there and can be read, as :meth:`has_picture`."""
+        try:
+            read_ply(self.path / name)
         except (FileFormatError, FileNotFoundError):
             return False
         return True

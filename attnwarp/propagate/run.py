@@ -601,7 +601,8 @@ class _Run:
             self.tuning.restore(self.folder.path / state)
             self.done += self.tuning.iteration - number * s.iterations
         end = (number + 1) * s.iterations
-        if self.tuning.iteration < end or not self.folder.has(state):
+        finished = self.tuning.iteration >= end and self.folder.has(state)
+        if not finished:
             text = f"stage {number + 1} of {len(self.plan.stages)}: tuning"
             training = self.plan.training(number, s.training)
             makers = [partial(self._training, view, self._edited(view)) for view in training]
@@ -619,7 +620,8 @@ class _Run:
                     watch=tell,
                     saved=self.times.write,
                 )
-        write_ply(self.folder.path / splats, self.tuning.gaussians())
+        if not (finished and self.folder.has_splats(splats)):
+            write_ply(self.folder.path / splats, self.tuning.gaussians())
         self.times.write()
 
     def _training(self, view: int, pixels: Bytes) -> TrainingView:

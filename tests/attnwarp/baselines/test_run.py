@@ -265,7 +265,7 @@ def test_settings_that_a_run_cannot_have_are_named_before_any_work(
 
     rows, _ = rows_of(editor.unet, refused)
     assert not rows
-    assert not files(tmp_path)
+    assert not any(tmp_path.iterdir())
 
 
 def test_the_lowest_start_that_the_steps_fit_below_is_taken(run):

@@ -397,6 +397,10 @@ def test_files_of_a_finished_edit_that_are_damaged_are_written_again(scene, edit
         (tmp_path / name).write_bytes(before[name][: len(before[name]) // 2])
     run(scene, editor, tmp_path, settings, segments=everything)
     assert files(tmp_path) == before
+    written = (tmp_path / "stages/1.ply").stat().st_mtime_ns
+    run(scene, editor, tmp_path, settings, segments=everything)
+    # What is whole is not written once more.
+    assert (tmp_path / "stages/1.ply").stat().st_mtime_ns == written
 
 
 def killed_and_resumed(scene, editor, folder, moments):
@@ -732,7 +736,7 @@ def test_settings_that_an_edit_cannot_have_are_refused_before_any_work(
 
     rows, _ = rows_of(editor.unet, refused)
     assert not rows
-    assert not files(tmp_path)  # which would hold the folder to the wrong setting
+    assert not any(tmp_path.iterdir())  # a manifest would hold the folder to the wrong setting
 
 
 def guidance_of_passes(editor, name, call):
