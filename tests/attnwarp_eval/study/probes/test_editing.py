@@ -334,6 +334,22 @@ def test_only_cells_whose_views_have_noise_of_their_own_say_how_it_is_drawn(fold
     assert limits["timed"]["seconds_of"]["fresh_noise"] == 2
 
 
+@pytest.mark.parametrize("name", ["comparison-quick", "comparison-six", "comparison", "beyond"])
+def test_studies_that_compare_methods_tune_attention_warping_alike(name):
+    """Further sources leave fewer views, so fewer stages. Oracle: stages counted by hand."""
+    study = load_study(name)
+    totals = {}
+    for label in study.probes["editing"]:
+        variant = study.variants[label]
+        fields = editing.settings_of(study, variant, 0)
+        if variant.part(editing.VariantPart).method == "propagate" and fields["method"] == "warp":
+            left = len(study.views) + 1 - fields["sources"]
+            stages = min(fields["stages"], math.ceil(left / fields["views_per_stage"]))
+            totals[label] = stages * fields["iterations"]
+    assert len(totals) >= 3  # further sources are among them
+    assert len(set(totals.values())) == 1, totals
+
+
 @pytest.mark.parametrize("kind", ["recoloured", "painted", "pasted"])
 def test_a_source_made_by_hand_is_replayed_and_all_views_are_held_against_the_true_edit(
     folder, tmp_path, kind
