@@ -43,8 +43,9 @@ def test_a_controlnet_of_the_released_code_draws_fresh_noise_and_has_other_guida
     assert [one.guidance(stage) for stage in range(3)] == [12.5, 11.0, 9.5]
 
 
-def test_extended_is_corrected_with_several_sources():
-    assert PRESETS["extended"] == replace(PRESETS["corrected"], sources=4)
+def test_extended_is_corrected_with_ideas_beyond_the_paper():
+    ideas = {"sources": 4, "noise": "surface", "estimate": 0.5, "estimate_until": 1.0}
+    assert PRESETS["extended"] == replace(PRESETS["corrected"], **ideas)
 
 
 @pytest.mark.parametrize("name", PRESETS)
