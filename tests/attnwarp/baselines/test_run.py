@@ -2,10 +2,9 @@
 
 import json
 import shutil
-import weakref
 from dataclasses import replace
-from functools import partial
 
+import held_pictures
 import numpy as np
 import pytest
 import torch
@@ -29,8 +28,7 @@ from attnwarp.baselines import run as run_module
 from attnwarp.baselines.fitting import Fitting
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import read_image, read_ply
-from attnwarp.propagate.pictures import full_size, to_bytes
-from attnwarp.propagate.tune import DrawnViews
+from attnwarp.propagate.pictures import to_bytes
 
 
 @pytest.fixture(scope="module")
@@ -330,20 +328,9 @@ def test_splats_are_tuned_on_pictures_that_a_small_edit_changes_in_the_segments_
 @pytest.mark.parametrize("held", [0, 1, 8])
 def test_of_the_pictures_a_round_tunes_on_as_many_are_kept_as_fit(run, monkeypatch, held):
     """Oracle: references that do not hold their objects."""
-    made, most = [], 0
-
-    def watched(*args):
-        nonlocal most
-        picture = full_size(*args)
-        made.append(weakref.ref(picture))
-        most = max(most, sum(one() is not None for one in made))
-        return picture
-
-    monkeypatch.setattr(run_module, "full_size", watched)
-    limited = partial(DrawnViews, held_bytes=held * 32 * 32 * 3 * 4)
-    monkeypatch.setattr(run_module, "DrawnViews", limited)
+    counts = held_pictures.watch(monkeypatch, run_module, held * 32 * 32 * 3 * 4)
     run("by_view", ByViewSettings(steps=1, iterations=9, perceptual=0))
     views = 3
     # Beside those that are kept: the first view's, which the round holds, and the iteration's.
-    assert most == {0: 2, 1: 2, 8: views}[held]
-    assert len(made) == {0: 10, 1: 7, 8: views}[held]
+    assert max(counts) == {0: 2, 1: 2, 8: views}[held]
+    assert len(counts) == {0: 10, 1: 7, 8: views}[held]

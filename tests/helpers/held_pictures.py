@@ -1,0 +1,26 @@
+"""How many pictures a run keeps while it tunes on them."""
+
+import weakref
+from functools import partial
+
+from attnwarp.propagate.pictures import full_size
+from attnwarp.propagate.tune import DrawnViews
+
+
+def watch(monkeypatch, module, held_bytes):
+    """Watch the pictures that a module's runs make, with so much memory to keep them in.
+
+    Returns:
+        For each picture in the order they were made, how many were held then, itself included.
+    """
+    references, counts = [], []
+
+    def watched(*args):
+        picture = full_size(*args)
+        references.append(weakref.ref(picture))
+        counts.append(sum(one() is not None for one in references))
+        return picture
+
+    monkeypatch.setattr(module, "full_size", watched)
+    monkeypatch.setattr(module, "DrawnViews", partial(DrawnViews, held_bytes=held_bytes))
+    return counts
