@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from attnwarp import losses
@@ -51,11 +52,11 @@ class Fitting(Tuning):
         super().__init__(start, cameras, shared, stages=1, backend=backend)
         self.ssim = settings.ssim
 
-    def loss_of(self, view: Render, target: Tensor) -> Tensor:
+    def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
         """The weighted sum of the losses; see :class:`attnwarp.propagate.tune.Tuning`."""
-        loss = super().loss_of(view, target)
+        loss = super().loss_of(picture, view)
         if self.ssim:
-            image = view.color.float()
+            image, target = picture.color.float(), torch.from_numpy(view.picture)
             loss = loss + self.ssim * (1 - losses.ssim(image, target.to(image.device)))
         return loss
 

@@ -241,5 +241,12 @@ class BundledPerceptual:
 
     def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
-        x, y = (each.permute(2, 0, 1)[None] for each in (image, target))
-        return self.net(x, y)[0]
+        return self.between(self.features(image), self.features(target))
+
+    def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
+        """What :meth:`between` compares of a picture (H, W, 3) in [0, 1], differentiable."""
+        return self.net.stack(picture.permute(2, 0, 1)[None])
+
+    def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:
+        """() the distance of two pictures by their :meth:`features`."""
+        return self.net.between(image, target)[0]

@@ -179,28 +179,40 @@ class Lpips:
         if np.array_equal(a, b):
             return 0.0  # exactly: a kernel may sum the two halves of a batch in different orders
         with full_float32():
-            stacked = torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2)
-            return float(sum(self._stages(stacked.to(self._device))))
+            both = self._units(torch.from_numpy(np.stack([a, b])).permute(0, 3, 1, 2))
+            return float(sum(self._parts([x[0] for x in both], [x[1] for x in both])))
 
     def loss(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """() the distance of two (H, W, 3) pictures in [0, 1], differentiable."""
-        stacked = torch.stack([image, target]).permute(0, 3, 1, 2).to(self._device)
-        return torch.stack(self._stages(stacked)).sum()
+        return self.between(self.features(image), self.features(target))
 
-    def _stages(self, pair: torch.Tensor) -> list[torch.Tensor]:
-        """() float64 of each stage, of a pair (2, 3, H, W) in [0, 1]."""
+    def features(self, picture: torch.Tensor) -> list[torch.Tensor]:
+        """What :meth:`between` compares of a picture (H, W, 3) in [0, 1], differentiable."""
+        return [x[0] for x in self._units(picture.permute(2, 0, 1)[None])]
+
+    def between(self, image: list[torch.Tensor], target: list[torch.Tensor]) -> torch.Tensor:
+        """() the distance of two pictures by their :meth:`features`."""
+        return torch.stack(self._parts(image, target)).sum()
+
+    def _units(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """(N, C_k, h_k, w_k) unit features of each stage, of pictures (N, 3, H, W) in [0, 1]."""
         shift, scale = (
             torch.tensor(v, device=self._device).reshape(1, 3, 1, 1) for v in (SHIFT, SCALE)
         )
-        x = (2 * pair - 1 - shift) / scale
-        parts: list[torch.Tensor] = []
+        x = (2 * pictures.to(self._device) - 1 - shift) / scale
+        units: list[torch.Tensor] = []
         for i, layer in enumerate(self._network):
             x = layer(x)
-            if i == self._backbone.taps[len(parts)]:
-                unit = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON)
-                weighted = ((unit[0] - unit[1]) ** 2)[None] * self._weights[len(parts)]
-                parts.append(weighted.sum(1).mean(dtype=torch.float64))
-        return parts
+            if i == self._backbone.taps[len(units)]:
+                units.append(x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + EPSILON))
+        return units
+
+    def _parts(self, a: list[torch.Tensor], b: list[torch.Tensor]) -> list[torch.Tensor]:
+        """() float64 of each stage, of two pictures' unit features (C_k, h_k, w_k)."""
+        return [
+            (((x - y) ** 2)[None] * weight).sum(1).mean(dtype=torch.float64)
+            for x, y, weight in zip(a, b, self._weights, strict=True)
+        ]
 
 
 def load_lpips(place: Path, *, name: str, device: str = "cpu") -> Lpips:

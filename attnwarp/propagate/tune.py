@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, cast
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -31,8 +32,12 @@ SOURCE_EVERY = 10
 class PerceptualLoss(Protocol):
     """A perceptual distance with a gradient."""
 
-    def loss(self, image: Tensor, target: Tensor) -> Tensor:
-        """() of two (H, W, 3) pictures in [0, 1]."""
+    def features(self, picture: Tensor) -> list[Tensor]:
+        """What is compared of a picture (H, W, 3) in [0, 1]."""
+        ...
+
+    def between(self, image: list[Tensor], target: list[Tensor]) -> Tensor:
+        """() the distance of two pictures by their features."""
         ...
 
 
@@ -96,6 +101,41 @@ class DrawnViews(Sequence[TrainingView]):
         return view
 
 
+FEATURE_BYTES = 2**30
+"""Of pictures' features that :class:`DistanceToViews` keeps: 80 views of 256 px."""
+
+
+class DistanceToViews:
+    """The perceptual distance of renders to the pictures of views.
+
+    What it compares of a view's picture is worked out once while the view lives, and kept for the
+    first views that fit. An iteration on a kept view takes a third less of the network.
+
+    Args:
+        perceptual: the distance.
+        kept_bytes: of the pictures' features.
+    """
+
+    def __init__(self, perceptual: PerceptualLoss, kept_bytes: int = FEATURE_BYTES) -> None:
+        self._perceptual, self._bytes = perceptual, kept_bytes
+        self._kept: WeakKeyDictionary[TrainingView, list[Tensor]] = WeakKeyDictionary()
+
+    def __call__(self, image: Tensor, view: TrainingView) -> Tensor:
+        """() of a render (H, W, 3) in [0, 1], which may need a gradient, to a view's picture."""
+        target = self._of(view, image.device)
+        return self._perceptual.between(self._perceptual.features(image), target)
+
+    def _of(self, view: TrainingView, device: torch.device) -> list[Tensor]:
+        if view in self._kept:
+            return self._kept[view]
+        with torch.no_grad():
+            features = self._perceptual.features(torch.from_numpy(view.picture).to(device))
+        held = sum(x.nbytes for kept in self._kept.values() for x in kept)
+        if held + sum(x.nbytes for x in features) <= self._bytes:
+            self._kept[view] = features
+        return features
+
+
 class Tuning:
     """Splats, their optimiser and its place in the work; goes on through all stages.
 
@@ -146,7 +186,8 @@ class Tuning:
         self.loss = math.nan
         self.visits: dict[int, int] = {}
         # Here and not at its first use: before it, views are edited for hours.
-        self.perceptual = perceptual_net(settings)
+        net = perceptual_net(settings)
+        self.perceptual = None if net is None else DistanceToViews(net)
 
     def gaussians(self) -> Gaussians:
         """The splats as they stand, outside autograd."""
@@ -240,7 +281,7 @@ class Tuning:
             background=background,
             near=self.fit.near * self.model.extent,
         )
-        loss = self.loss_of(picture, torch.from_numpy(view.picture))
+        loss = self.loss_of(picture, view)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise RuntimeError(
@@ -253,24 +294,22 @@ class Tuning:
         self.loss = value
         self.visits[view.number] = self.visits.get(view.number, 0) + 1
 
-    def loss_of(self, view: Render, target: Tensor) -> Tensor:
+    def loss_of(self, picture: Render, view: TrainingView) -> Tensor:
         """The weighted sum of the losses.
 
         Args:
-            view: the render.
-            target: (H, W, 3) in [0, 1].
+            picture: the render.
+            view: what it shall become.
         """
         s = self.settings
-        image = view.color.float()
-        target = target.to(image.device)
-        loss = s.l1 * losses.l1(image, target)
+        image = picture.color.float()
+        loss = s.l1 * losses.l1(image, torch.from_numpy(view.picture).to(image.device))
         if self.perceptual is not None:
-            distance = self.perceptual.loss(image.clamp(0, 1), target)
-            loss = loss + s.perceptual * distance.to(loss)
+            loss = loss + s.perceptual * self.perceptual(image.clamp(0, 1), view).to(loss)
         if s.normal:
-            loss = loss + s.normal * losses.normal_consistency(view)
+            loss = loss + s.normal * losses.normal_consistency(picture)
         if s.distortion:
-            loss = loss + s.distortion * losses.depth_distortion(view, scale=self.model.extent)
+            loss = loss + s.distortion * losses.depth_distortion(picture, scale=self.model.extent)
         return loss
 
     def _background(self) -> Tensor:

@@ -66,6 +66,18 @@ def test_it_is_torchmetrics_network(placed, monkeypatch):
         assert value > 1e-3
 
 
+def test_its_loss_is_its_distance_and_has_a_slope(placed):
+    encoder = load_encoder(f"lpips:{placed[0]}", "perceptual")
+    (a,), (b,) = pictures((36, 40)), pictures((36, 40), seed=1)
+    image = torch.from_numpy(a).requires_grad_(True)
+    loss = encoder.loss(image, torch.from_numpy(b))
+    assert float(loss.detach()) == pytest.approx(encoder.distance([a], [b])[0], rel=1e-5)
+    (slope,) = torch.autograd.grad(loss, image)
+    nearer = image.detach() - 1e-3 * slope / slope.norm()
+    fallen = float(encoder.loss(nearer, torch.from_numpy(b)) - loss.detach())
+    assert fallen == pytest.approx(-1e-3 * float(slope.norm()), rel=0.1)
+
+
 def test_it_is_the_sum_of_the_paper_in_float64(placed):
     folder, network, name = placed
     state = torch.load(folder / f"{name}.pth", map_location="cpu", weights_only=True)

@@ -12,7 +12,7 @@ from attnwarp.encoders import load_encoder
 from attnwarp.fit.checkpoint import save
 from attnwarp.propagate import preset
 from attnwarp.propagate.scene import near_of, render_picture
-from attnwarp.propagate.tune import TrainingView, Tuning
+from attnwarp.propagate.tune import DistanceToViews, TrainingView, Tuning
 from attnwarp.render import render
 
 SETTINGS = preset("corrected", iterations=40)
@@ -104,6 +104,50 @@ def test_the_perceptual_loss_is_the_distance_and_its_gradient_is_the_slope():
         assert slope == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
     finally:
         net.net.float()
+
+
+class Counting:
+    """A perceptual distance that counts the pictures that go through its network."""
+
+    def __init__(self):
+        self.net, self.pictures = load_encoder("perceptual-small", "perceptual"), 0
+
+    def features(self, picture):
+        self.pictures += 1
+        return self.net.features(picture)
+
+    def between(self, image, target):
+        return self.net.between(image, target)
+
+
+@pytest.mark.parametrize(("kept", "passes"), [(2**30, 3), (2**18, 9), (0, 12)])
+def test_a_views_picture_goes_through_the_network_once_while_it_fits(kept, passes):
+    net, random = Counting(), torch.Generator().manual_seed(1)
+    place = cameras(1)[0]
+    views = [
+        TrainingView(k, place, torch.rand((32, 32, 3), generator=random).numpy()) for k in range(3)
+    ]
+    distance = DistanceToViews(net, kept)
+    for _ in range(4):
+        for view in views:
+            render = torch.rand((32, 32, 3), generator=random).requires_grad_(True)
+            found = distance(render, view)
+            expected = net.net.loss(render, torch.from_numpy(view.picture))
+            assert torch.equal(found, expected)
+            slopes = [torch.autograd.grad(value, render)[0] for value in (found, expected)]
+            assert torch.equal(*slopes)
+    # Of 32 x 32 px features have 205 kB: one view's fit into the middle bound.
+    assert net.pictures == 12 + passes
+
+
+def test_features_of_a_view_go_with_it():
+    net = Counting()
+    distance = DistanceToViews(net)
+    picture = torch.zeros((32, 32, 3))
+    for number in range(3):
+        distance(picture, TrainingView(number, cameras(1)[0], picture.numpy()))
+        assert len(distance._kept) == 0
+    assert net.pictures == 6
 
 
 @pytest.mark.parametrize("unit", [2.0**-12, 2.0**12])
