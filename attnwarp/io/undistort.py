@@ -91,7 +91,7 @@ def _check_apart(folder: Path, written: list[Path | None], read: list[Path | Non
     if is_file(scene) and any(path and path.resolve().is_relative_to(place) for path in read):
         raise InputError(
             f"{scene}: stands in the folder of the pictures to undistort; name another folder for"
-            " the result"
+            " the result, or remove it if it is an earlier result"
         )
     # By what the system calls a file, so under another name or by a link as well.
     files = [path.stat() for path in read if path is not None and is_file(path)]

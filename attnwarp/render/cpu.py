@@ -189,7 +189,7 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, *upstream: torch.Tensor | None) -> tuple[Any, ...]:
         _ = ctx.saved_tensors
         wanted = {name for name, grad in zip(OUTPUTS, upstream, strict=True) if grad is not None}
-        if ctx.needs_input_grad[8]:
+        if ctx.needs_input_grad[8] and "color" in wanted:
             wanted.add("background")
         drawn = _with_sound_maps(ctx.drawn, ctx.maps, wanted)
         shapes = [array.shape for array in (*drawn.pictures[:-1], drawn.weight)]
