@@ -41,13 +41,19 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         ),
     ]
     if study.scenes:
+        alone = len(study.scenes) == 1
         lead.append(
-            f"Figures are means over {len(study.scenes)} scenes of means over their views, ±"
-            " half of the 95 % interval (Student's t over scenes). Differences are paired on scene"
-            " and view; verdicts are adjusted for the number of tests in their table, those of"
-            ' claims for the number of claims. "can\'t tell" is not "equal".'
+            (
+                "Figures are means over the views of one scene, which has no interval."
+                if alone
+                else f"Figures are means over {len(study.scenes)} scenes of means over their views,"
+                " ± half of the 95 % interval (Student's t over scenes)."
+            )
+            + " Differences are paired on scene and view; verdicts are adjusted for the number of"
+            " tests in their table, those of claims for the number of claims."
+            ' "can\'t tell" is not "equal".'
         )
-        if len(study.scenes) == 1 and study.variants:
+        if alone and study.variants:
             lead.append(
                 '**One scene gives no verdict in general: every test says "can\'t tell". Name more'
                 " scenes for one.**"

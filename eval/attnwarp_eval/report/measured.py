@@ -83,7 +83,7 @@ def _environments(records: list[Record[Any]]) -> list[str]:
     if len(counted) == 1:
         return [f"Computed with {next(iter(counted))}."]
     lines = [
-        f"{count} cells with {described}"
+        f"{count} cell{'s' if count > 1 else ''} with {described}"
         for described, count in sorted(counted.items(), key=lambda x: -x[1])
     ]
     return [

@@ -492,7 +492,7 @@ def test_cells_of_more_than_one_state_of_the_code_are_told_apart(tmp_path):
     text = markdown(build(mixed, tmp_path))
     assert "more than one state of code" in text
     assert "6 cells with revision `aaaaaaaaaaaa`" in text
-    assert "1 cells with revision `bbbbbbbbbbbb` with local changes" in text
+    assert "; 1 cell with revision `bbbbbbbbbbbb` with local changes" in text
 
 
 def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_path):
@@ -501,7 +501,9 @@ def test_a_study_of_one_scene_says_at_its_top_that_no_verdict_is_possible(tmp_pa
         for name, value in (("good", 0.1), ("slipped", 0.9))
     ]
     text = markdown(build(written_runs.results(study(scenes=["one"]), cells), tmp_path))
-    assert "One scene gives no verdict in general" in text[: text.index("\n## ")]
+    lead = text[: text.index("\n## ")]
+    assert "One scene gives no verdict in general" in lead
+    assert "means over the views of one scene, which has no interval" in lead and "±" not in lead
     # It is true: a difference of 0.8 in every view stays undecided.
     row = next(line for line in text.splitlines() if line.startswith("| slipped") and "0.8" in line)
     assert "can't tell" in row
