@@ -850,10 +850,10 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
         return None
     warp = spec["settings"].get("warp")
     settings = PRESETS["corrected"] if warp is None else WarpSettings.from_dict(warp)
-    made: dict[int, WarpedView] = {}
+    made: dict[tuple[int, int], WarpedView] = {}
 
     def of(source: int, target: int) -> WarpedView:
-        if target not in made:
+        if (source, target) not in made:
             pair = world.between(names[source], names[target])
             if spec["geometry"] == "truth":
                 view = warp_truth(world, pair, settings)
@@ -862,8 +862,8 @@ def _warps(work: Work, model: Gaussians, names: Sequence[str]) -> Any:
             if spec["mask"] == "truth":
                 visible = torch.from_numpy(np.ascontiguousarray(pair.visible))
                 view = replace(view, mask=visible & view.correspondence.defined, _at={})
-            made[target] = view
-        return made[target]
+            made[source, target] = view
+        return made[source, target]
 
     return of
 

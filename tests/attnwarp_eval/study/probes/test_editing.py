@@ -199,6 +199,28 @@ def test_the_exact_mask_injects_where_the_source_truly_sees(folder, tmp_path):
     )  # one step; image guidance of 1 drops a branch
 
 
+def test_each_source_has_its_own_exact_warp_to_a_target(folder, tmp_path, monkeypatch):
+    asked = {}
+
+    def run(job):
+        asked.update({pair: job.warps(*pair) for pair in ((0, 3), (2, 3), (1, 3))})
+        return planned(["red"] * 4).run(job)
+
+    method = Method(EDITING_METHODS["propagate"].settings, run)
+    monkeypatch.setitem(EDITING_METHODS, "planned", method)
+    own = {"method": "planned", "mask": "truth", "geometry": "truth"}
+    record_of(folder, tmp_path, variants={"planned": own})
+    scene = load_scene(load_study(str(folder / "mine.yaml")).scenes[0]).with_size(32, 32)
+    cameras = [scene.source, *scene.targets]
+    seen = {}
+    for (source, target), warp in asked.items():
+        exact = two_view(Geometry(scene), cameras[source], cameras[target])
+        assert (warp.mask.numpy() == exact.visible).all()
+        seen[source] = warp.correspondence.xy.numpy()[exact.visible]
+        assert seen[source] == pytest.approx(exact.xy[exact.visible], abs=1e-3)
+    assert len({len(pixels) for pixels in seen.values()}) > 1
+
+
 def test_a_compared_method_edits_every_view_with_its_own_settings(folder, tmp_path):
     own = {"method": "by_view", "options": {"steps": 2, "iterations": 3}}
     record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
