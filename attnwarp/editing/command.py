@@ -23,7 +23,11 @@ SEGMENTER = "clip-parts"
 
 InstructionOption = Annotated[str, typer.Option(help='What to change, such as "make it red".')]
 EditorOption = Annotated[
-    str, typer.Option(help="A bundled editor or a folder in diffusers' format.")
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER|BASE,CONTROLNET",
+        help="A bundled editor, or a folder or two in diffusers' format.",
+    ),
 ]
 DeviceOption = Annotated[str, typer.Option(help="Of the editor: cpu or cuda.")]
 WhereOption = Annotated[

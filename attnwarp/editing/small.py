@@ -137,7 +137,10 @@ def unknown_words(editor: Any, text: str) -> list[str]:
 
 
 def guide_of(name_or_folder: str) -> Guide:
-    """What an editor is guided by, without loading it: a folder ``controlnet`` means depth maps.
+    """What an editor is guided by, without loading it: a ControlNet means depth maps.
+
+    Args:
+        name_or_folder: of the editor, as :func:`load_editor` takes it.
 
     Raises:
         InputError: no such editor or folder.
@@ -146,31 +149,58 @@ def guide_of(name_or_folder: str) -> Guide:
         >>> guide_of("small-depth"), guide_of("small-plain")
         ('depth', 'picture')
     """
-    return "depth" if (_folder(name_or_folder)[0] / "controlnet").is_dir() else "picture"
+    return "picture" if folders_of(name_or_folder)[1] is None else "depth"
 
 
-def _folder(name_or_folder: str) -> tuple[Path, bool]:
-    """An editor's folder, and whether it is a bundled one."""
+def folders_of(name_or_folder: str) -> tuple[Path, Path | None]:
+    """An editor's folder, and its ControlNet's; None for an editor that is guided by pictures.
+
+    Args:
+        name_or_folder: of the editor, as :func:`load_editor` takes it.
+
+    Raises:
+        InputError: no such editor or folder.
+
+    Example:
+        >>> [folder.name for folder in folders_of("small-depth")]
+        ['small-depth', 'controlnet']
+    """
     names = bundled()
-    if name_or_folder in names:
-        return WEIGHTS / name_or_folder, True
     folder = Path(name_or_folder).expanduser()
-    if not folder.is_dir():
+    if name_or_folder in names:
+        folder = WEIGHTS / name_or_folder
+    elif "," in name_or_folder and not folder.is_dir():
+        return _pair(name_or_folder)
+    elif not folder.is_dir():
         raise InputError(
             f"editor {name_or_folder!r}: neither bundled ({', '.join(names) or 'none is'}) nor a"
             f" folder{suggest(name_or_folder, names)}"
         )
-    return folder, False
+    own = folder / "controlnet"
+    return folder, own if own.is_dir() else None
+
+
+def _pair(folders: str) -> tuple[Path, Path]:
+    """The two folders of ``BASE,CONTROLNET``."""
+    parts = [part.strip() for part in folders.split(",")]
+    if len(parts) != 2 or not all(parts):
+        raise InputError(f"editor {folders!r}: expected two folders, BASE,CONTROLNET")
+    places = [Path(part).expanduser() for part in parts]
+    for part, place in zip(("BASE", "CONTROLNET"), places, strict=True):
+        if not place.is_dir():
+            raise InputError(f"editor {folders!r}: {part} {str(place)!r} is no folder")
+    return places[0], places[1]
 
 
 def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | DepthControlNet:
-    """An editor by its name, such as "small-plain", or from a folder in diffusers' format.
+    """An editor by its name, such as "small-plain", or from folders in diffusers' format.
 
     A folder with a folder ``controlnet`` in it gives a
-    :class:`~attnwarp.editing.controlnet.DepthControlNet`.
+    :class:`~attnwarp.editing.controlnet.DepthControlNet`; so do two folders.
 
     Args:
-        name_or_folder: a bundled editor's name, or a path.
+        name_or_folder: a bundled editor's name, a path, or "BASE,CONTROLNET", the paths of a
+            Stable Diffusion and of its ControlNet.
         settings: as in :meth:`attnwarp.editing.pix2pix.InstructPix2Pix.from_folder` or in
             :meth:`attnwarp.editing.controlnet.DepthControlNet.from_folder`.
 
@@ -189,16 +219,15 @@ def load_editor(name_or_folder: str, **settings: Any) -> InstructPix2Pix | Depth
     from attnwarp.editing.controlnet import DepthControlNet
     from attnwarp.editing.pix2pix import InstructPix2Pix
 
-    folder, ships = _folder(name_or_folder)
-    depth = guide_of(name_or_folder) == "depth"
-    if ships:
+    folder, control = folders_of(name_or_folder)
+    if name_or_folder in bundled():
         check_sums(folder)
         guidance = (
-            {"guidance": DEPTH_GUIDANCE}
-            if depth
-            else {"text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE}
+            {"text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE}
+            if control is None
+            else {"guidance": DEPTH_GUIDANCE}
         )
         settings = {**guidance, **settings}
-    if depth:
-        return DepthControlNet.from_folder(folder, **settings)
-    return InstructPix2Pix.from_folder(folder, **settings)
+    if control is None:
+        return InstructPix2Pix.from_folder(folder, **settings)
+    return DepthControlNet.from_folder(folder, control, **settings)

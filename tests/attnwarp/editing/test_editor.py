@@ -30,7 +30,7 @@ from attnwarp.editing.schedule import (
     steps_as_published,
     steps_from,
 )
-from attnwarp.editing.small import WEIGHTS, bundled
+from attnwarp.editing.small import WEIGHTS, bundled, guide_of, load_editor
 from attnwarp.errors import InputError
 
 H, W = 16, 24
@@ -316,6 +316,34 @@ def test_editors_are_read_from_folders_in_diffusers_format(tmp_path):
         assert np.array_equal(
             loaded.images[0], edit(editor_of(pipe), [guide], "a bear", steps=2).images[0]
         )
+
+
+def test_a_base_and_a_controlnet_in_two_folders_are_one_editor(tmp_path):
+    pipe = controlnet()
+    pipe.save_pretrained(tmp_path / "base")
+    (tmp_path / "base" / "controlnet").rename(tmp_path / "depth")
+    both = f"{tmp_path / 'base'},{tmp_path / 'depth'}"
+    assert guide_of(both) == "depth"
+    ours = edit(load_editor(both, guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
+    expected = edit(editor_of(pipe, guidance=3.0), [depth_map()], "a bear", steps=2).images[0]
+    assert np.array_equal(ours, expected)
+    (tmp_path / "depth" / "config.json").unlink()
+    with pytest.raises(InputError, match="lacks depth/config.json; fetch the ControlNet again"):
+        load_editor(both)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("{0},{0}/none", "CONTROLNET '{0}/none' is no folder"),
+        ("{0}/none,{0}", "BASE '{0}/none' is no folder"),
+        ("{0},", "expected two folders, BASE,CONTROLNET"),
+        ("{0},{0},{0}", "expected two folders, BASE,CONTROLNET"),
+    ],
+)
+def test_a_missing_one_of_two_folders_is_named(name, message, tmp_path):
+    with pytest.raises(InputError, match=re.escape(message.format(tmp_path))):
+        load_editor(name.format(tmp_path))
 
 
 def test_a_folder_with_weights_of_half_precision_alone_is_read(tmp_path):

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from attnwarp import Camera, Gaussians, check
 from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
+from attnwarp.errors import InputError
 from attnwarp.render import render
 from attnwarp.warp import PRESETS, WarpedView, WarpSettings, warp_view
 from attnwarp_eval import metrics
@@ -771,16 +772,21 @@ def _files_digest(name: str) -> str:
     Raises:
         StudyError: there is none of that name.
     """
-    from attnwarp.editing.small import SUMS, WEIGHTS, bundled
+    from attnwarp.editing.small import SUMS, folders_of
 
-    folder = WEIGHTS / name if name in bundled() else Path(name).expanduser()
-    if not folder.is_dir():
-        raise StudyError(f"editor {name!r}: no such folder{did_you_mean(name, bundled())}")
-    files = sorted(p for p in folder.rglob("*") if p.suffix in (".json", ".safetensors"))
+    try:
+        folder, control = folders_of(name)
+    except InputError as error:
+        raise StudyError(str(error)) from None
+    files = {path.relative_to(folder): path for path in folder.rglob("*")}
+    if control is not None and control != folder / "controlnet":
+        # As if it stood there; a ControlNet that does is not read.
+        files = {place: path for place, path in files.items() if place.parts[0] != "controlnet"}
+        files |= {"controlnet" / path.relative_to(control): path for path in control.rglob("*")}
     sums = [
-        [path.relative_to(folder).as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
-        for path in files
-        if path.name != SUMS
+        [place.as_posix(), hashlib.sha256(path.read_bytes()).hexdigest()]
+        for place, path in sorted(files.items())
+        if path.suffix in (".json", ".safetensors") and path.name != SUMS
     ]
     return hashlib.sha256(json.dumps(sums).encode()).hexdigest()
 

@@ -455,6 +455,25 @@ def test_what_cannot_be_measured_is_refused_by_its_key(folder, changes, message)
         cells_of(study, {name: load_scene(name) for name in study.scenes})
 
 
+def test_an_editor_is_known_by_its_files_wherever_its_controlnet_lies(tmp_path):
+    one, other = tmp_path / "one", tmp_path / "other"
+    for base, control in ((one, one / "controlnet"), (other, tmp_path / "depth")):
+        for folder, text in ((base / "unet", "{}"), (control, '{"a": 1}')):
+            folder.mkdir(parents=True)
+            (folder / "config.json").write_text(text)
+    (other / "controlnet").mkdir()  # not the one that is named
+    (other / "controlnet" / "config.json").write_text("{}")
+
+    def identity(name):
+        return editing.editor_identity(editing.EditorPart(name=name))
+
+    both = identity(f"{other},{tmp_path / 'depth'}")
+    assert both == identity(str(one))
+    assert both != identity(str(other))
+    with pytest.raises(StudyError, match="CONTROLNET .* is no folder"):
+        identity(f"{other},{tmp_path / 'none'}")
+
+
 def test_one_answer_of_an_ambiguous_edit_can_be_asked_for_in_other_words(folder):
     edits = {"ball": {"some_colour=blue": "make the ball blue"}}
     study = load(folder, editing={**STUDY["editing"], "edits": edits})
