@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +11,7 @@ import typer
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
 
 if TYPE_CHECKING:
+    from attnwarp.editing.editor import Guide
     from attnwarp_eval.study.cell import Cell
     from attnwarp_eval.study.record import Failure
     from attnwarp_eval.study.results import Results
@@ -68,6 +69,21 @@ def run(
     scale: Annotated[
         int, typer.Option(help="With --data: 2, 4 or 8 reads images_2 and so on.")
     ] = 1,
+    editor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FOLDER",
+            help="With --data: in place of the study's editors that take a picture.",
+        ),
+    ] = None,
+    depth_editor: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME|FOLDER|BASE,CONTROLNET",
+            help="With --data: in place of the study's editors that take depth maps.",
+        ),
+    ] = None,
+    device: Annotated[str, typer.Option(help="With --data: of the editors, cpu or cuda.")] = "cpu",
 ) -> None:
     """Run a study and write its report.
 
@@ -80,9 +96,20 @@ def run(
 
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
+    for option, given in (
+        ("--editor", editor is not None),
+        ("--depth-editor", depth_editor is not None),
+        ("--device", device != "cpu"),
+    ):
+        if given and data is None:
+            raise fail(f"{option}: needs --data; on scenes, a study names its editors itself")
     if data is not None:
         words = (instruction, target_prompt, source_prompt)
-        _run_on_capture(lambda: load_study(study), data, ply, words, out, size, scale)
+        named: dict[Guide, str | None] = {"picture": editor, "depth": depth_editor}
+        editors = {guide: name for guide, name in named.items() if name is not None}
+        _run_on_capture(
+            lambda: load_study(study), data, ply, words, editors, device, out, size, scale
+        )
     elif dry_run:
         _print_plan(load, out)
     else:
@@ -94,6 +121,8 @@ def _run_on_capture(
     data: Path,
     ply: Path | None,
     words: tuple[str | None, str | None, str | None],
+    editors: Mapping[Guide, str],
+    device: str,
     out: Path | None,
     size: int | None,
     scale: int,
@@ -112,6 +141,7 @@ def _run_on_capture(
         if words[0] is None:
             raise InputError(f"--data {data}: needs --instruction, such as 'make it snow'")
         loaded = load()
+        by_guide = captured.Editors(editors, device)
         folder = out or Path("runs") / f"{loaded.name}-{data.resolve().name}"
         try:
             dataset = read_dataset(data, points=False, scale=scale)
@@ -126,6 +156,7 @@ def _run_on_capture(
                 captured.Words(words[0], words[1], words[2]),
                 folder,
                 show,
+                editors=by_guide,
             )
     for what, why in result.left_out.items():
         typer.echo(f"left out: {what}: {why}", err=True)

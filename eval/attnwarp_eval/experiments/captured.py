@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.editing.small import guide_of
+from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp_eval.document import write
 from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Table
@@ -30,11 +32,18 @@ from attnwarp_eval.user_images import measure
 
 if TYPE_CHECKING:
     from attnwarp.camera import Camera
+    from attnwarp.editing.editor import Guide
     from attnwarp.fit import Views
     from attnwarp.gaussians import Gaussians
 
 WITHOUT_TRUTH = ("image.", "embedding.")
 """Beginnings of the names of figures that need no true pictures."""
+
+GUIDES: dict[Guide, tuple[str, str]] = {
+    "picture": ("--editor", "a picture"),
+    "depth": ("--depth-editor", "depth maps"),
+}
+"""The option that names an editor, and what that editor takes, by its guide."""
 
 PICTURED = 4
 """Views side by side in the report, evenly spread."""
@@ -54,6 +63,41 @@ class Words:
     instruction: str
     target: str | None = None
     source: str | None = None
+
+
+@dataclass(frozen=True)
+class Editors:
+    """What edits single views.
+
+    Attributes:
+        named: by guide, a name or folders in place of the study's editors of that guide, as
+            :func:`attnwarp.editing.small.load_editor` takes it. A study's own guidance stays.
+        device: "cpu" or "cuda".
+
+    Raises:
+        InputError: no such device or editor, or one of another guide.
+    """
+
+    named: Mapping[Guide, str] = field(default_factory=dict)
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        device_of(self.device)
+        for guide, name in self.named.items():
+            option, wanted = GUIDES[guide]
+            if guide_of(name) != guide:
+                other, actual = GUIDES[guide_of(name)]
+                raise InputError(
+                    f"{option} {name}: takes {actual}, expected an editor that takes {wanted};"
+                    f" name it by {other}"
+                )
+
+    def of(self, study: Study, variant: Variant) -> editing.EditorPart:
+        """The editor of a variant."""
+        own = editing.editor_of(study, variant)
+        if not self.named:
+            return own
+        return own.model_copy(update={"name": self.named.get(guide_of(own.name), own.name)})
 
 
 @dataclass
@@ -90,6 +134,8 @@ def compare(
     words: Words,
     out: Path,
     progress: Progress = silent,
+    *,
+    editors: Editors = Editors(),
 ) -> Comparison:
     """Run every variant of a study on a capture, measure it, and write a report.
 
@@ -100,9 +146,11 @@ def compare(
         words: the edit.
         out: folder of ``captured.json``, ``.md`` and ``.html``, and of a folder for each variant.
         progress: told of each variant.
+        editors: what edits single views.
 
     Raises:
-        InputError: no variant that can run without truth, or one whose folder holds another run.
+        InputError: no variant that can run without truth, or one whose folder holds another run;
+            an editor for variants that the study lacks.
     """
     names = study.probes.get("editing", [])
     result = Comparison()
@@ -112,6 +160,14 @@ def compare(
     usable = [name for name in names if f"variant {name}" not in result.left_out]
     if not usable:
         raise InputError(f"{study.name}: no variant of the probe editing runs without truth")
+    parts = {name: editors.of(study, study.variants[name]) for name in usable}
+    for guide, editor_name in editors.named.items():
+        if editor_name not in {part.name for part in parts.values()}:
+            option, wanted = GUIDES[guide]
+            raise InputError(
+                f"{option} {editor_name}: no variant of {study.name} has an editor that takes"
+                f" {wanted}"
+            )
     # Variants whose seconds limit others come first.
     usable.sort(key=lambda name: _reference(study.variants[name]) is not None)
     result.left_out |= {
@@ -124,11 +180,15 @@ def compare(
     for place, name in enumerate(usable):
         progress(place, len(usable), name)
         folder = out / f"variant-{names.index(name) + 1}"
-        edited = _edit(study, name, views, splats, words, folder / "run", seconds)
+        editor = editing.load(
+            parts[name].name, editing.editor_identity(parts[name]), editors.device
+        )
+        edited = _edit(study, name, editor, views, splats, words, folder / "run", seconds)
         seconds[name] = sum(edited.seconds.get(part, 0.0) for part in editing.OWN_WORK)
         _write_pictures(views.cameras, splats, edited, originals, folder)
         result.rows[name] = _measured(study, edited, words, folder, out / "originals", result)
         result.rows[name] |= {
+            "editor": parts[name].name,
             "folder": folder.name,
             "seconds": seconds[name],
             "network_rows": edited.counters.get("network_rows", math.nan),
@@ -166,6 +226,7 @@ def _bytes(image: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
 def _edit(
     study: Study,
     name: str,
+    editor: Any,
     views: Views,
     splats: Gaussians,
     words: Words,
@@ -178,8 +239,6 @@ def _edit(
 
     variant = study.variants[name]
     own = variant.part(editing.VariantPart)
-    part = editing.editor_of(study, variant)
-    editor = editing.load(part.name, editing.editor_identity(part))
     settings = editing.settings_of(study, variant, study.seeds[0])
     if settings.get("size") is None:
         settings["size"] = editor.unet.config.sample_size * editor.factor
@@ -272,11 +331,12 @@ def _write(
 def report(study: Study, words: Words, cameras: Sequence[Camera], result: Comparison) -> Report:
     """The comparison as a document."""
     titles = list(dict.fromkeys(t for row in result.rows.values() for t in row["figures"]))
-    costs = ["seconds", "network rows", "edited views", "cut short by"]
+    costs = ["editor", "seconds", "network rows", "edited views", "cut short by"]
     rows = [
         [
             name,
             *(number(row["figures"].get(title, math.nan)) for title in titles),
+            row["editor"],
             number(row["seconds"]),
             number(row["network_rows"]),
             str(row["edited_views"]),

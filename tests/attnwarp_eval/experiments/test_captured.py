@@ -8,10 +8,13 @@ import yaml
 from few_splats import few_splats
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio
+from tiny_editors import controlnet, pix2pix
 from typer.testing import CliRunner
 
 from attnwarp import Camera
+from attnwarp.editing.small import load_editor
 from attnwarp.io import Dataset, write_ply, write_transforms
+from attnwarp.propagate.scene import editor_digest
 from attnwarp.render import render
 from attnwarp_eval.cli.main import app
 
@@ -160,6 +163,54 @@ def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path
     assert left["CLIP similarity"] == "needs --prompt"
 
 
+def test_editors_of_ones_own_stand_for_the_studys_by_what_they_take(folder, tmp_path, monkeypatch):
+    """Oracle: the digest of the weights in each folder, beside what each method wrote of its editor."""
+    pix2pix().save_pretrained(tmp_path / "picture")
+    controlnet().save_pretrained(tmp_path / "base")
+    (tmp_path / "base" / "controlnet").rename(tmp_path / "depth")
+    both = f"{tmp_path / 'base'},{tmp_path / 'depth'}"
+    asked = []
+
+    def spy(name, **given):
+        asked.append((name, given.pop("device")))
+        return load_editor(name, **given)
+
+    monkeypatch.setattr("attnwarp.editing.small.load_editor", spy)
+    options = {"stages": 1, "steps": 1, "iterations": 1}
+    own = {
+        "variants": {
+            "plain": {"options": options},
+            "depth": {"editor": {"name": "small-depth"}, "options": options},
+        },
+        "probes": {"editing": ["plain", "depth"]},
+    }
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(STUDY | own))
+    arguments = [
+        "run", tmp_path / "study.yaml", "--data", folder, "--ply", folder / "scene.ply", "--out", tmp_path / "out",
+        "--instruction", "a bear", "--editor", tmp_path / "picture", "--depth-editor", both, "--device", "cpu:0",
+    ]  # fmt: skip
+    done = CliRunner().invoke(app, [*map(str, arguments)])
+    assert done.exit_code == 0, done.output
+    rows = json.loads((tmp_path / "out" / "captured.json").read_text())["variants"]
+    expected = {"plain": str(tmp_path / "picture"), "depth": both}
+    assert {name: row["editor"] for name, row in rows.items()} == expected
+    for name, row in rows.items():
+        manifest = json.loads(
+            (tmp_path / "out" / row["folder"] / "run" / "manifest.json").read_text()
+        )
+        assert manifest["inputs"]["editor"] == editor_digest(load_editor(expected[name]))
+    assert asked == [(name, "cpu:0") for name in expected.values()]
+
+
+def test_editors_are_named_for_captures_alone(folder):
+    for option in ("--editor", "--depth-editor", "--device"):
+        done = CliRunner().invoke(app, ["run", str(folder / "study.yaml"), option, "cuda"])
+        assert done.exit_code == 2 and f"{option}: needs --data" in done.stderr
+
+
+GIVEN = ("--ply", "scene.ply", "--instruction", "red")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -167,6 +218,10 @@ def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path
         (["--ply", "scene.ply"], "needs --instruction"),
         (["--ply", "scene.ply", "--instruction", "red", "--scale", "3"], "scale: got 3"),
         (["--ply", "none.ply", "--instruction", "red"], "none.ply"),
+        ([*GIVEN, "--device", "gpu"], "device 'gpu': unknown, expected cpu or cuda"),
+        ([*GIVEN, "--editor", "smal"], "editor 'smal': neither bundled"),
+        ([*GIVEN, "--editor", "small-depth"], "takes depth maps, expected an editor that takes a"),
+        ([*GIVEN, "--depth-editor", "small-depth"], "no variant of mine has an editor that takes"),
     ],
 )
 def test_what_is_missing_is_one_line(folder, tmp_path, monkeypatch, arguments, message):

@@ -793,21 +793,22 @@ def _files_digest(name: str) -> str:
 
 @lru_cache(maxsize=2)
 def _loaded(
-    name: str, guidance: tuple[tuple[str, float], ...]
+    name: str, guidance: tuple[tuple[str, float], ...], device: str
 ) -> InstructPix2Pix | DepthControlNet:
     from attnwarp.editing.small import guide_of, load_editor
 
-    given = {f"{kind}_guidance": value for kind, value in guidance}
+    given: dict[str, Any] = {f"{kind}_guidance": value for kind, value in guidance}
     if guide_of(name) == "depth" and "text_guidance" in given:
         given["guidance"] = given.pop("text_guidance")
-    return load_editor(name, **given)
+    return load_editor(name, device=device, **given)
 
 
-def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:
+def load(name: str, planned: Json, device: str = "cpu") -> InstructPix2Pix | DepthControlNet:
     """An editor whose identity is the planned one.
 
     Raises:
         StudyError: its files have changed since the run was planned.
+        InputError: no such device.
     """
     if _files_digest(name) != planned["sha256"]:
         raise StudyError(
@@ -815,7 +816,8 @@ def load(name: str, planned: Json) -> InstructPix2Pix | DepthControlNet:
             " again"
         )
     given = planned["guidance"].items()
-    return _loaded(name, tuple((kind, value) for kind, value in given if value is not None))
+    guidance = tuple((kind, value) for kind, value in given if value is not None)
+    return _loaded(name, guidance, device)
 
 
 def edits_of(study: Study, scene: Scene) -> Iterator[Json]:
