@@ -8,6 +8,7 @@ what their processors return, so every processor works, and none has to be repla
 from __future__ import annotations
 
 import functools
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -212,20 +213,39 @@ class RecordingPlan:
         return values * len(self.keep) * self.views * self.steps * self.dtype.itemsize
 
     def __str__(self) -> str:
-        def counted(number: int, word: str) -> str:
-            plural = "branches" if word == "branch" else f"{word}s"
-            return f"{number} {word if number == 1 else plural}"
+        return in_words([self])
 
-        amount = self.bytes / 2**20
-        size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
-        kind = str(self.dtype).removeprefix("torch.")
-        places = {"device": "on the device", "cpu": "in main memory"}
-        place = places.get(str(self.store), f"in {self.store}")
-        return (
-            f"recording {counted(len(self.layers), 'layer')},"
-            f" {counted(len(self.keep), 'branch')} ({', '.join(self.keep)}),"
-            f" {counted(self.steps, 'step')} in {kind}: {size} {place}"
-        )
+
+def in_words(plans: Sequence[RecordingPlan]) -> str:
+    """A line for the recordings of one or several sources, with the memory of all together.
+
+    Args:
+        plans: at least one; layers, branches and steps are said of the first.
+
+    Example:
+        >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+        >>> plan = RecordingPlan((layer,), (32, 32), ("uncond", "text"), ("text",), steps=20)
+        >>> print(in_words([plan, plan]))
+        recording 2 sources, 1 layer, 1 branch (text), 20 steps in float32: 10.0 MiB on the device
+    """
+
+    def counted(number: int, word: str) -> str:
+        plural = "branches" if word == "branch" else f"{word}s"
+        return f"{number} {word if number == 1 else plural}"
+
+    first = plans[0]
+    amount = sum(plan.bytes for plan in plans) / 2**20
+    size = f"{amount / 1024:.2f} GiB" if amount >= 1024 else f"{amount:.1f} MiB"
+    kind = str(first.dtype).removeprefix("torch.")
+    sources = f"{len(plans)} sources, " if len(plans) > 1 else ""
+    places = {"device": "on the device", "cpu": "in main memory"}
+    folders = [plan.store for plan in plans if isinstance(plan.store, Path)]
+    place = f"in {os.path.commonpath(folders)}" if folders else places[str(first.store)]
+    return (
+        f"recording {sources}{counted(len(first.layers), 'layer')},"
+        f" {counted(len(first.keep), 'branch')} ({', '.join(first.keep)}),"
+        f" {counted(first.steps, 'step')} in {kind}: {size} {place}"
+    )
 
 
 @dataclass(eq=False)

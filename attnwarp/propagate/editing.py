@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from attnwarp.editing.attention import (
     choose_layers,
     constant,
     decay,
+    in_words,
     inject,
     record,
 )
@@ -81,7 +82,7 @@ class ViewEditor:
         instruction: in words.
         settings: see there.
         store: where recorded features go.
-        announce: told the memory of a recording before it is made.
+        announce: told the memory of the recordings.
 
     Attributes:
         timestep: Stable Diffusion's, drawn to start from; None for pure noise.
@@ -144,10 +145,9 @@ class ViewEditor:
             self._inject(stack, before, [target], branches)
             if self.layers:
                 # After the injection: what the next source gets is what this one went on with.
-                plan = self._plan(branches, target)
-                features = stack.enter_context(
-                    record(self.editor.unet, plan, announce=self.announce)
-                )
+                _, _, h, w = self._shape(target)
+                plan = self._plan(target.view, (h, w), further=bool(before))
+                features = stack.enter_context(record(self.editor.unet, plan))
             estimates: list[Tensor] = []
             if by_hand is None or maps is None:
                 picture = self._edit([target], before, watch, estimates)[0]
@@ -180,6 +180,35 @@ class ViewEditor:
     def branches(self, stage: int) -> tuple[str, ...]:
         """Of the batch of a stage's views. Further sources have those of the first stage."""
         return self._branches(self.settings.guidance(stage))
+
+    def announce_recordings(self, sources: Mapping[int, tuple[int, int]]) -> None:
+        """Tell the memory of all sources' recordings, before the first is made.
+
+        Args:
+            sources: by the view's number, (h, w) of its edit in px; the first source first.
+        """
+        if self.announce is None or not self.layers:
+            return
+        factor = self.editor.factor
+        plans = [
+            self._plan(view, (h // factor, w // factor), further=number > 0)
+            for number, (view, (h, w)) in enumerate(sources.items())
+        ]
+        self.announce(in_words(plans))
+
+    def _plan(self, view: int, size: tuple[int, int], *, further: bool) -> RecordingPlan:
+        """What is recorded of a source whose latents have (h, w)."""
+        s = self.settings
+        branches = self._branches(s.guidance(0) if further else self._source_guidance())
+        return RecordingPlan(
+            self.layers,
+            size,
+            branches,
+            self._kept(branches),
+            s.steps,
+            dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
+            store=self.store / str(view) if isinstance(self.store, Path) else self.store,
+        )
 
     def _source_guidance(self) -> float | None:
         """Of the first source."""
@@ -371,19 +400,6 @@ class ViewEditor:
         """Of one view's latents."""
         h, w = (side // self.editor.factor for side in target.guide.shape[:2])
         return 1, self.editor.unet.config.out_channels, h, w
-
-    def _plan(self, branches: tuple[str, ...], target: Target) -> RecordingPlan:
-        s = self.settings
-        _, _, h, w = self._shape(target)
-        return RecordingPlan(
-            self.layers,
-            (h, w),
-            branches,
-            self._kept(branches),
-            s.steps,
-            dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
-            store=self.store / str(target.view) if isinstance(self.store, Path) else self.store,
-        )
 
     def _inversion(self, task: Any, picture: Image) -> Any:
         s = self.settings

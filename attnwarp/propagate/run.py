@@ -155,8 +155,8 @@ def propagate(
         checkpoint_seconds: between two checkpoints of tuning.
         backend: of :func:`attnwarp.render.render`.
         watch: told how the edit stands, :func:`attnwarp.propagate.progress.progress_display`.
-        announce: told what the views or the editor leave of the settings, and the memory of the
-            recording before it is made.
+        announce: told what the views or the editor leave of the settings, and the memory of all
+            recordings together before the first is made.
 
     Raises:
         ValueError: an argument of another size or type; the message names it.
@@ -342,6 +342,7 @@ class _Run:
     def sources(self) -> list[Source]:
         """The sources' edits; made anew, to the same bytes, in each sitting that needs them."""
         sources: list[Source] = []
+        self.view_editor.announce_recordings({v: self.sizes[v] for v in self.plan.sources})
         for view in self.plan.sources:
             sources.append(self._source(view, sources))
         return sources

@@ -894,6 +894,27 @@ def extended(scene, editor, tmp_path_factory):
     return run(scene, editor, folder, replace(QUICK, **ALL_IDEAS)), folder
 
 
+@pytest.mark.parametrize("store", ["cpu", "disk"])
+def test_the_memory_of_all_recordings_is_told_once_before_the_first(store, scene, editor, tmp_path):
+    """Oracle: features counted by hand, of two views of 32 px and one of twice as many pixels."""
+    model, views, images = scene
+    wide = views[1].resize(64, 32)
+    part = model, [views[0], wide, views[2]], [images[0], pictures(model, [wide])[0], images[2]]
+    told = []
+    settings = replace(QUICK, sources=3, steps=2, iterations=0, size=None)
+    run(part, editor, tmp_path, settings, store=store, announce=told.append,
+        watch=lambda step: told.append("work"))  # fmt: skip
+    (line,) = [text for text in told if text.startswith("recording")]
+    assert "work" not in told[: told.index(line)]
+    # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
+    one = (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
+    place = tmp_path / ".recording" if store == "disk" else "main memory"
+    assert line == (
+        f"recording 3 sources, 8 layers, 2 branches (text, image), 2 steps in float32:"
+        f" {4 * one / 2**20:.1f} MiB in {place}"
+    )
+
+
 def test_further_sources_are_edited_first_and_counted(extended, scene):
     result, folder = extended
     assert len(result.plan.chain) == 2
