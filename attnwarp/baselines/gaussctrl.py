@@ -18,10 +18,10 @@ from attnwarp.baselines.run import Baseline, Kind, Options, run
 from attnwarp.baselines.settings import GaussCtrlSettings
 from attnwarp.baselines.work import VIEWS, Round, ViewEdit, Work, chunks
 from attnwarp.camera import Camera
-from attnwarp.editing.editor import Editor, edit, shared_noise
-from attnwarp.editing.inversion import ddim_invert
+from attnwarp.editing.editor import Editor, edit
+from attnwarp.editing.inversion import inversion_steps, invert_view
 from attnwarp.gaussians import Gaussians
-from attnwarp.propagate.editing import Guide, guided
+from attnwarp.propagate.editing import Guide
 
 
 def gaussctrl(
@@ -88,7 +88,7 @@ class _GaussCtrl:
             return edits
         first = group == self.rounds[0].groups[0]
         inverted = set(group) | set(self.references) if first else set(group) - set(self.references)
-        return edits + len(inverted) * (s.steps - self._predicts_picture)
+        return edits + len(inverted) * len(inversion_steps(self.work.editor, s.steps)[0])
 
     def edit(
         self, number: int, group: Sequence[int], model: Gaussians, watch: Callable[[], None]
@@ -126,21 +126,11 @@ class _GaussCtrl:
             return work.noise(0, [view]).to(work.editor.unet.device, work.editor.unet.dtype)
         if view not in self._latents:
             prompt = work.instruction + s.suffix if s.source_prompt is None else s.source_prompt
-            schedule, timesteps = work.editor.schedule, work.editor.timesteps(s.steps)
-            before = work.editor.encode([work.render(view, work.frozen)])
-            begin = None
-            if self._predicts_picture:
-                *timesteps, begin = timesteps
-                noise = shared_noise((1, *before.shape[1:]), s.seed).to(before)
-                before = schedule.add_noise(before, noise, begin)
-            with guided(work.editor, 1.0):
-                task = work.editor.task([depth], prompt)
-                self._latents[view] = ddim_invert(schedule, task.predict, before, timesteps, begin)
+            self._latents[view] = invert_view(
+                work.editor, depth, work.render(view, work.frozen), prompt,
+                steps=s.steps, seed=s.seed,
+            )  # fmt: skip
         return self._latents[view]
-
-    @property
-    def _predicts_picture(self) -> bool:
-        return self.work.editor.schedule.prediction == "sample"
 
 
 @contextmanager

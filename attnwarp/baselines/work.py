@@ -12,10 +12,10 @@ import torch
 from torch import Tensor
 
 from attnwarp.baselines.settings import BaselineSettings
-from attnwarp.editing.editor import Editor, shared_noise
+from attnwarp.editing.editor import Editor, guided, shared_noise
 from attnwarp.editing.schedule import steps_as_published
 from attnwarp.gaussians import Gaussians
-from attnwarp.propagate.editing import Guide, guided
+from attnwarp.propagate.editing import Guide
 from attnwarp.propagate.noise import own_seed
 from attnwarp.propagate.pictures import Image, Size, composite, edit_size, resized
 from attnwarp.propagate.scene import Scene, near_of, render_picture

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol
@@ -192,6 +193,21 @@ def edit(
             if watch is not None:
                 watch(number, len(timesteps), x)
     return Edit(editor.decode(x), x, timesteps)
+
+
+@contextmanager
+def guided(editor: Any, value: float | None) -> Iterator[None]:
+    """Use another text guidance while the block runs; None leaves the editor's own."""
+    name = "text_guidance" if hasattr(editor, "text_guidance") else "guidance"
+    if value is None:
+        yield
+        return
+    before = getattr(editor, name)
+    setattr(editor, name, float(value))
+    try:
+        yield
+    finally:
+        setattr(editor, name, before)
 
 
 def tensor_of(images: Sequence[npt.NDArray[Any]], name: str, multiple: int) -> Tensor:

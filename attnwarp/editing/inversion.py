@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from attnwarp import check
+from attnwarp.editing.editor import Editor, Image, guided, shared_noise
 from attnwarp.editing.schedule import Schedule, following
 
 Predict = Callable[[Tensor, int], Tensor]
@@ -68,6 +71,59 @@ def ddim_invert(
             a = last.to(x0)
             x = (a.sqrt() * x0 + (1 - a).sqrt() * noise).to(x.dtype)
     return x
+
+
+def invert_view(
+    editor: Editor,
+    guide: npt.NDArray[Any],
+    picture: Image,
+    prompt: str,
+    *,
+    steps: int,
+    seed: int = 0,
+) -> Tensor:
+    """(1, C, h, w) latents from which unguided DDIM with the same prompt reconstructs a view.
+
+    Args:
+        editor: a model that draws the whole picture, such as a depth ControlNet.
+        guide: what ``editor.task`` takes of the view.
+        picture: (H, W, 3) of the view, in [0, 1].
+        prompt: what the picture shows; "" names nothing.
+        steps: of the edit.
+        seed: of the noise of :func:`inversion_steps`, the same for all views.
+
+    Example:
+        >>> import numpy as np
+        >>> from attnwarp.editing.small import load_editor
+        >>> depth, grey = np.ones((32, 32)), np.full((32, 32, 3), 0.5, np.float32)
+        >>> invert_view(load_editor("small-depth"), depth, grey, "a bear", steps=2).shape
+        torch.Size([1, 48, 8, 8])
+    """
+    timesteps, begin = inversion_steps(editor, steps)
+    latents = editor.encode([picture])
+    if begin is not None:
+        noise = shared_noise((1, *latents.shape[1:]), seed).to(latents)
+        latents = editor.schedule.add_noise(latents, noise, begin)
+    with guided(editor, 1.0):
+        task = editor.task([guide], prompt)
+        return ddim_invert(editor.schedule, task.predict, latents, timesteps, begin)
+
+
+def inversion_steps(editor: Editor, steps: int) -> tuple[list[int], int | None]:
+    """The timesteps of a view's inversion, falling, and the one that it is noised to before.
+
+    A network that predicts the picture says nothing of a clean picture's noise. Its inversion
+    begins at the lowest timestep, others' at the clean latents: None.
+
+    Example:
+        >>> from attnwarp.editing.small import load_editor
+        >>> inversion_steps(load_editor("small-depth"), 4)
+        ([999, 749, 499], 249)
+    """
+    timesteps = editor.timesteps(steps)
+    if editor.schedule.prediction == "sample":
+        return timesteps[:-1], timesteps[-1]
+    return timesteps, None
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,8 +23,8 @@ from attnwarp.editing.attention import (
     inject,
     record,
 )
-from attnwarp.editing.editor import Editor, edit, shared_noise
-from attnwarp.editing.inversion import edit_friendly_invert, replay
+from attnwarp.editing.editor import Editor, edit, guided, shared_noise
+from attnwarp.editing.inversion import edit_friendly_invert, invert_view, replay
 from attnwarp.editing.schedule import steps_as_published
 from attnwarp.propagate.noise import FRESH, carried, own_seed, unmoved
 from attnwarp.propagate.pictures import Image
@@ -45,7 +45,7 @@ class Target:
     Attributes:
         view: its number, which its own noise depends on.
         guide: (h, w, 3) picture or (h, w) depth, as the editor takes it.
-        start_picture: (h, w, 3) that is noised to the settings' ``start``.
+        start_picture: (h, w, 3) that is noised to the settings' ``start``, or inverted.
         sight: how the sources see it; None where there are none.
     """
 
@@ -88,7 +88,8 @@ class ViewEditor:
         timestep: Stable Diffusion's, drawn to start from; None for pure noise.
 
     Raises:
-        ValueError: layers or branches that the editor lacks; a start too low for the steps.
+        ValueError: layers or branches that the editor lacks; an inversion of one that changes
+            pictures; a start too low for the steps.
     """
 
     def __init__(
@@ -102,6 +103,11 @@ class ViewEditor:
     ) -> None:
         self.editor, self.instruction, self.settings = editor, instruction, settings
         self.store, self.announce = store, announce
+        if settings.latents == "inversion" and editor.guide != "depth":
+            raise ValueError(
+                "latents: 'inversion' is made for a depth ControlNet, got InstructPix2Pix, which"
+                " takes pictures; choose another editor, or 'random'"
+            )
         self.layers: tuple[Layer, ...] = ()
         if settings.method == "warp":
             self.layers = choose_layers(
@@ -138,6 +144,7 @@ class ViewEditor:
         s = self.settings
         features: Recording | None = None
         guidance = s.guidance(0) if before else self._source_guidance()
+        latents = self._inverted([target])
         with guided(self.editor, guidance), ExitStack() as stack:
             branches = self.editor.branches
             task = self.editor.task([target.guide], self.instruction)
@@ -150,7 +157,7 @@ class ViewEditor:
                 features = stack.enter_context(record(self.editor.unet, plan))
             estimates: list[Tensor] = []
             if by_hand is None or maps is None:
-                picture = self._edit([target], before, watch, estimates)[0]
+                picture = self._edit([target], before, latents, watch, estimates)[0]
             else:
                 replay(self.editor.schedule, task.predict, maps, watch=_ignoring(watch))
                 picture = by_hand
@@ -173,9 +180,10 @@ class ViewEditor:
             stage: from 0.
             watch: called after each step.
         """
+        latents = self._inverted(targets)
         with guided(self.editor, self.settings.guidance(stage)), ExitStack() as stack:
             self._inject(stack, sources, targets, self.editor.branches)
-            return self._edit(targets, sources, watch)
+            return self._edit(targets, sources, latents, watch)
 
     def branches(self, stage: int) -> tuple[str, ...]:
         """Of the batch of a stage's views. Further sources have those of the first stage."""
@@ -304,23 +312,43 @@ class ViewEditor:
         self,
         targets: Sequence[Target],
         sources: Sequence[Source],
+        latents: Tensor | None,
         watch: Callable[[], None] | None,
         estimates: list[Tensor] | None = None,
     ) -> list[Image]:
         s = self.settings
-        starts = [target.start_picture for target in targets]
+        noised = [t.start_picture for t in targets if t.start_picture is not None]
         result = edit(
             self.editor,
             [target.guide for target in targets],
             self.instruction,
             steps=s.steps,
             start=self.timestep,
-            pictures=None if starts[0] is None else [p for p in starts if p is not None],
-            noise=self.noise(targets, sources),
+            pictures=None if self.timestep is None else noised,
+            noise=self.noise(targets, sources) if latents is None else None,
+            latents=latents,
             watch=_ignoring(watch),
             estimate=self._estimate(targets, sources, estimates),
         )
         return result.images
+
+    def _inverted(self, targets: Sequence[Target]) -> Tensor | None:
+        """(B, C, h, w) that the views' edits start from; None for noise. Each goes through the
+        network alone, before features are recorded or injected.
+        """
+        s = self.settings
+        if s.latents == "random":
+            return None
+        prompt = self.instruction if s.source_prompt is None else s.source_prompt
+        return torch.cat(
+            [
+                invert_view(
+                    self.editor, t.guide, t.start_picture, prompt, steps=s.steps, seed=s.seed
+                )
+                for t in targets
+                if t.start_picture is not None
+            ]
+        )
 
     def _estimate(
         self,
@@ -416,21 +444,6 @@ class ViewEditor:
         return edit_friendly_invert(
             self.editor.schedule, task.predict, latents, timesteps, noises=noises
         )
-
-
-@contextmanager
-def guided(editor: Any, value: float | None) -> Iterator[None]:
-    """Use another text guidance while the block runs; None leaves the editor's own."""
-    name = "text_guidance" if hasattr(editor, "text_guidance") else "guidance"
-    if value is None:
-        yield
-        return
-    before = getattr(editor, name)
-    setattr(editor, name, float(value))
-    try:
-        yield
-    finally:
-        setattr(editor, name, before)
 
 
 def _in_words(guidance: float | None) -> str:

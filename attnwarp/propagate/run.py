@@ -20,6 +20,7 @@ from attnwarp.camera import Camera
 from attnwarp.digest import digest, digest_each
 from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
+from attnwarp.editing.inversion import inversion_steps
 from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
 from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
@@ -195,6 +196,11 @@ def propagate(
         by_hand = to_float(checked_image(source_picture, "source_picture"))
         h, w, _ = by_hand.shape
         check_view_aspect((h, w), cameras[source], "source_picture")
+        if settings.latents == "inversion":
+            raise ValueError(
+                "source_picture: got one with latents 'inversion', but its own noise is replayed, in"
+                " place of any inversion; leave it out, or set latents to 'random'"
+            )
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(
             gaussians, scene, editor, instruction, settings, source, by_hand, warps,
@@ -577,10 +583,11 @@ class _Run:
         return np.asarray(self._rendered_surface(before, camera).depth)
 
     def _start_picture(self, view: int, model: Gaussians) -> Image | None:
-        if self.view_editor.timestep is None:
+        inverted = self.settings.latents == "inversion"
+        if self.view_editor.timestep is None and not inverted:
             return None
         h, w = self.sizes[view]
-        if self.settings.start_picture == "original":
+        if inverted or self.settings.start_picture == "original":
             return resized(self.scene.picture(view), (h, w))
         return render_picture(model, self.scene.cameras[view].resize(w, h), self.near, self.backend)
 
@@ -700,10 +707,14 @@ class _Run:
         rows = len(source["branches"]) * (1 if self.by_hand is None else 2)
         for stage, views in ((0, self.plan.chain), *enumerate(self.plan.stages)):
             rows += len(views) * len(self.view_editor.branches(stage))
+        rows *= self.settings.steps
+        if self.settings.latents == "inversion":
+            inverted, _ = inversion_steps(self.editor, self.settings.steps)
+            rows += len(self.plan.edited) * len(inverted)
         return {
             "views": 1 + len(targets),
             **({"sources": sources} if sources > 1 else {}),
-            "network_rows": rows * self.settings.steps,
+            "network_rows": rows,
             "feature_bytes": sources * source["feature_bytes"],
             "injected": sum(shares) / len(shares) if shares else 0.0,
             "iterations": self.tuning.iteration,

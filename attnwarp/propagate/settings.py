@@ -15,6 +15,7 @@ from attnwarp.warp import WarpSettings, settings
 
 Method = Literal["warp", "each view alone"]
 Noise = Literal["shared", "fresh", "surface"]
+Latents = Literal["random", "inversion"]
 StartPicture = Literal["render", "original"]
 DepthFrom = Literal["frozen", "current"]
 Decay = Literal["linear", "constant"]
@@ -31,6 +32,7 @@ MOST_VIEWS = 40
 _CHOICES: dict[str, Any] = {
     "method": Method,
     "noise": Noise,
+    "latents": Latents,
     "start_picture": StartPicture,
     "depth_from": DepthFrom,
     "decay": Decay,
@@ -60,6 +62,10 @@ class PropagateSettings:
         noise: "shared" by source and targets, pixel by pixel; "fresh" for each view; or "surface":
             a point of the surface has the same noise in every view
             (:mod:`attnwarp.propagate.noise`).
+        latents: what a view's edit starts from: "random" ones, or the DDIM "inversion" of its
+            picture before the edit, without guidance, of an editor that is guided by depth. Each
+            view then has a start of its own, so ``noise`` stays "shared" and ``start`` None.
+        source_prompt: of the inversion: what the scene shows; None for the instruction.
         start: (lowest, highest) timestep of Stable Diffusion, of which one is drawn for all views,
             to start from in place of pure noise. On the editor's own schedule it becomes the step
             that leaves as much of the picture
@@ -127,6 +133,8 @@ class PropagateSettings:
     size: int | None = None
     steps: int = 20
     noise: Noise = "shared"
+    latents: Latents = "random"
+    source_prompt: str | None = ""
     start: tuple[int, int] | None = None
     start_picture: StartPicture = "render"
     text_guidance: float | None = None
@@ -170,6 +178,7 @@ class PropagateSettings:
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: got {getattr(self, name)!r}, expected true or false")
         check.text(self.perceptual_encoder, "perceptual_encoder")
+        self._check_latents()
         if not isinstance(self.warp, WarpSettings):
             raise ValueError(f"warp: got {self.warp!r}, expected WarpSettings")
         for name in ("fractions", "kinds", "blocks", "branches", "start"):
@@ -197,9 +206,33 @@ class PropagateSettings:
                 f" {self.guidance_drop:g}, so stage {self.stages} has {last:g}, expected at least 0"
             )
 
+    def _check_latents(self) -> None:
+        if self.source_prompt is not None:
+            check.text(self.source_prompt, "source_prompt")
+        if self.latents == "random":
+            if self.source_prompt != "":
+                raise ValueError(
+                    f"source_prompt: got {self.source_prompt!r} with random latents; set latents to"
+                    " 'inversion', which reads it, or leave it out"
+                )
+            return
+        for name, value, plain in (("noise", self.noise, "shared"), ("start", self.start, None)):
+            if value != plain:
+                raise ValueError(
+                    f"{name}: got {value!r} with latents 'inversion', from which each view has its"
+                    f" own start; set {name} to {plain!r}, or latents to 'random'"
+                )
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values in the order of the fields; equal settings give equal dictionaries."""
+        """Plain JSON values in the order of the fields; equal settings give equal dictionaries.
+
+        Fields that came after the first edits are left out at their defaults, so that folders and
+        studies of before are still those of the same settings.
+        """
         values = asdict(self)
+        for name in _LATER:
+            if values[name] == getattr(type(self), name):
+                del values[name]
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
     @classmethod
@@ -230,6 +263,7 @@ class PropagateSettings:
         return self.text_guidance - self.guidance_drop * stage
 
 
+_LATER = ("latents", "source_prompt")
 _WHOLE = {
     "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
 }  # fmt: skip

@@ -704,6 +704,7 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
     ("changes", "message"),
     [
         ({"perceptual_encoder": "bogus"}, "encoder 'bogus': unknown"),
+        ({"latents": "inversion"}, "latents: 'inversion' is made for a depth .*InstructPix2Pix"),
         ({"branches": ("bogus",)}, "branches: got 'bogus', expected one of 'text', 'image', "),
         (
             {"branches": ("image",), "source_text_guidance": 1.5},  # s_T = s_I
@@ -772,20 +773,24 @@ def test_released_guidance_falls_by_stage_and_the_editors_own_comes_back(scene, 
     assert values == [3.0]
 
 
-def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_guidance(
-    scene, tmp_path
-):
+@pytest.fixture
+def depth_editor():
+    """A ControlNet whose own guidance, which has one branch, runs in no pass of an edit."""
     from tiny_editors import controlnet
 
     from attnwarp.editing.controlnet import DepthControlNet
 
     pipe = controlnet()
     names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
-    # The editor's own guidance, which has one branch, runs in no pass.
-    net = DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+    return DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+
+
+def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_guidance(
+    scene, depth_editor, tmp_path
+):
     settings = quick("released-controlnet")
     values, result = guidance_of_passes(
-        net, "guidance", lambda: run(scene, net, tmp_path, settings)
+        depth_editor, "guidance", lambda: run(scene, depth_editor, tmp_path, settings)
     )
     assert values == [7.5, 12.5]
     source = json.loads((tmp_path / "source.json").read_text())
@@ -794,6 +799,67 @@ def test_a_controlnet_is_guided_by_depth_with_both_branches_and_its_released_gui
     # 4 layers of 16 channels at 16 x 16 and 4 of 32 at 8 x 8, two branches, two steps, float32.
     assert source["feature_bytes"] == (4 * 256 * 16 + 4 * 64 * 32) * 2 * 2 * 4
     assert len(result.edited) == 5
+
+
+def inverted_by_diffusers(net, depth, picture, prompt, steps):
+    """(1, C, h, w) at the noisiest step, by diffusers' own inverse scheduler and models."""
+    from diffusers import DDIMInverseScheduler
+
+    from attnwarp.editing.controlnet import control_image
+
+    inverse = DDIMInverseScheduler.from_config(net.scheduler.config)
+    inverse.set_timesteps(steps)
+    with torch.no_grad():
+        text = net.embed([prompt])
+        control = torch.from_numpy(control_image(depth)).permute(2, 0, 1)[None]
+        pixels = torch.from_numpy(picture).permute(2, 0, 1)[None]
+        x = net.vae.encode(2 * pixels - 1).latent_dist.mode() * net.vae.config.scaling_factor
+        for t in inverse.timesteps:
+            down, middle = net.controlnet(x, t, text, control, return_dict=False)
+            noise = net.unet(
+                x, t, text,
+                down_block_additional_residuals=down, mid_block_additional_residual=middle,
+            ).sample  # fmt: skip
+            x = inverse.step(noise, int(t), x).prev_sample
+    return x
+
+
+def test_inverted_latents_are_those_of_diffusers_with_the_source_prompt(
+    scene, depth_editor, monkeypatch
+):
+    guides, task = [], depth_editor.task
+    monkeypatch.setattr(
+        depth_editor, "task", lambda g, words: guides.append((words, g)) or task(g, words)
+    )
+    settings = quick(
+        "corrected", method="each view alone", text_guidance=3.0, iterations=0,
+        latents="inversion", source_prompt="a bear",
+    )  # fmt: skip
+    rows, result = rows_of(
+        depth_editor.unet, lambda: run(scene, depth_editor, None, settings, "a red bear")
+    )
+    assert result.counters["network_rows"] == sum(rows)
+    assert (rows.count(1), depth_editor.guidance) == (5 * 2, 1.0)  # views are inverted unguided
+    assert [words for words, _ in guides].count("a bear") == 5
+    _, first = guides[0]
+    monkeypatch.setattr(depth_editor, "guidance", 3.0)
+    x = inverted_by_diffusers(depth_editor, first[0], scene[2][0], "a bear", 2)
+    expected = edit(depth_editor, first, "a red bear", steps=2, latents=x).images[0]
+    assert np.abs(result.edited[0] - 255 * expected).max() < 1
+    # It is no noise that views share, nor what an edit without inversion gives.
+    alone = run(scene, depth_editor, None, replace(settings, latents="random", source_prompt=""))
+    assert np.abs(result.edited[0].astype(int) - alone.edited[0]).max() > 8
+
+
+def test_features_are_carried_between_inverted_views(scene, depth_editor, tmp_path):
+    """A view at the source's place, of the same picture, gets the source's edit."""
+    model, views, images = scene
+    twins = model, [views[0], views[0], views[2]], [images[0], images[0], images[2]]
+    settings = quick("corrected", stages=1, latents="inversion", a0=1.0, decay="constant")
+    result = run(twins, depth_editor, tmp_path / "whole", settings)
+    assert np.abs(result.edited[0].astype(int) - result.edited[1]).max() <= 1
+    other = run(twins, depth_editor, tmp_path / "alone", replace(settings, method="each view alone"))
+    assert not np.array_equal(other.edited[2], result.edited[2])
 
 
 def visits(folder):

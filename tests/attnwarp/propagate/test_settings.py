@@ -54,6 +54,16 @@ def test_settings_survive_json(name):
     assert PropagateSettings.from_dict(json.loads(text)) == PRESETS[name]
 
 
+def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
+    """Folders and cells of studies are compared by it."""
+    later = {"latents", "source_prompt"}
+    assert not any(later & set(settings.to_dict()) for settings in PRESETS.values())
+    inverted = preset("corrected", latents="inversion", source_prompt="a bear")
+    data = json.loads(json.dumps(inverted.to_dict()))
+    assert {name: data[name] for name in later} == {"latents": "inversion", "source_prompt": "a bear"}  # fmt: skip
+    assert PropagateSettings.from_dict(data) == inverted
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -76,6 +86,17 @@ def test_settings_survive_json(name):
         ({"guidance_drop": 1.5}, "guidance_drop: got 1.5 without text_guidance, which it is taken"),
         ({"perceptual_encoder": 5}, "perceptual_encoder: got 5, expected a string"),
         ({"perceptual_encoder": None}, "perceptual_encoder: got None, expected a string"),
+        ({"latents": "inverted"}, "latents: got 'inverted', expected .*'inversion'"),
+        (
+            {"latents": "inversion", "noise": "fresh"},
+            "noise: got 'fresh' with latents 'inversion', .* set noise to 'shared'",
+        ),
+        (
+            {"latents": "inversion", "start": (700, 980)},
+            "start: got .*700, 980.* with latents 'inversion', .* set start to None",
+        ),
+        ({"source_prompt": "a bear"}, "source_prompt: got 'a bear' with random latents; set"),
+        ({"latents": "inversion", "source_prompt": 5}, "source_prompt: got 5, expected a string"),
         ({"warp": 3, "warp.opaque": 0.9}, "warp: got 3, expected its fields by name"),
     ],
 )
