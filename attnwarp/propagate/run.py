@@ -198,8 +198,8 @@ def propagate(
         check_view_aspect((h, w), cameras[source], "source_picture")
         if settings.latents == "inversion":
             raise ValueError(
-                "source_picture: got one with latents 'inversion', but its own noise is replayed, in"
-                " place of any inversion; leave it out, or set latents to 'random'"
+                "source_picture: got one with latents 'inversion', but its own noise is replayed;"
+                " leave it out, or set latents to 'random'"
             )
     with nullcontext(folder) if folder else tempfile.TemporaryDirectory() as place:
         run = _Run(

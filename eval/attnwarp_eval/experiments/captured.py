@@ -24,7 +24,13 @@ from attnwarp_eval.document.model import Gallery, Picture, Report, Section, Tabl
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.files import write_atomic, write_picture
 from attnwarp_eval.progress import Progress, silent
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
+from attnwarp_eval.study.editing_methods import (
+    EDITING_METHODS,
+    EditedScene,
+    Job,
+    needs_source_words,
+    with_source_words,
+)
 from attnwarp_eval.study.probes import editing, fit, sensitivity
 from attnwarp_eval.study.schema import Study, Variant
 from attnwarp_eval.study.store import Store
@@ -57,7 +63,8 @@ class Words:
         instruction: for editors that are told what to change.
         target: what the edited scene shows, for editors guided by depth and for CLIP; None: depth
             editors get the instruction, and CLIP's figures are left out.
-        source: what the scene showed before, for CLIP's direction; None leaves that out.
+        source: what the scene showed before, for CLIP's direction and for methods that invert with
+            it; None leaves both out.
     """
 
     instruction: str
@@ -157,6 +164,10 @@ def compare(
     for name in names:
         if (reason := needs_truth(study.variants[name])) is not None:
             result.left_out[f"variant {name}"] = reason
+        elif words.source is None and needs_source_words(
+            editing.settings_of(study, study.variants[name], study.seeds[0])
+        ):
+            result.left_out[f"variant {name}"] = "it inverts with the words of --source-prompt"
     usable = [name for name in names if f"variant {name}" not in result.left_out]
     if not usable:
         raise InputError(f"{study.name}: no variant of the probe editing runs without truth")
@@ -239,7 +250,9 @@ def _edit(
 
     variant = study.variants[name]
     own = variant.part(editing.VariantPart)
-    settings = editing.settings_of(study, variant, study.seeds[0])
+    settings = with_source_words(
+        editing.settings_of(study, variant, study.seeds[0]), words.source or ""
+    )
     if settings.get("size") is None:
         settings["size"] = editor.unet.config.sample_size * editor.factor
     budget = None

@@ -42,6 +42,7 @@ class Claim:
     a: Mapping[str, Any]
     expect: Literal["higher", "lower"]
     b: Mapping[str, Any] | None = None
+    or_b: Mapping[str, Any] | None = None
     yaw: tuple[float, float] | None = None
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
@@ -74,6 +75,8 @@ class Claim:
         own = self.settings == "own"
         a = variant_like(results, self.a, self.probe, own=own)
         b = None if self.b is None else variant_like(results, self.b, self.probe, own=own)
+        if b is None and self.or_b is not None:
+            b = variant_like(results, self.or_b, self.probe, own=own)
         if a is None or (self.b is not None and b is None):
             return None
         if self.compare_yaw is not None:

@@ -25,6 +25,29 @@ Image = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
 
+SOURCE_WORDS = "{source}"
+"""Stands in a method's setting ``source_prompt`` for the words that describe the scene before."""
+
+
+def needs_source_words(settings: Mapping[str, Any]) -> bool:
+    """Whether a method's settings have a place for the words that describe the scene before."""
+    return SOURCE_WORDS in (settings.get("source_prompt") or "")
+
+
+def with_source_words(settings: dict[str, Any], words: str) -> dict[str, Any]:
+    """A method's settings with these words in their place, if they have one.
+
+    Example:
+        >>> with_source_words({"steps": 20, "source_prompt": "{source}"}, "a bear")
+        {'steps': 20, 'source_prompt': 'a bear'}
+        >>> with_source_words({"steps": 20}, "a bear")
+        {'steps': 20}
+    """
+    if not needs_source_words(settings):
+        return settings
+    return {**settings, "source_prompt": settings["source_prompt"].replace(SOURCE_WORDS, words)}
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """A scene to edit.

@@ -698,6 +698,9 @@ def test_arguments_that_do_not_fit_are_named(scene, editor):
         propagate(model, views, images, editor, "  ", QUICK)
     with pytest.raises(ValueError, match="checkpoint_seconds: got None"):
         run((model, views, images), editor, checkpoint_seconds=None)
+    inverted = replace(QUICK, latents="inversion")
+    with pytest.raises(ValueError, match="source_picture: got one with latents 'inversion', but"):
+        run((model, views, images), editor, settings=inverted, source_picture=images[0])
 
 
 @pytest.mark.parametrize(
@@ -858,7 +861,9 @@ def test_features_are_carried_between_inverted_views(scene, depth_editor, tmp_pa
     settings = quick("corrected", stages=1, latents="inversion", a0=1.0, decay="constant")
     result = run(twins, depth_editor, tmp_path / "whole", settings)
     assert np.abs(result.edited[0].astype(int) - result.edited[1]).max() <= 1
-    other = run(twins, depth_editor, tmp_path / "alone", replace(settings, method="each view alone"))
+    other = run(
+        twins, depth_editor, tmp_path / "alone", replace(settings, method="each view alone")
+    )
     assert not np.array_equal(other.edited[2], result.edited[2])
 
 

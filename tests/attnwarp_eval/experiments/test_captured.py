@@ -33,8 +33,10 @@ STUDY = {
                   "budget": {"seconds_of": "whole"}},
         "ceiling": {"method": "true pictures"},
         "oracle": {"mask": "truth"},
+        "inverted": {"method": "gaussctrl", "editor": {"name": "small-depth"},
+                     "options": {"steps": 1, "iterations": 0, "source_prompt": "{source}, far"}},
     },
-    "probes": {"editing": ["whole", "short", "timed", "ceiling", "oracle"]},
+    "probes": {"editing": ["whole", "short", "timed", "ceiling", "oracle", "inverted"]},
 }  # fmt: skip
 
 
@@ -92,7 +94,9 @@ def done(folder, tmp_path_factory):
 
 def test_the_figures_are_those_of_the_written_pictures(done, folder):
     _, out, data = done
-    assert list(data["variants"]) == ["whole", "short", "timed"]
+    assert list(data["variants"]) == ["whole", "short", "inverted", "timed"]
+    manifest = out / data["variants"]["inverted"]["folder"] / "run" / "manifest.json"
+    assert json.loads(manifest.read_text())["settings"]["source_prompt"] == "a thing, far"
     row = data["variants"]["whole"]
     renders, edited = (
         {p.stem: read(p) for p in (out / row["folder"] / name).iterdir()}
@@ -161,6 +165,7 @@ def test_smaller_copies_of_the_pictures_are_read_by_their_scale(folder, tmp_path
     assert read(tmp_path / "originals" / "view-0000.png").shape == (16, 16, 3)
     left = json.loads((tmp_path / "captured.json").read_text())["left_out"]
     assert left["CLIP similarity"] == "needs --prompt"
+    assert left["variant inverted"] == "it inverts with the words of --source-prompt"
 
 
 def test_editors_of_ones_own_stand_for_the_studys_by_what_they_take(folder, tmp_path, monkeypatch):

@@ -408,6 +408,33 @@ def test_a_claim_about_methods_finds_them_whatever_their_own_settings_are(measur
     assert complete.measure(run) is None  # no variant has the defaults' iterations
 
 
+def test_inverted_latents_are_held_against_random_ones_only_where_no_others_were_measured():
+    """Oracle: a value of its own for each variant."""
+    declared = {claim.id: claim for claim in load_claims()}
+    depth = {"editor": {"name": "small-depth"}}
+    inverted = {"latents": "inversion"}
+    variants = {
+        "random": depth,
+        "inverted": {**depth, "options": inverted},
+        "GaussCtrl": {**depth, "method": "gaussctrl", "options": inverted},
+        "GaussCtrl, random": {**depth, "method": "gaussctrl", "options": {"latents": "random"}},
+    }
+    values = dict(zip(variants, [0.1, 0.2, 0.3, 0.4], strict=True))
+
+    def sides(claim, measured):
+        content = study(
+            scenes=["one"], variants=variants, probes={"editing": list(variants)}, ablations=[]
+        )
+        run = written_runs.results(content, [edited(name, values[name]) for name in measured])
+        found = declared[f"{claim}-dino"].measure(run)
+        return found and {name: side.mean for name, side in found.sides.items()}
+
+    assert sides("over-gaussctrl", variants) == {"GaussCtrl": 0.3, "inverted": 0.2}
+    assert sides("over-gaussctrl", ["random", "GaussCtrl"]) == {"GaussCtrl": 0.3, "random": 0.1}
+    assert sides("over-gaussctrl-random", variants) == {"GaussCtrl, random": 0.4, "random": 0.1}
+    assert sides("over-gaussctrl-random", ["inverted", "GaussCtrl, random"]) is None
+
+
 WARPED, CONTROLLED = ["attention warping"], ["attention warping, ControlNet"]
 
 
@@ -434,6 +461,8 @@ def test_each_comparison_that_ships_has_both_sides_of_the_claims_about_methods(n
         ]
         if (name, labels) == ("comparison", ["IGS2GS"]):  # the first of them is the claim's
             labels = ["IGS2GS", "IGS2GS, 3000 iterations"]
+        if (claim, labels) == ("over-gaussctrl", CONTROLLED):  # GaussCtrl inverts
+            labels = [f"{CONTROLLED[0]}, inversion"] if name == "comparison" else []
         assert alike == labels
 
 

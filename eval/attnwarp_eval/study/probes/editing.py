@@ -43,7 +43,12 @@ from attnwarp_eval.study.edit_truth import (
     neighbours,
     planned_truth,
 )
-from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Job
+from attnwarp_eval.study.editing_methods import (
+    EDITING_METHODS,
+    EditedScene,
+    Job,
+    with_source_words,
+)
 from attnwarp_eval.study.hand_made import Kind, hand_made
 from attnwarp_eval.study.probes import editing_sections, register, sensitivity
 from attnwarp_eval.study.probes.base import Layout, Place, Probe, Work, metrics_of
@@ -119,7 +124,8 @@ class VariantPart(Part):
     """Keys of a variant that only this probe reads.
 
     ``options`` are fields of the method's settings, over the study's; ``preset`` among them names
-    its preset, else the variant's. ``mask: truth`` injects where the source truly sees the
+    its preset, else the variant's. ``{source}`` in ``source_prompt`` stands for the edit's
+    ``source`` words. ``mask: truth`` injects where the source truly sees the
     surface, ``geometry: truth`` warps by exact depth. ``budget`` cuts the method short.
     ``by_hand`` gives the method a source view that was edited by hand
     (:mod:`attnwarp_eval.study.hand_made`) instead of letting the editor edit it.
@@ -474,7 +480,7 @@ def run_method(
             [truth.originals[name] for name in names],
             editor,
             spec["edit"]["target" if editor.guide == "depth" else "instruction"],
-            spec["settings"],
+            with_source_words(spec["settings"], spec["edit"]["source"]),
             Path(folder),
             _warps(work, before, names),
             {a: [views[n] for n in names] for a, views in truth.answers.items()},

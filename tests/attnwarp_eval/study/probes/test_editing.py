@@ -417,6 +417,28 @@ def test_an_editor_of_depth_maps_gets_the_description_and_others_the_instruction
     assert words == [("depth", edit["target"]), ("picture", edit["instruction"])]
 
 
+@pytest.mark.parametrize("method", ["gaussctrl", "propagate"])
+def test_the_scenes_words_are_handed_to_an_inversion_that_asks_for_them(
+    method, folder, tmp_path, monkeypatch
+):
+    prompts = []
+
+    def run(job):
+        prompts.append(job.settings.get("source_prompt"))
+        return planned(["red"] * 4).run(job)
+
+    monkeypatch.setitem(
+        EDITING_METHODS, method, dataclasses.replace(EDITING_METHODS[method], run=run)
+    )
+    options = {"latents": "inversion", "source_prompt": "{source}, photographed"}
+    own = {"method": method, "editor": {"name": "small-depth"}, "options": options}
+    record = record_of(folder, tmp_path, editing={}, variants={"planned": own})
+    (edit,) = SCENE["edits"]
+    assert prompts == [f"{edit['source']}, photographed"]
+    # The words are the edit's, which the cell has beside them.
+    assert record.spec["settings"]["source_prompt"] == options["source_prompt"]
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
