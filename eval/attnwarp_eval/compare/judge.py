@@ -94,6 +94,7 @@ class Comparison:
         rows: one a (probe, variant, metric) that both sides have.
         faults: what fails without a figure.
         added: what only the run has; it passes until ``--update`` takes it into the baseline.
+        unread: probes that both sides have cells of, with figures none of which was compared.
     """
 
     study: str
@@ -102,6 +103,7 @@ class Comparison:
     rows: tuple[Row, ...]
     faults: tuple[Fault, ...]
     added: tuple[str, ...] = field(default=())
+    unread: tuple[str, ...] = field(default=())
 
     @property
     def regressed(self) -> bool:
@@ -117,6 +119,11 @@ class Comparison:
             return (
                 f"the seeds differ, and a test over {self.scenes} scenes says nothing; expected at"
                 f" least {FEWEST_SCENES}, or the baseline's seeds"
+            )
+        if self.unread:
+            return (
+                f"both sides share no gated figure of {', '.join(map(repr, self.unread))}; write a"
+                " baseline of earlier code anew with --update, or gate on a study without it"
             )
         return ""
 
@@ -155,7 +162,9 @@ def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
     rows = _rows(left, right, exact)
     scenes = [row.difference.scenes for row in rows if probe_of(row.probe).needs_scenes]
     most = max(scenes, default=0)
-    return Comparison(run.study, exact, most, rows, tuple(faults), tuple(added))
+    both = {probe for _, probe, *_ in left.keys() & right.keys()}
+    unread = sorted(name for name in both - {r.probe for r in rows} if probe_of(name).metrics)
+    return Comparison(run.study, exact, most, rows, tuple(faults), tuple(added), tuple(unread))
 
 
 def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:

@@ -45,8 +45,10 @@ def summary(comparison: Comparison) -> str:
     text = ", ".join(f"{counts[name]} {name}" for name in ORDER)
     if comparison.regressed:
         outcome = "regression"
+    elif comparison.too_little:
+        outcome = f"{'too little' if comparison.rows else 'nothing'} to compare"
     else:
-        outcome = "nothing to compare" if comparison.too_little else "pass"
+        outcome = "pass"
     return f"{outcome}: {text}; {len(comparison.faults)} missing or changed"
 
 

@@ -13,6 +13,7 @@ import tarfile
 
 import numpy as np
 import pytest
+import written_runs
 from scipy import stats
 from typer.testing import CliRunner
 
@@ -21,13 +22,18 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
 from attnwarp_eval.compare.judge import FEWEST_SCENES
-from attnwarp_eval.compare.snapshot import Figure, Measured, definition
-from attnwarp_eval.compare.write import document
+from attnwarp_eval.compare.snapshot import Figure, Measured, definition, snapshot
+from attnwarp_eval.compare.write import document, summary
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study.edit_truth import Judgement
+from attnwarp_eval.study.probes import probes
+from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.probes.variability import Varied
 from attnwarp_eval.study.run import plan
 
+DONE = Judgement("red", True, 25.0, 10.0, 10.0)
 DATA = pathlib.Path(__file__).parents[1] / "data" / "runs.tar.xz"
 
 
@@ -469,8 +475,8 @@ def test_hard_cases_are_no_scenes():
             Measured(f"case{i}", "stability", ("cpu",), 0, "same", {},
                      {"stability.margin": Figure(1, {"1": 2.0})}) for i in range(8)
         )  # fmt: skip
-        snapshot = errors({seed: value}, scenes)
-        return dataclasses.replace(snapshot, cells=snapshot.cells + cases)
+        scenes_only = errors({seed: value}, scenes)
+        return dataclasses.replace(scenes_only, cells=scenes_only.cells + cases)
 
     few = compare(with_cases(0, 0.01, 3), with_cases(1, 0.9, 3))
     assert "a test over 3 scenes says nothing" in few.too_little
@@ -485,6 +491,104 @@ def test_nothing_in_common_is_exit_code_3(stored, tmp_path):
     write_baseline(tmp_path / "empty.jsonl", empty)
     done = gate(tmp_path / "empty.jsonl", run)
     assert done.exit_code == 3 and "share no gated figure" in done.stderr
+
+
+EDITED = {
+    "multiview.same_answer.edit": 1.0,
+    "multiview.same_answer.edit_seen": 1.0,
+    "multiview.delta_e_above.edit_inside": 2.0,
+    "multiview.delta_e_above.edit_next": -1.0,
+    "multiview.delta_e_above.render_inside": 3.0,
+    "fidelity.mse.edit_inside": 0.01,
+    "fidelity.mse.render_inside": 0.02,
+    "fidelity.preserved_psnr.edit": 40.0,
+    "embedding.clip_directional.render": 0.2,
+    "embedding.dino_image.render": 0.9,
+    "image.psnr.edit_render": 30.0,
+    "depth.abs_rel.after": 0.01,
+}
+
+
+def edited(figures, probe="editing", seconds=None):
+    """A calibrated run of one edit of one scene."""
+    study = {"name": "edits", "scenes": ["ball"], "seeds": [1, 2], "variants": {"ours": {}},
+             "probes": {probe: ["ours"]}}  # fmt: skip
+    extra = {
+        "editing": EditResult("red", "make it red", DONE, DONE, {}, {}, 30.0, 2, 1.0),
+        "variability": Varied("red", "make it red", (1, 2), ("red", "red")),
+    }[probe].to_json()
+    spec = {"budget": {"seconds": seconds}} if seconds else {}
+    cells = [
+        written_runs.outcome("calibration", "ball", ["calibration"], written_runs.record(
+            [("yaw015", 15.0, {"warp.epe_median": 0.1})])),
+        written_runs.outcome(probe, "ball", ["ours"], written_runs.record(
+            [("red/yaw015", 15.0, figures)], spec=spec, **extra)),
+    ]  # fmt: skip
+    return snapshot(written_runs.results(study, cells))
+
+
+def test_an_edit_that_got_worse_in_any_figure_is_a_regression():
+    before = edited(EDITED)
+    assert not compare(before, before).regressed
+    for key, value in EDITED.items():
+        sign = -1 if METRICS[key].direction == "higher" else 1
+        result = compare(before, edited(EDITED | {key: value + sign * max(0.1, 0.1 * abs(value))}))
+        worse = [(row.probe, row.metric) for row in result.rows if row.verdict == "worse"]
+        assert worse == [("editing", key)] and result.regressed
+        left = {k: v for k, v in EDITED.items() if k != key}
+        (fault,) = compare(before, edited(left)).faults
+        assert (fault.kind, fault.name) == ("missing", f"ball / editing / ours / seed 0 / {key}")
+
+
+def test_views_of_a_seed_that_agree_less_are_a_regression():
+    before, after = (edited({"variability.within": v, "variability.between": 9.0}, "variability")
+                     for v in (2.0, 3.0))  # fmt: skip
+    assert compare(before, after).regressed and not compare(after, before).regressed
+
+
+def test_a_probe_of_which_nothing_was_compared_is_too_little():
+    # A count has no better direction; seconds of the machine decide what a limited method gives.
+    for figures, seconds in (({"multiview.views": 3.0}, None), (EDITED, 5.0)):
+        side = edited(figures, seconds=seconds)
+        result = compare(side, side)
+        assert result.rows and not result.regressed
+        assert result.too_little.startswith("both sides share no gated figure of 'editing'")
+        assert summary(result).startswith("too little to compare: 0 worse")
+    assert not compare(edited(EDITED), edited(EDITED)).too_little
+
+
+STANDS_IN = {
+    "depth.rmse": "depth.abs_rel",
+    "depth.bias_median": "depth.bias_relative",
+    "depth.delta_1_25": "depth.delta_1_01",
+    "occlusion.f1": "occlusion.precision",
+    "fit.psnr": "fit.mse",
+}
+"""Headline figures that move with a gated one of the same pixels."""
+
+
+def headlines(probe):
+    for key in (*probe.columns.values(), *probe.contrasts):
+        whole = key.format(layer=64).removesuffix(".interior").removesuffix(".edge")
+        yield STANDS_IN.get(whole, whole.replace("fidelity.psnr.", "fidelity.mse."))
+
+
+def test_every_headline_figure_is_gated_and_every_gate_is_a_figure_of_a_probe(stored):
+    keys = {key for probe in probes() for key in headlines(probe)}
+    assert len(keys) > 20
+    assert [key for key in keys if not gated(key)] == []
+    keys |= {
+        key
+        for cell in Store(stored / "variants").done()
+        for view in Store(stored / "variants").read(cell)["views"]
+        for key in view["metrics"]
+    }
+    # Claims and the tests of these probes read the rest.
+    elsewhere = {
+        "fidelity.ssim", "fidelity.preserved_psnr", "embedding.clip_similarity",
+        "variability.within", "stability.margin",
+    }  # fmt: skip
+    assert GATES.keys() - {METRICS[key].name for key in keys if gated(key)} == elsewhere
 
 
 def test_every_gate_is_a_registered_metric_with_a_direction_and_a_wider_margin():

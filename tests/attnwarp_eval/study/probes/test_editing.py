@@ -18,6 +18,8 @@ from torch_threads import on_one_thread
 from attnwarp.baselines import Budget
 from attnwarp.encoders.bundled import WEIGHTS
 from attnwarp_eval.compare.snapshot import read_snapshot
+from attnwarp_eval.metrics.gates import gated
+from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
@@ -99,6 +101,11 @@ def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_
     assert figure(record, "depth.abs_rel.before") == pytest.approx(
         figure(record, "depth.abs_rel.after"), rel=0.2
     )
+    # Without encoders; docs/gate.md.
+    assert {METRICS[key].name for key in record.views[0].metrics if gated(key)} == {
+        "multiview.delta_e_above", "multiview.same_answer", "fidelity.mse", "fidelity.ssim",
+        "fidelity.preserved_psnr", "image.psnr", "depth.abs_rel",
+    }  # fmt: skip
 
 
 def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import yaml
 from ball_scene import COLORS, SCENE
 from skimage.color import deltaE_ciede2000, rgb2lab
 
+from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
@@ -123,6 +124,8 @@ def test_views_that_differ_within_a_seed_disagree_and_others_do_not(measured):
 
 def test_answers_and_the_reports_words_follow_the_plan(measured):
     records, root = measured
+    keys = records["by seed"].views[0].metrics
+    assert [key for key in keys if gated(key)] == ["variability.within"]
     assert records["by seed"].extra.answers == tuple(NAMES[seed % 3] for seed in SEEDS)
     assert records["always red"].extra.answers == ("red",) * 3
     report = (root / "report.md").read_text()
