@@ -5,7 +5,7 @@ from __future__ import annotations
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import Interval, Ratio, interval
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Interval, Ratio, interval
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
@@ -80,7 +80,7 @@ def _in_turn(timed: Timed) -> str:
         f"All contestants ran in turn in one process, {first.rounds} rounds in an order drawn"
         f" anew each round, on {of} with {first.threads} renderer"
         f" thread{'s' if first.threads != 1 else ''}; a ratio is the median over rounds of the"
-        " ratio to the first contestant within a round, with a bootstrap interval over rounds."
+        f" ratio to the first contestant within a round; {RATIO_INTERVAL}"
         " The row `again` is the first contestant against itself: what noise alone does on this"
         " machine. Inside that band, or its mirror image about 1, nothing is called faster or"
         " slower."

@@ -225,6 +225,50 @@ def test_ratios_taken_in_turn_see_through_a_machine_that_drifts():
     assert (same.ratio, same.low, same.high) == (1, 1, 1)
 
 
+def covered(rounds, runs, seed, scenes=1):
+    """How often the interval holds the true ratio of 1.25, where a tenth of the rounds has a hiccup
+    on either side.
+    """
+    rng = np.random.default_rng(seed)
+
+    def seconds(true):
+        hiccups = np.where(rng.random((scenes, rounds)) < 0.1, 3.0, 1.0)
+        return true * hiccups * rng.lognormal(0, 0.05, (scenes, rounds))
+
+    results = [time_ratio(seconds(1.25), seconds(1.0)) for _ in range(runs)]
+    return sum(result.low < 1.25 < result.high for result in results)
+
+
+@pytest.mark.parametrize("rounds", [7, 9])
+def test_ratios_of_few_rounds_hold_the_truth_as_often_as_they_say(rounds):
+    # 0.1 % that an interval with this coverage fails.
+    assert covered(rounds, 200, rounds) >= stats.binom.ppf(0.001, 200, 0.95)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenes", [1, 3])
+@pytest.mark.parametrize("rounds", [6, 7, 9])
+def test_ratios_hold_the_truth_as_often_as_they_say_over_many_runs(rounds, scenes):
+    assert covered(rounds, 2000, rounds, scenes) >= stats.binom.ppf(0.001, 2000, 0.95)
+
+
+def test_the_interval_of_a_ratio_is_the_sign_tests():
+    # A value with so many of 15 rounds below it is not rejected as their median by SciPy's test.
+    logs = np.random.default_rng(3).normal(size=15)
+    result = time_ratio([np.exp(logs)], [np.ones(15)])
+    below = [count for count in range(16) if stats.binomtest(count, 15).pvalue > 0.05]
+    expected = np.sort(logs)[[below[0] - 1, below[-1]]]
+    assert np.log([result.low, result.high]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("rounds", [1, 3, 5])
+def test_few_rounds_have_no_interval(rounds):
+    # The range of five rounds holds the median in 1 - 2 / 2**5 = 94 % of cases.
+    assert not time_ratio([[2.0] * 6, [2.0] * rounds], [[1.0] * 6, [1.0] * rounds]).bounded
+    assert time_ratio([[2.0] * rounds], [[1.0] * rounds]).ratio == pytest.approx(2)
+    assert time_ratio([[2.0] * 6], [[1.0] * 6]).bounded
+
+
 def test_rounds_that_do_not_belong_together_are_refused():
     with pytest.raises(ValueError, match="same number of rounds"):
         time_ratio([[1.0, 2.0]], [[1.0]])

@@ -12,7 +12,7 @@ import numpy as np
 from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.experiments.accuracy.earlier import check_overwriting, with_earlier
 from attnwarp_eval.experiments.accuracy.panel import QUESTIONS, Panel
-from attnwarp_eval.statistics.intervals import Ratio
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Ratio
 from attnwarp_eval.study.store import Store
 
 
@@ -78,7 +78,7 @@ def write(panels: Sequence[Panel], out: Path) -> list[Path]:
         (
             "All contestants of a scene ran in turn in one process, in an order drawn anew each"
             " round. A ratio is the median over rounds of the ratio to the first row within a"
-            " round, with a 95 % bootstrap interval over rounds. The row `again` is the first row"
+            f" round; {RATIO_INTERVAL} The row `again` is the first row"
             " against itself: what noise alone does."
         ),
         (

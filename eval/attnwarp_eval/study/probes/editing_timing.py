@@ -18,7 +18,7 @@ from attnwarp_eval.cost import AGAIN, Meter, in_turn
 from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.statistics.intervals import Ratio, time_ratio
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Ratio, time_ratio
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import planned_truth
 from attnwarp_eval.study.probes import editing, register
@@ -225,7 +225,7 @@ class EditingTimingProbe(Probe[Rounds]):
             (
                 f"Seconds of one whole edit, {timed.turns[0].rounds} rounds of each variant in one"
                 f" process, in turn: {', '.join(turn.of for turn in timed.turns)}. Ratios are"
-                " medians over rounds of the ratio within a round, with a bootstrap interval. The"
+                f" medians over rounds of the ratio within a round; {RATIO_INTERVAL} The"
                 " row `again` is the first variant against itself: inside that band, or its mirror"
                 " image about 1, nothing is called faster or"
                 f" slower.{editing_text if control is not None else ''}"

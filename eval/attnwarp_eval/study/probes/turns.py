@@ -71,8 +71,12 @@ class Timed:
         return Interval(base * ratio.ratio, low, high, 1, 1, 0, nan, nan)
 
     def judge(self, ratio: Ratio) -> str:
-        """Faster or slower only outside the band that the baseline against itself spans."""
+        """Faster or slower only outside the band that the baseline against itself spans, and from
+        so many rounds on that there is one.
+        """
         noise = self.noise
+        if not (noise.bounded and ratio.bounded):
+            return f"can't tell ({min(turn.rounds for turn in self.turns)} rounds)"
         band = max(noise.high, 1 / noise.low, 1.0)
         if ratio.low > band:
             return "slower"
