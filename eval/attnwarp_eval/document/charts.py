@@ -285,8 +285,6 @@ def cost_front(
             continue
         on = i in on_front
         colour = PALETTE[0] if on else "#999999"
-        # Intervals that would cross zero cannot be drawn on logarithmic axes and are cut just above
-        # it.
         axes.errorbar(
             seconds.mean,
             quality.mean,
@@ -296,8 +294,8 @@ def cost_front(
             linewidth=0,
             elinewidth=0.8,
             capsize=2,
-            xerr=_bars(seconds),
-            yerr=_bars(quality),
+            xerr=_bars(seconds, True),
+            yerr=_bars(quality, log),
         )
         notes.append(
             axes.annotate(
@@ -344,8 +342,9 @@ def _move_apart(axes: Axes, notes: Sequence[Annotation]) -> None:
         settled.append(box)
 
 
-def _bars(value: Interval) -> list[list[float]] | None:
+def _bars(value: Interval, log: bool) -> list[list[float]] | None:
     if not value.bounded:
         return None
-    low = max(value.low, value.mean / 20)
+    # What crosses zero cannot be drawn on a logarithmic axis, and is cut just above it.
+    low = max(value.low, value.mean / 20) if log else value.low
     return [[max(value.mean - low, 0.0)], [max(value.high - value.mean, 0.0)]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from attnwarp_eval.statistics.intervals import Interval
+from attnwarp_eval.statistics.intervals import Interval, Ratio
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -53,3 +53,18 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     if not value.bounded:
         return number(value.mean) + note
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"
+
+
+def ratio_text(value: Ratio) -> str:
+    """A ratio of seconds with its 95 % interval, where it has one.
+
+    Args:
+        value: the ratio.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import time_ratio
+        >>> [ratio_text(time_ratio([[2.0] * n], [[1.0] * n])) for n in (6, 1)]
+        ['2.00 [2.00, 2.00]', '2.00']
+    """
+    text = number(value.ratio)
+    return f"{text} [{number(value.low)}, {number(value.high)}]" if value.bounded else text

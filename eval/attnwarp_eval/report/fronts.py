@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
-from attnwarp_eval.document.numbers import number, spread
-from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Interval, Ratio, interval
+from attnwarp_eval.document.numbers import number, ratio_text, spread
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Interval, interval
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
@@ -106,7 +106,7 @@ def _points(
         if timed is not None:
             base, ratio = name == timed.baseline, timed.ratio(name)
             seconds = timed.seconds(name)
-            text = "1" if base else _ratio(ratio)
+            text = "1" if base else ratio_text(ratio)
             judged = "baseline" if base else timed.judge(ratio)
         else:
             once = results.seconds(front.probe, name, probe(front.probe).cost)
@@ -123,9 +123,5 @@ def _points(
     if timed is not None:
         noise = timed.noise
         again = number(1000 * timed.base * noise.ratio)
-        rows.append(["again", "–", again, _ratio(noise), "–"])
+        rows.append(["again", "–", again, ratio_text(noise), "–"])
     return points, rows
-
-
-def _ratio(ratio: Ratio) -> str:
-    return f"{number(ratio.ratio)} [{number(ratio.low)}, {number(ratio.high)}]"

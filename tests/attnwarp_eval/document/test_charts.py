@@ -42,3 +42,15 @@ def test_lines_stand_where_their_numbers_are_or_apart_about_there(tmp_path, apar
         charts.lines(axes, series, x="seconds", y="dB", title="fits", **apart)
         for bars, shift in zip(axes.containers, shifts, strict=True):
             np.testing.assert_allclose(bars.lines[0].get_xdata(), [0.5 + shift, 1.0 + shift])
+
+
+@pytest.mark.parametrize(("log", "lowest"), [(False, -11.0), (True, 0.15)])
+def test_bars_of_a_front_are_whole_and_cut_on_logarithmic_axes_alone(tmp_path, log, lowest) -> None:
+    wide = Interval(3.0, -11.0, 17.0, scenes=2, views=9, undefined=0, detectable=0.1, p=0.5)
+    with charts.drawing(tmp_path / "front.svg") as (axes,):
+        points = {"wide": (around(1.0), wide)}
+        charts.cost_front(axes, points, x="seconds", y="error", title="front", log=log)
+        across, along = axes.containers[0].lines[2]
+        (bar,) = along.get_segments()
+        assert bar[:, 1] == pytest.approx([lowest, 17.0])
+        assert across.get_segments()[0][:, 0] == pytest.approx([0.9, 1.1])

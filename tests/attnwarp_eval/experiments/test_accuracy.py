@@ -122,6 +122,15 @@ def depth_panel(scene, wrong=0.25):
     return Panel("depth", scene, "largest relative error of depth", (slow, fast), (2.0, 2.2, 2.4))
 
 
+def test_the_bias_of_a_picture_has_students_interval(tmp_path):
+    seconds = (1.0, 1.1, 1.2, 1.1, 1.0, 1.1, 1.2)
+    more = {"bias": 0.001, "bias_error": 0.001}
+    one = Contestant("plan, 4 spp", (0.5, 0.4, 0.6), seconds, more)
+    write([Panel("pictures", "one", "RMS", (one,), seconds, (seconds,))], tmp_path)
+    # Of 7 rounds: t(0.975) with 6 degrees of freedom is 2.447 in any table.
+    assert "+0.10 % ± 0.24" in (tmp_path / "accuracy.md").read_text()
+
+
 def store_panel(folder, panel, **changes):
     """As a call does that measured it; the spec is written out, as former versions' cells are."""
     spec = {"probe": "accuracy", "protocol": 1, "question": panel.question, "scene": "a" * 64,
@@ -139,12 +148,7 @@ def test_what_was_measured_of_other_scenes_stays_and_tables_show_the_known_ratio
         store_panel(tmp_path, depth_panel(scene))
         assert tmp_path / "accuracy.html" in write([depth_panel(scene)], tmp_path)
     text = (tmp_path / "accuracy.md").read_text()
-    assert (
-        "**one**" in text
-        and "**two**" in text
-        and "0.500 [0.500, 0.500]" in text
-        and "25.00 %" in text
-    )
+    assert "**one**" in text and "**two**" in text and "| 0.500 |" in text and "25.00 %" in text
     assert "| again |" in text and (tmp_path / "depth.svg").is_file() and "Left out" not in text
     assert scenes_in(tmp_path) == ["one", "two"]
     # The file is made of the cells: what was written into it since does not count.

@@ -12,7 +12,7 @@ import numpy as np
 from attnwarp_eval.canonical_json import without_nan, write_json
 from attnwarp_eval.experiments.accuracy.earlier import check_overwriting, with_earlier
 from attnwarp_eval.experiments.accuracy.panel import QUESTIONS, Panel
-from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Ratio
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL
 from attnwarp_eval.study.store import Store
 
 
@@ -122,11 +122,10 @@ TITLES = {
 
 
 def _sections(panels: Sequence[Panel]) -> list[Any]:
-    from attnwarp_eval.document.model import Section, Table
-    from attnwarp_eval.document.numbers import number
+    from scipy import stats
 
-    def ratio(value: Ratio) -> str:
-        return f"{number(value.ratio)} [{number(value.low)}, {number(value.high)}]"
+    from attnwarp_eval.document.model import Section, Table
+    from attnwarp_eval.document.numbers import number, ratio_text
 
     sections = []
     for question, title in TITLES.items():
@@ -149,8 +148,9 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                     else f"{number(value)} [{number(low)}, {number(high)}]"
                 )
                 if question == "pictures":
-                    more = [f"{100 * c.more['bias']:+.2f} % ± {196 * c.more['bias_error']:.2f}",
-                            "1" if k == 0 else ratio(panel.at_equal_error(k))]  # fmt: skip
+                    half = 100 * c.more["bias_error"] * stats.t.ppf(0.975, len(c.seconds) - 1)
+                    more = [f"{100 * c.more['bias']:+.2f} % ± {half:.2f}",
+                            "1" if k == 0 else ratio_text(panel.at_equal_error(k))]  # fmt: skip
                 elif question == "depth":
                     more = [
                         f"{c.more['median']:.1e}",
@@ -163,7 +163,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                     error = f"{100 * value:.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
                 times = [
                     number(1000 * float(np.median(c.seconds))),
-                    "1" if k == 0 else ratio(panel.ratio(k)),
+                    "1" if k == 0 else ratio_text(panel.ratio(k)),
                 ]
                 rows.append([c.name, error, *more, *times])
             blank = ["–"] * (1 + len(extra))
@@ -172,7 +172,7 @@ def _sections(panels: Sequence[Panel]) -> list[Any]:
                     "again",
                     *blank,
                     number(1000 * float(np.median(panel.again))),
-                    ratio(panel.ratio(None)),
+                    ratio_text(panel.ratio(None)),
                 ]
             )
             section.tables.append(

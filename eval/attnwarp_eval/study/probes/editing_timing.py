@@ -16,9 +16,9 @@ from pydantic import Field
 
 from attnwarp_eval.cost import AGAIN, Meter, in_turn
 from attnwarp_eval.document.model import Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.numbers import number, ratio_text
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Ratio, time_ratio
+from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, time_ratio
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import planned_truth
 from attnwarp_eval.study.probes import editing, register
@@ -203,12 +203,12 @@ class EditingTimingProbe(Probe[Rounds]):
             base = name == timed.baseline
             to_control = "–"
             if control is not None and name != control:
-                to_control = _ratio(time_ratio(own.rounds(name), own.rounds(control)))
+                to_control = ratio_text(time_ratio(own.rounds(name), own.rounds(control)))
             rows.append(
                 [
                     name,
                     *_spread(timed.rounds(name)),
-                    "1" if base else _ratio(ratio),
+                    "1" if base else ratio_text(ratio),
                     "baseline" if base else timed.judge(ratio),
                     *(_spread(timed.of(part).rounds(name))[0] for part in PARTS),
                     to_control,
@@ -216,7 +216,7 @@ class EditingTimingProbe(Probe[Rounds]):
                 ]
             )
         rest = ["–"] * (len(PARTS) + 1 + len(COUNTERS))
-        rows.append(["again", *_spread(timed.rounds(None)), _ratio(timed.noise), "–", *rest])
+        rows.append(["again", *_spread(timed.rounds(None)), ratio_text(timed.noise), "–", *rest])
         editing_text = (
             f" Editing is {', '.join(editing.EDITING_PARTS)}, without tuning; {control!r} is its"
             " control."
@@ -238,7 +238,3 @@ def _spread(rounds: Sequence[Sequence[float]]) -> tuple[str, str]:
     """Median over cells and rounds; the lowest and the highest."""
     taken = [value for row in rounds for value in row]
     return number(statistics.median(taken)), f"{number(min(taken))} to {number(max(taken))}"
-
-
-def _ratio(ratio: Ratio) -> str:
-    return f"{number(ratio.ratio)} [{number(ratio.low)}, {number(ratio.high)}]"
