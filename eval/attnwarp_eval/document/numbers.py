@@ -32,6 +32,37 @@ def number(value: float | None, digits: int = 3) -> str:
     )
 
 
+def pooled(error: Interval, scenes: int | None = None) -> str:
+    """PSNR of a mean squared error, with the PSNRs of its interval's ends.
+
+    Args:
+        error: mean squared error of pictures in [0, 1]. 0 has an infinite PSNR; so has an end of
+            the interval that reaches below it.
+        scenes: as for :func:`spread`.
+
+    Example:
+        >>> from attnwarp_eval.statistics.intervals import interval
+        >>> pooled(interval({"bear": [0.01], "fence": [0.011], "glass": [0.009]}))
+        '20.0 [19.0, 21.2]'
+        >>> pooled(interval({"bear": [0.0], "fence": [0.02]}))  # of 0 and 0.02
+        '20.0 [8.63, inf]'
+    """
+    text = decibels(error.mean)
+    if error.bounded:
+        text += f" [{decibels(error.high)}, {decibels(error.low)}]"
+    return text + _note(error, scenes)
+
+
+def decibels(error: float) -> str:
+    """PSNR of a mean squared error of pictures in [0, 1]; a dash where it is NaN.
+
+    Example:
+        >>> decibels(0.01), decibels(0.0), decibels(float("nan"))
+        ('20.0', 'inf', '–')
+    """
+    return "inf" if error <= 0 else number(-10 * math.log10(error))
+
+
 def spread(value: Interval, scenes: int | None = None) -> str:
     """Mean ± half of the 95 % interval, with the number of undefined values.
 
@@ -46,10 +77,7 @@ def spread(value: Interval, scenes: int | None = None) -> str:
     """
     if not math.isfinite(value.mean):
         return "–"
-    notes = [f"{value.undefined} undefined"] if value.undefined else []
-    if scenes is not None and value.scenes < scenes:
-        notes.append(f"{value.scenes} of {scenes} scenes")
-    note = f" ({', '.join(notes)})" if notes else ""
+    note = _note(value, scenes)
     if not value.bounded:
         return number(value.mean) + note
     return f"{number(value.mean)} ± {number(value.high - value.mean, 2)}{note}"
@@ -68,3 +96,11 @@ def ratio_text(value: Ratio) -> str:
     """
     text = number(value.ratio)
     return f"{text} [{number(value.low)}, {number(value.high)}]" if value.bounded else text
+
+
+def _note(value: Interval, scenes: int | None) -> str:
+    """What a mean leaves out, in brackets."""
+    notes = [f"{value.undefined} undefined"] if value.undefined else []
+    if scenes is not None and value.scenes < scenes:
+        notes.append(f"{value.scenes} of {scenes} scenes")
+    return f" ({', '.join(notes)})" if notes else ""

@@ -63,8 +63,8 @@ def psnr(image: Any, target: Any, mask: Any = None) -> float:
     """-10 log10 of :func:`mse`, in dB: +inf where the pictures are equal, NaN for an empty mask.
 
     The error is divided by the pixels of the mask. Dividing by all pixels, with the others set to
-    0, gains -10 log10(coverage): 6.02 dB at 25 %. Never average PSNR over views, average MSE; see
-    :func:`edit_psnr`.
+    0, gains -10 log10(coverage): 6.02 dB at 25 %. The PSNR of several views is that of their mean
+    MSE; see :func:`edit_psnr`. A mean of decibels is another figure, which hides bad views.
 
     Args:
         image, target: (H, W, 3) float32 or float64, sRGB in [0, 1].

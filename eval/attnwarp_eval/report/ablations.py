@@ -17,9 +17,15 @@ from attnwarp_eval.statistics.intervals import (
     verdict,
 )
 from attnwarp_eval.study.probes import probe
-from attnwarp_eval.study.probes.base import mean_values
+from attnwarp_eval.study.probes.base import is_mse, mean_values
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Ablation
+
+POOLED = (
+    "PSNR, dB, is the mean over the views of their decibels; equal pictures, of infinite PSNR, are"
+    " left out of it as undefined. Pooled PSNR is that of the mean squared error over the views and"
+    " scenes, with those of the ends of its interval; equal pictures have error 0."
+)
 
 CLAIMED = "†"
 """Stands beside the p-value of a comparison that a claim makes."""
@@ -48,7 +54,12 @@ class Contrast:
 def ablations(results: Results) -> list[Section]:
     """A section for each ablation that the study names."""
     claimed = of_comparisons(judge(results, load_claims()))
-    return [_section(results, ablation, claimed) for ablation in results.study.ablations]
+    sections = [_section(results, ablation, claimed) for ablation in results.study.ablations]
+    for section, ablation in zip(sections, results.study.ablations, strict=True):
+        if any(map(is_mse, probe(ablation.probe).columns.values())):
+            section.text.append(POOLED)
+            break
+    return sections
 
 
 def _section(results: Results, ablation: Ablation, claimed: Mapping[Comparison, float]) -> Section:

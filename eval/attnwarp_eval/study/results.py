@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -70,6 +70,15 @@ class Shared:
                 f" with most: {', '.join(self.apart)}."
             )
         return [text]
+
+
+def _value(figures: Mapping[str, float], metric: str) -> float:
+    """A figure of a view, NaN without one. Former cells recorded some PSNRs without their mean
+    squared errors, which follow.
+    """
+    if metric not in figures and "mse" in metric:
+        return float(10 ** (-figures.get(metric.replace("mse", "psnr"), math.nan) / 10))
+    return figures.get(metric, math.nan)
 
 
 def _count(table: ByView) -> int:
@@ -154,7 +163,7 @@ class Results:
         for scene, seed, record in self.records(probe, variant):
             for view in record.views:
                 if yaw is None or yaw[0] <= view.yaw <= yaw[1]:
-                    value = view.metrics.get(metric, math.nan)
+                    value = _value(view.metrics, metric)
                     table.setdefault(scene, {})[f"{view.name}/{seed}"] = float(value)
         return table
 

@@ -121,6 +121,37 @@ def test_an_ablation_table_shows_means_differences_and_verdicts():
     assert row[6] == "3, 6"
 
 
+@pytest.mark.parametrize(
+    ("views", "mean", "pooled"),
+    [
+        # Equal pictures: a record has no infinite number, and their error says what they are.
+        ([(20.0, 0.01), (None, 0.0)], "20.0 (1 undefined)", 0.005),
+        ([(20.0, 0.01), (None, None)], "20.0 (1 undefined)", 0.01),
+        # Former cells recorded the PSNR alone.
+        ([(20.0,), (10.0,)], "15.0", (0.01 + 0.1) / 2),
+        ([(None, 0.0), (None, 0.0)], "–", 0.0),
+    ],
+)
+def test_a_pooled_psnr_is_that_of_the_views_mean_error(views, mean, pooled):
+    names = ("image.psnr.edit_render", "image.mse.edit_render")
+    figures = [(f"edit/v{i}", 0.0, dict(zip(names, v))) for i, v in enumerate(views)]  # noqa: B905
+    judgement = Judgement("red", True, 20.0, 10.0, 10.0)
+    extra = EditResult("red", "paint it red", judgement, judgement, {}, {}, 30.0, 2, 0.0)
+    data = written_runs.record(figures, **extra.to_json())
+    cell = written_runs.outcome("editing", "one", ["mine"], data)
+    content = {
+        **study(variants={"mine": {}, "other": {}}, probes={"editing": ["mine", "other"]}),
+        "ablations": [
+            {"title": "Mine", "baseline": "mine", "variants": ["other"], "probe": "editing"}
+        ],
+    }
+    (section,) = ablations(written_runs.results({**content, "scenes": ["one"]}, [cell]))
+    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
+    assert row["Edit PSNR, dB"] == mean
+    shown = float(row["Edit PSNR, pooled"].split()[0])
+    assert shown == (math.inf if pooled == 0 else pytest.approx(-10 * math.log10(pooled), rel=5e-3))
+
+
 def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_part_in_their_family():
     """Oracle: scipy's t test of the scenes' differences, adjusted by hand (Benjamini, Hochberg)."""
     recall, precision = "occlusion.recall", "occlusion.precision"

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from attnwarp_eval.cost import Meter
 from attnwarp_eval.document.model import Finding, Section, Table
-from attnwarp_eval.document.numbers import spread
+from attnwarp_eval.document.numbers import pooled, spread
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.metrics.registry import METRICS, Metric, Registry
 from attnwarp_eval.scene.scene import Scene
@@ -306,6 +306,16 @@ def metrics_of(*prefixes: str) -> Registry:
 
 
 def mean_values(results: Results, probe: str, name: str, metrics: Iterable[str]) -> list[str]:
-    """Cells of a table: the means over scenes of a variant's metrics, with their intervals."""
+    """Cells of a table: the means over scenes of a variant's metrics, with their intervals. A mean
+    squared error is shown in decibels, as a pooled PSNR.
+    """
     scenes = len(results.study.scenes)
-    return [spread(results.mean(probe, name, metric), scenes) for metric in metrics]
+    return [
+        (pooled if is_mse(metric) else spread)(results.mean(probe, name, metric), scenes)
+        for metric in metrics
+    ]
+
+
+def is_mse(metric: str) -> bool:
+    """Whether a figure is the mean squared error behind a PSNR."""
+    return "mse" in metric.split(".")[1].split("_")

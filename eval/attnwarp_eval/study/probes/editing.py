@@ -205,8 +205,11 @@ class EditingProbe(Probe[EditResult]):
         "... of neighbours": "multiview.delta_e_above.edit_next",
         "... in renders": "multiview.delta_e_above.render_inside",
         "PSNR to truth inside, dB": "fidelity.psnr.edit_inside",
+        "... inside, pooled": "fidelity.mse.edit_inside",
         "PSNR of renders, dB": "fidelity.psnr.render_inside",
+        "... of renders, pooled": "fidelity.mse.render_inside",
         "Edit PSNR, dB": "image.psnr.edit_render",
+        "Edit PSNR, pooled": "image.mse.edit_render",
         "CLIP direction": "embedding.clip_directional.render",
         "CLIP image": "embedding.clip_image.render",
         "DINO image": "embedding.dino_image.render",
@@ -576,9 +579,10 @@ class _Measure:
             # Sampled splats lie on surfaces: the sky has none.
             {name: self._hits(name).valid for name in both},
         )
-        errors = dict(zip(psnr.views, psnr.psnr, strict=True))
+        errors = dict(zip(psnr.views, zip(psnr.psnr, psnr.mse, strict=True), strict=True))
         for name, row in figures.items():
-            row["image.psnr.edit_render"] = errors.get(name, math.nan)
+            decibels, error = errors.get(name, (math.nan, math.nan))
+            row |= {"image.psnr.edit_render": decibels, "image.mse.edit_render": error}
             row |= embedded[name]
             row |= self._depth(name)
             edit = work.spec["edit"]["name"]
@@ -611,7 +615,10 @@ class _Measure:
             )
             for key in FIDELITY
             for place in ("", "_inside")
-        } | {f"fidelity.preserved_psnr.{kind}": figures.get("fidelity.preserved_psnr", math.nan)}
+        } | {
+            f"fidelity.{key}.{kind}": figures.get(f"fidelity.{key}", math.nan)
+            for key in ("preserved_psnr", "preserved_mse")
+        }
 
     def _agreement(self, kind: str, name: str, answer: str | None) -> dict[str, float]:
         """Of a target with the source, and with its neighbour; NaN where it was not edited or the

@@ -12,10 +12,10 @@ from typing import Any
 
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
-from attnwarp_eval.document.numbers import number, spread
+from attnwarp_eval.document.numbers import decibels, number, pooled, spread
 from attnwarp_eval.metrics.multiview import BELOW_FLOOR
 from attnwarp_eval.statistics.intervals import Interval, common, interval
-from attnwarp_eval.study.probes.base import Layout
+from attnwarp_eval.study.probes.base import Layout, is_mse
 from attnwarp_eval.study.probes.turns import timed_in_turn
 from attnwarp_eval.study.record import PictureFile
 from attnwarp_eval.study.results import Results
@@ -34,6 +34,7 @@ BY_SCENE = {
     "multiview.delta_e_above.edit_next": "Disagreement of neighbouring views above its floor, dE00",
     "multiview.delta_e_above.render_inside": "Disagreement of renders above its floor, dE00",
     "fidelity.psnr.edit_inside": "PSNR to the true edit inside the object, dB",
+    "fidelity.mse.edit_inside": "The same, pooled: of the mean squared error over the views, dB",
     "depth.abs_rel.before": "AbsRel of the splats' depth before the edit",
     "depth.abs_rel.after": "AbsRel of the splats' depth after tuning",
 }
@@ -217,7 +218,8 @@ def by_scene(results: Results, probe: str, names: Sequence[str]) -> Section:
         for name in measured:
             table = _lists(results.views(probe, name, metric))
             means = [interval({s: table.get(s, [])}).mean for s in scenes]
-            rows.append([name, *(number(value) for value in means), spread(interval(table))])
+            one, overall = (decibels, pooled) if is_mse(metric) else (number, spread)
+            rows.append([name, *map(one, means), overall(interval(table))])
         tables.append(Table(["variant", *scenes, "all scenes"], rows, title))
     tables.insert(0, _ratios(results, probe, measured))
     tables += _injected(results, probe, measured)

@@ -127,6 +127,7 @@ class Fit(Probe[Curve]):
     metrics = metrics_of("fit.", "depth.")
     columns: ClassVar[Mapping[str, str]] = {
         "PSNR, dB": "fit.psnr",
+        "PSNR, pooled": "fit.mse",
         "SSIM": "fit.ssim",
         "AbsRel": "depth.abs_rel",
         "AbsRel inside": "depth.abs_rel.interior",

@@ -92,6 +92,12 @@ def test_true_pictures_have_the_highest_fidelity_the_least_disagreement_and_one_
     assert record.extra.source.done
     assert figure(record, "multiview.same_answer.edit") == [1, 1, 1]
     assert max(figure(record, "fidelity.mse.edit")) <= ROUNDING**2
+    decibels = [name for name in record.views[0].metrics if "psnr" in name]
+    assert {name.split(".")[1] for name in decibels} == {"psnr", "preserved_psnr"}
+    for name in decibels:
+        errors = np.array(figure(record, name.replace("psnr", "mse")))
+        with np.errstate(divide="ignore"):
+            np.testing.assert_allclose(figure(record, name), -10 * np.log10(errors))
     # Rounding by half a step moves a mean CIEDE2000 of these colours by less than 0.3.
     above = [v for v in figure(record, "multiview.delta_e_above.edit_inside") if not math.isnan(v)]
     assert above
