@@ -43,6 +43,8 @@ class Claim:
     expect: Literal["higher", "lower"]
     b: Mapping[str, Any] | None = None
     or_b: Mapping[str, Any] | None = None
+    against: float = 0.0
+    than: str = ""
     yaw: tuple[float, float] | None = None
     compare_yaw: tuple[tuple[float, float], tuple[float, float]] | None = None
     source: str = ""
@@ -93,12 +95,17 @@ class Claim:
                 metric, {name: _interval(t) for name, t in tables.items()}, means[0], means[1]
             )
         first = results.views(self.probe, a, metric, self.yaw)
+        if b is None and not self.than:
+            limit = {s: dict.fromkeys(views, self.against) for s, views in first.items()}
+            return Measured(metric, {a: _interval(first)}, limit, first)
         if b is None:
-            zero = {scene: dict.fromkeys(views, 0.0) for scene, views in first.items()}
-            return Measured(metric, {a: _interval(first)}, zero, first)
-        second = results.views(self.probe, b, metric, self.yaw)
+            names = (f"{a}, {self.than}", f"{a}, {metric}")
+            first, second = results.views(self.probe, a, self.than, self.yaw), first
+        else:
+            names = (a, b)
+            second = results.views(self.probe, b, metric, self.yaw)
         # Over the views that both have: only there is the difference of the means the claim's.
-        sides = dict(zip((a, b), map(_interval, common([first, second])), strict=True))
+        sides = dict(zip(names, map(_interval, common([first, second])), strict=True))
         return Measured(metric, sides, first, second)
 
 
@@ -293,7 +300,8 @@ def claims(results: Results) -> Section:
     for finding in findings:
         claim = finding.claim
         sides = "; ".join(f"{name}: {spread(value)}" for name, value in finding.sides.items())
-        contrast = spread(finding.contrast) if len(finding.sides) > 1 else "against 0"
+        alone = len(finding.sides) == 1
+        contrast = f"against {number(claim.against)}" if alone else spread(finding.contrast)
         agree, views = finding.agreement
         rows.append(
             [

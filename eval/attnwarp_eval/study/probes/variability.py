@@ -19,9 +19,9 @@ import numpy.typing as npt
 from attnwarp.propagate.pictures import enlarged_change
 from attnwarp_eval import metrics
 from attnwarp_eval.document.model import Gallery, Picture, Section, Table
-from attnwarp_eval.document.numbers import number
+from attnwarp_eval.document.numbers import spread
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.statistics.intervals import interval
+from attnwarp_eval.statistics.intervals import ByView, Interval, interval
 from attnwarp_eval.study import pictures
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.edit_truth import EditTruth, neighbours, planned_truth
@@ -120,6 +120,14 @@ class VariabilityProbe(Probe[Varied]):
                     {"editor": editing.editor_of(study, variant).name},
                 )  # fmt: skip
 
+    def meaning(self, study: Study, variant: Variant) -> tuple[Any, ...]:
+        """Those of a method of editing."""
+        return editing.EditingProbe().meaning(study, variant)
+
+    def alike(self, study: Study, variant: Variant, wanted: Variant) -> bool:
+        """As for editing: a claim may leave a method's own settings out."""
+        return editing.EditingProbe().alike(study, variant, wanted)
+
     def compute(self, work: Work) -> Varied:
         """Edit the scene with every seed, then compare the views of a seed and of all seeds."""
         spec, world, meter = work.spec, work.world, work.meter
@@ -198,28 +206,33 @@ class VariabilityProbe(Probe[Varied]):
             yield Place.RESULT, self._table(results)
 
     def _table(self, results: Results) -> Section:
+        seeds, scenes = len(results.study.seeds), len(results.study.scenes)
+        columns = [
+            "variant",
+            "change",
+            "variety between seeds",
+            "disagreement within a seed",
+            f"the same less {AGREES:g} of the variety",
+            f"answers, of {seeds} seeds",
+            "so",
+        ]
         rows = []
         for name in results.study.variants:
             records = results.records(self.name, name)
             if not records:
                 continue
             change, between, within, floor = (
-                interval(_lists(results.views(self.name, name, metric))).mean
+                results.views(self.name, name, metric)
                 for metric in (CHANGE, BETWEEN, WITHIN, FLOOR)
             )
-            answers = [len(set(record.extra.answers) - {None}) for _, _, record in records]
-            verdict = described(change, between, within - floor)
-            rows.append(
-                [
-                    name,
-                    number(change),
-                    number(between),
-                    number(within - floor),
-                    number(sum(answers) / len(answers)),
-                    verdict,
-                ]
-            )
-        seeds = len(results.study.seeds)
+            disagreement = _less(within, floor)
+            excess = _less(disagreement, between, AGREES)
+            figures = [interval(_lists(table)) for table in (change, between, disagreement, excess)]
+            answers: dict[str, list[float]] = {}
+            for scene, _, record in records:
+                answers.setdefault(scene, []).append(len(set(record.extra.answers) - {None}))
+            shown = [spread(value, scenes) for value in (*figures, interval(answers))]
+            rows.append([name, *shown, described(figures[0], figures[1], figures[3])])
         text = [
             (
                 f"Mean CIEDE2000 inside the edited object, {seeds} seeds, edited views. **Change**:"
@@ -231,17 +244,11 @@ class VariabilityProbe(Probe[Varied]):
             (
                 f"A variety below {NOTICED:g} is not noticed: the method always makes the same. A"
                 " method is to vary between seeds and to agree within one. Where the disagreement"
-                f" within a seed is at least {AGREES:g} of the variety, it varies within a seed"
-                " too; views drawn one by one have a ratio of about 1."
+                f" within a seed is above {AGREES:g} of the variety, it varies within a seed"
+                " too; views drawn one by one have a ratio of about 1. Each word needs a 95 %"
+                " interval over scenes that lies on one side of its limit, so of one scene nothing"
+                " is told."
             ),
-        ]
-        columns = [
-            "variant",
-            "change",
-            "variety between seeds",
-            "disagreement within a seed",
-            f"answers, of {seeds} seeds",
-            "so",
         ]
         return Section("Variety between seeds, agreement within one", text, [Table(columns, rows)])
 
@@ -261,28 +268,46 @@ class VariabilityProbe(Probe[Varied]):
         return Section("Seeds side by side", text, gallery=Gallery(rows))
 
 
-def described(change: float, between: float, within: float) -> str:
-    """What a method does, in words.
+def described(change: Interval, between: Interval, excess: Interval) -> str:
+    """What a method does, in words, as far as the intervals tell.
 
     Args:
         change: CIEDE2000 of the views before and after the edit.
         between: of the same view in two seeds.
-        within: of neighbouring views of a seed, above that before the edit.
+        excess: of neighbouring views of a seed, above that before the edit, less
+            :data:`AGREES` of ``between``.
 
-    >>> described(20.0, 0.2, 0.5), described(20.0, 12.0, 2.0), described(20.0, 12.0, 12.5)
-    ('always the same', 'varies, and agrees within a seed', 'varies, within a seed too')
-    >>> described(0.3, 0.0, 0.0)
-    'changes nothing'
+    >>> several = interval({"bear": [12.0], "face": [14.0]})  # 13 ± 13
+    >>> of_one = interval({"bear": [12.0]})
+    >>> described(several, several, several), described(of_one, of_one, of_one)
+    ("can't tell", "can't tell")
     """
-    if not math.isfinite(change) or not math.isfinite(between):
-        return "–"
-    if change < NOTICED:
+    if (changes := _above(change, NOTICED)) is None:
+        return "can't tell"
+    if not changes:
         return "changes nothing"
-    if between < NOTICED:
+    if (varies := _above(between, NOTICED)) is None:
+        return "can't tell whether it varies"
+    if not varies:
         return "always the same"
-    if math.isfinite(within) and within >= AGREES * between:
-        return "varies, within a seed too"
-    return "varies, and agrees within a seed"
+    if (disagrees := _above(excess, 0.0)) is None:
+        return "varies, can't tell whether within a seed too"
+    return "varies, within a seed too" if disagrees else "varies, and agrees within a seed"
+
+
+def _above(value: Interval, limit: float) -> bool | None:
+    """On which side of a limit an interval lies; None if on both, or without bounds."""
+    if not value.bounded or value.low <= limit <= value.high:
+        return None
+    return value.low > limit
+
+
+def _less(a: ByView, b: ByView, factor: float = 1.0) -> dict[str, dict[str, float]]:
+    """a - factor * b by scene and view, for two figures of the same cells."""
+    return {
+        scene: {view: x - factor * b[scene][view] for view, x in views.items()}
+        for scene, views in a.items()
+    }
 
 
 def _difference(a: Image, b: Image, mask: npt.NDArray[np.bool_]) -> float:

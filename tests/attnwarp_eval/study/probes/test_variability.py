@@ -4,17 +4,20 @@ import math
 
 import numpy as np
 import pytest
+import written_runs
 import yaml
 from ball_scene import COLORS, SCENE
 from skimage.color import deltaE_ciede2000, rgb2lab
 
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.report import write_report
+from attnwarp_eval.report.claims import judge, load_claims
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import probe
+from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.run import execute, plan
 
 VIEWS = ("source", "yaw015", "yaw030", "yaw120")
@@ -122,7 +125,7 @@ def test_views_that_differ_within_a_seed_disagree_and_others_do_not(measured):
     assert within and min(within) > 20
 
 
-def test_answers_and_the_reports_words_follow_the_plan(measured):
+def test_answers_follow_the_plan_and_one_scene_tells_nothing_in_general(measured):
     records, root = measured
     keys = records["by seed"].views[0].metrics
     assert [key for key in keys if gated(key)] == ["variability.within"]
@@ -130,13 +133,82 @@ def test_answers_and_the_reports_words_follow_the_plan(measured):
     assert records["always red"].extra.answers == ("red",) * 3
     report = (root / "report.md").read_text()
     rows = {line.split(" | ")[0][2:]: line for line in report.splitlines() if line.startswith("| ")}
-    assert rows["always red"].endswith("| always the same |")
-    assert rows["nothing"].endswith("| changes nothing |")
-    assert rows["by seed"].endswith("| varies, and agrees within a seed |")
-    assert rows["by view"].endswith("| varies, within a seed too |")
+    assert all(rows[name].endswith("| can't tell |") for name in PLANS)
     pictures = {p.content for p in records["by seed"].pictures}
     assert pictures == {"before", "seed-3", "seed-4", "seed-5"}
     assert "Seeds side by side" in report
+
+
+SCENES = ("one", "two", "three")
+THREE = {
+    # Change, between, within of each scene; the floor is 1. Intervals are mean ± 2.48 sd.
+    "changes nothing": [(0.1, 0.0, 1.0), (0.2, 0.0, 1.0), (0.3, 0.0, 1.0)],
+    "always the same": [(20, 0.1, 1.5), (21, 0.2, 1.5), (22, 0.3, 1.5)],
+    "varies, and agrees within a seed": [(20, 12, 3), (21, 13, 3), (22, 12, 4)],
+    "varies, within a seed too": [(20, 12, 13), (21, 13, 14), (22, 12, 14)],
+    # Excess -5, 1, 0: on both sides of 0, though its mean is that of a method that agrees.
+    "varies, can't tell whether within a seed too": [(20, 12, 2), (21, 12, 8), (22, 12, 7)],
+    # A variety of 13 ± 19.
+    "can't tell whether it varies": [(20, 5, 1), (21, 13, 1), (22, 20.5, 1)],
+}
+
+
+def written(table):
+    """The run of variants with these figures by scene, one view each."""
+    keys = ("change", "between", "within")
+    extra = {
+        "varied": {"name": "e", "instruction": "i", "seeds": [1, 2], "answers": ["red", "red"]}
+    }
+    cells = [
+        written_runs.outcome(
+            "variability", scene, [name],
+            written_runs.record(
+                [("e/v", 15.0, {f"variability.{k}": v for k, v in zip(keys, row, strict=True)}
+                  | {"variability.within_floor": 1.0})], **extra),
+            f"{name}-{scene}",
+        )
+        for name, rows in table.items() for scene, row in zip(SCENES, rows, strict=True)
+    ]  # fmt: skip
+    content = {
+        "name": "mine", "scenes": list(SCENES), "seeds": [1, 2],
+        "variants": {name: {"options": {"stages": 1 + i}} for i, name in enumerate(table)},
+        "probes": {"variability": list(table)},
+    }  # fmt: skip
+    return written_runs.results(content, cells)
+
+
+def test_the_reports_words_need_an_interval_on_one_side_of_their_limit(tmp_path):
+    ((_, section),) = probe("variability").sections(written(THREE), Layout(tmp_path))
+    (table,) = section.tables
+    assert {row[0]: row[-1] for row in table.rows} == {name: name for name in THREE}
+    shown = next(row for row in table.rows if row[0] == "varies, and agrees within a seed")
+    # Student's t, by hand: 4.303 * sd / sqrt(3), with sd 1, 0.577, 0.577 and 0.764.
+    assert shown[1:5] == ["21.0 ± 2.5", "12.3 ± 1.4", "2.33 ± 1.4", "-3.83 ± 1.9"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "styles", "agrees"),
+    [
+        ([(20, 12, 3), (21, 13, 3), (22, 12, 4)], "holds", "holds"),
+        ([(20, 12, 13), (21, 13, 15), (22, 12, 14)], "holds", "does not hold"),
+        # Varies, but by less than is noticed: more than 0 is not enough.
+        ([(20, 0.50, 3), (21, 0.51, 3.1), (22, 0.52, 3)], "does not hold", "does not hold"),
+        ([(20, 0.5, 0.1), (21, 9, 0.1), (22, 14, 0.1)], "can't tell", "can't tell"),
+    ],
+)
+def test_claims_about_seeds_compare_variety_with_its_limit_and_with_the_seeds_own(
+    rows, styles, agrees
+):
+    judged = {one.claim.id: one for one in judge(written({"warping": rows}), load_claims())}
+    assert {id: one.verdict for id, one in judged.items()} == {
+        "seeds-give-styles": styles, "a-seed-agrees": agrees,
+    }  # fmt: skip
+    assert judged["seeds-give-styles"].contrast.mean == pytest.approx(
+        np.mean([row[1] for row in rows]) - 1
+    )
+    assert judged["a-seed-agrees"].contrast.mean == pytest.approx(
+        np.mean([row[1] - row[2] for row in rows])
+    )
 
 
 def test_every_seed_has_its_own_settings_and_all_share_the_splats(folder, monkeypatch):
