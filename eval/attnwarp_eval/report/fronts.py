@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+
+import numpy as np
+
 from attnwarp_eval.document import charts
 from attnwarp_eval.document.model import Picture, Section, Table
 from attnwarp_eval.document.numbers import number, ratio_text, spread
-from attnwarp_eval.statistics.intervals import RATIO_INTERVAL, Interval, interval
+from attnwarp_eval.statistics.intervals import (
+    RATIO_INTERVAL,
+    Interval,
+    front_probability,
+    interval,
+)
+from attnwarp_eval.statistics.intervals import front as pareto
 from attnwarp_eval.study.probes import probe, probes
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.turns import Timed, timed_in_turn
 from attnwarp_eval.study.results import Results, Shared
 from attnwarp_eval.study.schema import Front
+
+DRAWS = 1000
+"""Resamples of scenes and rounds."""
 
 
 def fronts(results: Results, layout: Layout) -> list[Section]:
@@ -28,35 +43,90 @@ def fronts(results: Results, layout: Layout) -> list[Section]:
         points, rows = _points(results, front, shared)
         if not points:
             continue
+        timed = timed_in_turn(results, probe(front.probe).stage)
         section.text += shared.text(front.title)
         path = layout.figure(f"front-{index}.svg")
         own = probe(front.probe)
         label = f"{metric} ({own.metric(metric).unit})"
+        once = "" if timed else ", one pass"
         with charts.drawing(path) as (axes,):
             on_front = charts.cost_front(
                 axes,
                 points,
-                x=f"seconds {own.cost_of}",
+                x=f"seconds {own.cost_of}{once}",
                 y=label,
                 title=front.title,
                 # A difference of colours above a floor may be negative.
                 log=own.metric(metric).unit != "dE00",
             )
-        section.figures.append(Picture(f"figures/{path.name}", front.title))
-        columns = ["variant", label, f"ms {own.cost_of}", "time, ratio", "verdict", "on the front"]
-        marked = [
-            [*row, ("yes" if row[0] in on_front else "no") if row[0] in points else "–"]
-            for row in rows
-        ]
+        section.figures.append(Picture(f"figures/{path.name}", f"{front.title}{once}"))
+        time = f"ms {own.cost_of}{once}"
+        columns = ["variant", label, time, "time, ratio", "verdict", "on the front"]
+        if timed is None:
+            marked = [[*row, "by one pass" if row[0] in on_front else "–"] for row in rows]
+        else:
+            columns.append("probability")
+            chances = _probabilities(timed, shared, list(points))
+            marked = [
+                [*row, "yes" if row[0] in on_front else "no", chances[row[0]]]
+                if row[0] in points
+                else [*row, "–", "–"]
+                for row in rows
+            ]
         section.tables.append(Table(columns, marked, front.title))
+        section.tables += _cheapest(results, shared, points, time)
     return [section] if section.tables else []
+
+
+def _probabilities(timed: Timed, shared: Shared, names: Sequence[str]) -> dict[str, str]:
+    """How probably each variant is on the front; a dash for one scene, which says nothing of
+    others.
+    """
+    means = np.array(
+        [[fmean(row.values()) for _, row in sorted(shared.tables[n].items())] for n in names]
+    )
+    scenes = means.shape[1]
+    if scenes < 2:
+        return dict.fromkeys(names, "–")
+    drawn = np.random.default_rng(0).integers(scenes, size=(DRAWS, scenes))
+    cost = np.array([timed.resampled(name, DRAWS) for name in names])
+    shares = front_probability(cost, means[:, drawn].mean(axis=-1))
+    return {name: f"{share:.2f}" for name, share in zip(names, shares, strict=True)}
+
+
+def _cheapest(
+    results: Results, shared: Shared, points: Mapping[str, tuple[Interval, Interval]], time: str
+) -> list[Table]:
+    """The cheapest variant for an error: chosen on every other scene, checked on the rest."""
+    scenes = results.study.scene_names
+    chosen_on, checked_on = scenes[::2], scenes[1::2]
+    seconds = {name: each.mean for name, (each, _) in points.items()}
+    chosen, checked = (
+        {name: shared.mean(name, part).mean for name in points} for part in (chosen_on, checked_on)
+    )
+    if not any(map(math.isfinite, checked.values())):
+        return []
+    names = list(points)
+    rows = []
+    for i in pareto([seconds[n] for n in names], [chosen[n] for n in names]):
+        name, limit = names[i], chosen[names[i]]
+        able = [n for n in names if checked[n] <= limit]
+        cheapest = min(able, key=seconds.__getitem__, default="none")
+        taken, elsewhere = 1000 * seconds[name], checked[name]
+        rows.append([number(limit), name, number(taken), number(elsewhere), cheapest])
+    columns = ["error at most", "variant", time, "its error elsewhere", "cheapest elsewhere"]
+    caption = (
+        f"Cheapest for an error: chosen on {', '.join(chosen_on)}, looked up elsewhere on"
+        f" {', '.join(checked_on)}"
+    )
+    return [Table(columns, rows, caption, folded=True)]
 
 
 def _text(results: Results) -> list[str]:
     contents = dict.fromkeys(probe(front.probe).cost_text for front in results.study.fronts)
     text = [
         f"{' '.join(contents)} A point is on the front when nothing"
-        " cheaper is as good, by the means: look at the intervals before believing a close one."
+        " cheaper is as good, by the means."
     ]
     for stage in dict.fromkeys(probe(front.probe).stage for front in results.study.fronts):
         timed = timed_in_turn(results, stage)
@@ -69,7 +139,8 @@ def _once(stage: str) -> str:
     advice = f": a study with a {able} probe takes them in turn" if able else ""
     return (
         "These seconds come from one pass over the views, each variant at another time, and"
-        f" are for orientation{advice}."
+        f" are for orientation{advice}. So a front is of that one pass, and nothing is said of how"
+        " probable it is."
     )
 
 
@@ -83,7 +154,8 @@ def _in_turn(timed: Timed) -> str:
         f" ratio to the first contestant within a round; {RATIO_INTERVAL}"
         " The row `again` is the first contestant against itself: what noise alone does on this"
         " machine. Inside that band, or its mirror image about 1, nothing is called faster or"
-        " slower."
+        f" slower. The probability of being on the front is the share of {DRAWS} draws, of scenes"
+        " and of rounds with replacement, in which a variant is on it."
     )
 
 
