@@ -174,7 +174,7 @@ def _table(compared: Sequence[Contrast], baseline: str) -> Table:
         "metric",
         "difference",
         "verdict",
-        "smallest that would be seen",
+        "smallest that one test alone would see",
         "adjusted p",
         "scenes, views",
     ]
