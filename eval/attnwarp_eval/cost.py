@@ -28,13 +28,18 @@ T = TypeVar("T")
 PACKAGES = (
     "attnwarp",
     "numpy",
+    "scipy",
     "torch",
     "numba",
     "open3d",
     "mitsuba",
     "scikit-image",
     "opencv-contrib-python-headless",
+    "diffusers",
+    "transformers",
+    "tokenizers",
 )
+"""What figures depend on, beside the source."""
 
 
 class Meter:

@@ -333,6 +333,12 @@ def report(
             f" {missing} have no figures in the report; attnwarp-eval verify {run} names them",
             TOO_LITTLE,
         )
+    if not results.measured:
+        raise fail(
+            f"{run}: none of {len(results.cells)} cells was measured; run the study again to"
+            " measure them",
+            TOO_LITTLE,
+        )
     if missing:
         typer.echo(
             f"attnwarp-eval: {run}: {missing} of {len(results.cells)} cells are missing, as the run"

@@ -159,8 +159,14 @@ class Environment:
         return _environments[key]
 
     def same_code(self, other: Environment) -> bool:
-        """Whether both were computed by the same state of the source."""
-        return (self.revision, self.dirty) == (other.revision, other.dirty)
+        """Whether both were computed by the same state of the source and the same packages.
+
+        Packages that only one of them names do not count: former code recorded fewer.
+        """
+        shared = self.versions.keys() & other.versions.keys()
+        return (self.revision, self.dirty) == (other.revision, other.dirty) and all(
+            self.versions[name] == other.versions[name] for name in shared
+        )
 
 
 @dataclass(frozen=True)

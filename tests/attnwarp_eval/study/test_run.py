@@ -163,6 +163,9 @@ def test_the_report_of_an_unfinished_run_says_how_much_is_missing(finished, fold
     done = call("report", run)
     assert done.exit_code == 0
     assert f"1 of {CELLS} cells are missing, as the run is unfinished" in done.stderr
+    shutil.rmtree(run / "cells")
+    done = call("report", run)
+    assert done.exit_code == 3 and f"none of {CELLS} cells was measured" in done.stderr
 
 
 def test_a_damaged_picture_is_refused_by_name_and_made_anew(finished, folder):

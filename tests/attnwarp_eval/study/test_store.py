@@ -10,8 +10,10 @@ import time
 import pytest
 
 from attnwarp_eval.canonical_json import canonical_json
+from attnwarp_eval.cost import environment
 from attnwarp_eval.files import write_atomic
 from attnwarp_eval.study.cell import Cell
+from attnwarp_eval.study.record import Environment
 from attnwarp_eval.study.store import Store, StoreError
 from attnwarp_eval.study.task import Task, results
 
@@ -319,3 +321,17 @@ def test_a_file_is_whole_however_its_writer_was_killed(tmp_path):
         data = path.read_bytes()
         assert len(data) == 200_000
         assert len(set(data)) == 1
+
+
+def test_another_version_of_what_decides_an_edit_is_other_code():
+    here = environment()
+    # What an edit is computed with, by the names of the package index.
+    assert here["versions"].keys() >= {"diffusers", "transformers", "tokenizers", "torch", "scipy"}
+    this = Environment.from_json(here)
+    assert this.same_code(Environment.from_json(here))
+    for name in ("diffusers", "transformers", "attnwarp"):
+        versions = {**here["versions"], name: "0.0.1"}
+        assert not this.same_code(Environment.from_json({**here, "versions": versions}))
+    # Records of former code name fewer packages.
+    fewer = {k: v for k, v in here["versions"].items() if k not in ("diffusers", "scipy")}
+    assert this.same_code(Environment.from_json({**here, "versions": fewer}))
