@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from attnwarp_eval.compare.snapshot import Measured, Snapshot
-from attnwarp_eval.metrics.gates import Margin, margin, same_count
+from attnwarp_eval.metrics.gates import GATES, Margin, margin, same_count
 from attnwarp_eval.metrics.registry import METRICS, Metric
 from attnwarp_eval.statistics.intervals import (
     ByView,
@@ -163,8 +163,14 @@ def compare(baseline: Snapshot, run: Snapshot) -> Comparison:
     scenes = [row.difference.scenes for row in rows if probe_of(row.probe).needs_scenes]
     most = max(scenes, default=0)
     both = {probe for _, probe, *_ in left.keys() & right.keys()}
-    unread = sorted(name for name in both - {r.probe for r in rows} if probe_of(name).metrics)
+    # A probe of one's own has figures that no gate knows: nothing of it was dropped.
+    unread = sorted(name for name in both - {r.probe for r in rows} if _has_gates(name))
     return Comparison(run.study, exact, most, rows, tuple(faults), tuple(added), tuple(unread))
+
+
+def _has_gates(name: str) -> bool:
+    """Whether any gate is a figure of a probe."""
+    return not GATES.keys().isdisjoint(m.name for m in probe_of(name).metrics.values())
 
 
 def _by_key(cells: Iterable[Measured], exact: bool) -> dict[Key, list[Measured]]:

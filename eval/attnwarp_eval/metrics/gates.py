@@ -61,7 +61,9 @@ GATES: Mapping[str, Margin] = {
     "embedding.dino_image": Margin(5e-3),
     "fidelity.mse": Margin(1e-5, 0.05),
     "fidelity.ssim": Margin(2e-3),
+    "fidelity.preserved_mse": Margin(1e-5, 0.05),
     "fidelity.preserved_psnr": Margin(0.2),
+    "image.mse": Margin(1e-5, 0.05),
     "image.psnr": Margin(0.2),
     "stability.margin": Margin(0.5),
 }

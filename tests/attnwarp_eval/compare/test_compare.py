@@ -585,8 +585,8 @@ def test_every_headline_figure_is_gated_and_every_gate_is_a_figure_of_a_probe(st
     }
     # Claims and the tests of these probes read the rest.
     elsewhere = {
-        "fidelity.ssim", "fidelity.preserved_psnr", "embedding.clip_similarity",
-        "variability.within", "stability.margin",
+        "fidelity.ssim", "fidelity.preserved_mse", "fidelity.preserved_psnr",
+        "embedding.clip_similarity", "variability.within", "stability.margin",
     }  # fmt: skip
     assert GATES.keys() - {METRICS[key].name for key in keys if gated(key)} == elsewhere
 
