@@ -65,6 +65,32 @@ def psnr(x, truth):
     return 10 * np.log10(span**2 / float((x - truth).square().mean()))
 
 
+def test_a_picture_that_a_network_drew_is_inverted_and_rebuilt(monkeypatch):
+    """As GaussCtrl and ``propagate`` start. Oracle: the latents that were drawn, from other noise and in other steps. A
+    network of random weights takes no noise away, so its flow is followed where the signal prevails."""
+    from tiny_editors import controlnet
+
+    from attnwarp.editing.controlnet import DepthControlNet
+    from attnwarp.editing.editor import edit
+    from attnwarp.editing.inversion import invert_view
+
+    pipe = controlnet()
+    names = ("unet", "vae", "text_encoder", "tokenizer", "scheduler", "controlnet")
+    editor = DepthControlNet(*(getattr(pipe, name) for name in names), guidance=1.0)
+    editor.schedule = Schedule(torch.linspace(0.9999, 0.6, 1000), "epsilon", 1.0)
+    depth = np.random.default_rng(0).uniform(1, 3, (16, 16))
+    drawn = edit(editor, [depth], "a bear", steps=10, seed=5)
+    # An autoencoder of random weights would not give the picture back.
+    monkeypatch.setattr(editor, "encode", lambda pictures: drawn.latents)
+    latents = invert_view(editor, depth, drawn.images[0], "a bear", steps=20)
+    rebuilt, missed = (
+        edit(editor, [depth], "a bear", steps=20, latents=x).latents
+        for x in (latents, drawn.latents)
+    )
+    assert psnr(missed, drawn.latents) < 27  # not inverted
+    assert psnr(rebuilt, drawn.latents) > 30
+
+
 def test_ddim_inversion_needs_a_network_that_predicts_noise():
     schedule = Schedule(parts()["scheduler"].alphas_cumprod, "sample", 1.0)
     with pytest.raises(ValueError, match="DDIM inversion needs its noise"):
