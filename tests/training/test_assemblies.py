@@ -30,9 +30,17 @@ from training.editing_pairs import (
     reserved,
     thing_of,
 )
-from training.objects import plain_numbers
+from training.objects import RECIPES, body, plain_numbers
 from training.render import pictures
-from training.worlds import COLORS, FINISHES, NOUNS, OBJECTS, Look
+from training.worlds import (
+    COLORS,
+    FINISHES,
+    HELD_OUT_SHAPE,
+    NOUNS,
+    OBJECTS,
+    TRAIN_SHAPES,
+    Look,
+)
 
 SHAPE = ("center", "radii", "start", "end", "points", "radius", "height", "size")
 
@@ -136,22 +144,42 @@ def test_sentences_name_the_part_and_none_is_a_scenes():
     assert set(NOUNS) == set(OBJECTS)
 
 
-def test_no_recipe_repeats_a_scenes_shape_or_texture():
+def shape_of(part):
+    numbers = (part.get(k) for k in SHAPE)
+    return str([v for v in numbers if v is not None])
+
+
+def shapes_and_palettes():
+    """Of the scenes' files, as they are written."""
     folder = (Path(attnwarp_eval.__file__).parent / "scenes").resolve()
     shapes, palettes = set(), set()
     for path in folder.glob("*.yaml"):
         for thing in yaml.safe_load(path.read_text())["objects"]:
-            for part in thing["shape"].get("parts", ()):
-                numbers = (part.get(k) for k in SHAPE)
-                shapes.add(str([v for v in numbers if v is not None]))
+            shapes |= {shape_of(part) for part in thing["shape"].get("parts", ())}
             palettes.add(str(thing.get("texture", {}).get("colors")))
     assert len(shapes) > 50
+    return shapes, palettes
+
+
+def test_no_thing_that_encoders_learn_from_repeats_a_scenes_shape():
+    shapes, _ = shapes_and_palettes()
+    drawn = {
+        shape_of(part)
+        for word in RECIPES
+        for instance in (*range(TRAIN_SHAPES), HELD_OUT_SHAPE)
+        for part in body(word, instance)["parts"]
+    }
+    assert len(drawn) > 1000
+    assert not drawn & shapes
+
+
+def test_no_recipe_repeats_a_scenes_shape_or_texture():
+    shapes, palettes = shapes_and_palettes()
     for k in range(len(KINDS)):
         world = Assembly(k, 3, 5)
         for parts in world.pieces().values():
             for part in plain_numbers(parts):
-                numbers = (part.get(k) for k in SHAPE)
-                assert str([v for v in numbers if v is not None]) not in shapes
+                assert shape_of(part) not in shapes
         for finish in ("plain", "wooden", "stone"):
             surface = look(0, finish).surface
             assert str(surface.get("texture", {}).get("colors")) not in palettes - {"None"}

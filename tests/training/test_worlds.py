@@ -2,6 +2,8 @@
 never be drawn.
 """
 
+import re
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from attnwarp_eval.truth.plan import plan
 from training import render, worlds
 from training.clip import make_tokenizer, true_of, wrong
 from training.data import SPLITS, looks_of
+from training.depth_editor import reserved_prompts
+from training.editing_pairs import reserved
 from training.objects import RECIPES, body
 from training.worlds import (
     COLORS,
@@ -53,6 +57,58 @@ def test_every_thing_stands_on_the_ground_and_is_about_a_unit_wide_or_tall(word)
         assert np.abs([low[:2], high[:2]]).max() < 1.7
     assert body(word, 3) == body(word, 3)
     assert len({str(body(word, k)) for k in range(12)}) > 5
+
+
+LEARNT = {
+    *(f"a photo of a {c} bear in a garden" for c in ("blue", "green", "red", "violet", "yellow")),
+    "a photo of an orange bear in a garden", "a photo of a bronze statue of a bear in a garden",
+    *(f"a photo of a {c} stegosaurus" for c in ("blue", "pink", "red", "yellow")),
+    "a photo of a green stegosaurus in a clearing", "a photo of a steel sculpture of a stegosaurus in a clearing",
+    "a photo of a stone statue of a stegosaurus in a clearing",
+    "a photo of a bronze bust of a man", "a photo of a marble bust of a man",
+    "a photo of a person in a park", "a photo of a person in a park by day",
+    "a photo of a person in a park on a moonlit night", "a photo of a golden statue of a person in a park",
+    "a photo of a table in a garden at dusk", "a photo of a table in a garden by day",
+    "a photo of a white marble table in a garden", "a photo of a wooden table in a garden",
+    "a photo of a tree stump in the snow",
+}  # fmt: skip
+"""The scenes' sentences that captions of worlds can be, word for word: clip-small and clip-parts may
+have learnt from them."""
+
+
+def captions_pattern():
+    """A regular expression of all captions, from the tables of words alone."""
+
+    def one(words):
+        return f"(?:{'|'.join(sorted(map(re.escape, words), key=len, reverse=True))})"
+
+    def every(table):
+        return one(word for words in table.values() for word in words)
+
+    hue = every(worlds.HUES)
+    surface = (
+        f"(?:{hue}|(?:shiny|glossy|polished) {hue}|{hue} plastic|{hue} and {hue}"
+        " (?:striped|checked|chequered)|golden|gold|silver|steel|chrome|bronze|copper|wooden|stone"
+        "|(?:white )?marble)"
+    )
+    nouns = f"(?:{every(worlds.NOUNS)}|thing|object|something|polar bear|grizzly bear)"
+    place, hour = every(worlds.PLACES), every(worlds.HOURS)
+    return re.compile(
+        f"(?:{one(o for o in worlds.OPENINGS if o)} )?an? (?:{one(worlds.FILLERS)} )?(?:{surface} )?"
+        f"(?:(?:statue|sculpture) of an? )?{nouns}(?: {hour})?(?: {place})?(?: {hour})?"
+    )
+
+
+def test_captions_repeat_no_sentence_of_the_scenes_but_these():
+    pattern, rng = captions_pattern(), np.random.default_rng(0)
+    for _ in range(2000):
+        thing = int(rng.integers(len(OBJECTS)))
+        look = draw_look(thing, rng, pairs="any")
+        text = sentence(captioned(attributes(thing, look), rng), rng, fillers=True)
+        assert pattern.fullmatch(text), text
+    theirs = reserved() | reserved_prompts()
+    assert len(theirs) > 100
+    assert {text for text in theirs if pattern.fullmatch(text)} == LEARNT
 
 
 def test_a_pair_kept_from_training_is_never_drawn_for_it_and_always_for_its_test():
