@@ -14,6 +14,7 @@ import tarfile
 import numpy as np
 import pytest
 import written_runs
+from chord_probe import Chord, Longest
 from scipy import stats
 from typer.testing import CliRunner
 
@@ -28,7 +29,7 @@ from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.edit_truth import Judgement
-from attnwarp_eval.study.probes import probes
+from attnwarp_eval.study.probes import probes, register, unregister
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.probes.variability import Varied
 from attnwarp_eval.study.run import plan
@@ -516,6 +517,7 @@ def edited(figures, probe="editing", seconds=None):
     extra = {
         "editing": EditResult("red", "make it red", DONE, DONE, {}, {}, 30.0, 2, 1.0),
         "variability": Varied("red", "make it red", (1, 2), ("red", "red")),
+        "chord": Longest("yaw015", 1.0),
     }[probe].to_json()
     spec = {"budget": {"seconds": seconds}} if seconds else {}
     cells = [
@@ -555,6 +557,15 @@ def test_a_probe_of_which_nothing_was_compared_is_too_little():
         assert result.too_little.startswith("both sides share no gated figure of 'editing'")
         assert summary(result).startswith("too little to compare: 0 worse")
     assert not compare(edited(EDITED), edited(EDITED)).too_little
+
+
+def test_a_probe_of_ones_own_that_no_gate_knows_does_not_stop_a_comparison():
+    register(Chord)
+    try:
+        result = compare(*(edited({"chord.length": length}, "chord") for length in (1.0, 2.0)))
+    finally:
+        unregister("chord")
+    assert result.rows and not result.too_little and not result.regressed
 
 
 STANDS_IN = {
