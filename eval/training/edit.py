@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from training.card_sections import Kept
 
 app = typer.Typer(
     help="Recipe of the bundled editors. Stages go on where they were stopped.",
@@ -21,6 +25,7 @@ Out = Annotated[Path, typer.Option(help="Folder of checkpoints.")]
 Data = Annotated[
     Path, typer.Option(help="Folder of the pictures; rendered where they are missing.")
 ]
+Cards = Annotated[Path, typer.Option(help="Folder of the editors and their cards.")]
 Threads = Annotated[int, typer.Option(min=1, help="Of training.")]
 
 
@@ -79,9 +84,7 @@ def stages(out: Out = CACHE) -> None:
 
 
 @app.command()
-def export(
-    stage: str, name: str, out: Out = CACHE, weights: Annotated[Path, typer.Option()] = WEIGHTS
-) -> None:
+def export(stage: str, name: str, out: Out = CACHE, weights: Cards = WEIGHTS) -> None:
     """Write a stage's editor, as far as it has come, into the package under a name such as small-plain."""
     from training.depth_editor import DEPTH_STAGES
     from training.editor_export import export_depth_editor, export_editor
@@ -93,12 +96,14 @@ def export(
 @app.command()
 def assess(
     stage: str, name: str, out: Out = CACHE, data: Data = CACHE / "data",
-    weights: Annotated[Path, typer.Option()] = WEIGHTS,
+    weights: Cards = WEIGHTS,
     worlds: Annotated[int | None, typer.Option(help="Test worlds; all if left out.")] = None,
-    rounds: Annotated[int, typer.Option(min=0, help="Of swapped features; 0 for none.")] = 0,
     scenes: Annotated[bool, typer.Option(help="Judge it on the package's scenes too.")] = False,
 ) -> None:  # fmt: skip
-    """Measure an exported editor on what it has never seen, and write its card."""
+    """Measure an exported editor on what it has never seen, and write its card.
+
+    Sections of answers, by-clip and carries are left out: these commands write them.
+    """
     from training.depth_assess import assess_depth_editor
     from training.depth_editor import DEPTH_STAGES
     from training.editor_assess import assess_editor
@@ -108,30 +113,122 @@ def assess(
         card = assess_depth_editor(weights / name, data, depth_facts_of(stage, out), worlds=worlds)
     else:
         facts = facts_of(stage, out)
-        card = assess_editor(
-            weights / name, data, facts, worlds=worlds, rounds=rounds, scenes=scenes
-        )
+        card = assess_editor(weights / name, data, facts, worlds=worlds, scenes=scenes)
     (weights / name / "card.md").write_text(card)
     typer.echo(card)
 
 
+def exported(name: str, weights: Path) -> tuple[Any, int]:
+    """An exported editor with the guidance of the bundled ones, on one thread, and the side of its pictures in px."""
+    import torch
+
+    from attnwarp.editing import small
+
+    torch.set_num_threads(1)
+    folder = str(weights / name)
+    guidance = (
+        {"guidance": small.DEPTH_GUIDANCE}
+        if small.guide_of(folder) == "depth"
+        else {"text_guidance": small.TEXT_GUIDANCE, "image_guidance": small.IMAGE_GUIDANCE}
+    )
+    editor: Any = small.load_editor(folder, **guidance)
+    return editor, editor.unet.config.sample_size * editor.factor
+
+
+def judged(name: str, weights: Path, command: str) -> tuple[Any, int, Kept]:
+    """An editor that takes pictures, their side in px, and what a command has kept of it.
+
+    BadParameter: it takes depth maps.
+    """
+    from attnwarp.editing.small import SUMS, guide_of
+    from training.card_sections import Kept
+
+    if guide_of(str(weights / name)) != "picture":
+        message = f"{name} takes depth maps; give an editor of pictures, such as small-plain"
+        raise typer.BadParameter(message, param_hint="NAME")
+    editor, size = exported(name, weights)
+    sums = hashlib.sha256((weights / name / SUMS).read_bytes()).hexdigest()
+    return editor, size, Kept(CACHE / "judged" / f"{name}-{sums[:12]}-{command}.json")
+
+
+def add_section(name: str, weights: Path, section: str) -> None:
+    """Write a section into an editor's card, in place of a former one, and print it."""
+    from training.card_sections import with_section
+
+    path = weights / name / "card.md"
+    path.write_text(with_section(path.read_text() if path.exists() else f"# {name}", section))
+    typer.echo(section)
+
+
+@app.command()
+def answers(
+    name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
+    noises: Annotated[int, typer.Option(min=1, help="Of each instruction.")] = 200,
+) -> None:  # fmt: skip
+    """Count which answers open instructions get, into the card. Six minutes; a stopped run goes on."""
+    from training.editing_pairs import load_pairs
+    from training.editor_spread import answered, questions, spread_section
+
+    editor, size, kept = judged(name, weights, "answers")
+    asked = questions(load_pairs(data, "edit-test"), size)
+    counts = [answered(editor, question, noises, kept) for question in asked]
+    add_section(name, weights, spread_section(asked, counts, size=size))
+
+
+@app.command("by-clip")
+def by_clip(
+    name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
+    draws: Annotated[int, typer.Option(min=1, help="Pictures of each world and kind.")] = 2,
+) -> None:  # fmt: skip
+    """Judge finish, ground and time of day by clip-small, into the card. Two minutes; a stopped run goes on."""
+    from attnwarp.encoders import load_encoder
+    from training.editing_pairs import load_pairs
+    from training.editor_assess import answers_of
+    from training.editor_by_clip import by_clip_section, judgements
+
+    editor, size, kept = judged(name, weights, "by-clip")
+    worlds, judge = load_pairs(data, "edit-test"), load_encoder("clip-small")
+    results = judgements(answers_of(editor), worlds, judge, kept, size=size, draws=draws)
+    add_section(name, weights, by_clip_section(results, worlds=len(worlds), draws=draws))
+
+
+@app.command()
+def carries(
+    name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
+    pairs: Annotated[int, typer.Option(min=1, help="Swaps asked of each question.")] = 200,
+) -> None:  # fmt: skip
+    """Judge whether swapped features carry the answer, into the card. 20 minutes; a stopped run goes on."""
+    from training import editor_carries
+    from training.editing_pairs import load_pairs
+
+    editor, size, kept = judged(name, weights, "carries")
+    worlds = load_pairs(data, "edit-test")
+    figures = editor_carries.carries(editor, worlds, size=size, pairs=pairs, kept=kept)
+    add_section(name, weights, editor_carries.carried_section(figures, pairs))
+
+
 @app.command()
 def sheet(
-    name: str, data: Data = CACHE / "data", weights: Annotated[Path, typer.Option()] = WEIGHTS,
+    name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
     to: Annotated[Path, typer.Option(help="Folder of the picture.")] = REPORTS,
 ) -> None:  # fmt: skip
     """Draw an exported editor's answers on eight worlds that it has never seen."""
-    import torch
-
-    from attnwarp.editing.small import load_editor
-    from training import editor_sheets
+    from training import depth_assess, editor_sheets
     from training.editing_pairs import load_pairs
     from training.editor_assess import answers_of
 
-    torch.set_num_threads(1)
-    editor = load_editor(str(weights / name), text_guidance=1.5, image_guidance=1.0)
-    size = editor.unet.config.sample_size * editor.factor
-    picture = editor_sheets.sheet(answers_of(editor), load_pairs(data, "edit-test"), size=size)
+    editor, size = exported(name, weights)
+    worlds = load_pairs(data, "edit-test")
+    if editor.guide == "depth":
+        picture = editor_sheets.depth_sheet(
+            lambda prompts, row, text, seed: depth_assess.draw(
+                editor, prompts, row, text, seed=seed
+            ),
+            worlds,
+            size=size,
+        )
+    else:
+        picture = editor_sheets.sheet(answers_of(editor), worlds, size=size)
     typer.echo(editor_sheets.write_sheet(picture, to / f"{name}.png"))
 
 

@@ -13,6 +13,7 @@ import torch
 
 from attnwarp.editing.editor import Image, edit
 from training.assess import Figure, figure
+from training.card_sections import percent, short_of, with_section
 from training.editing_pairs import (
     AMBIGUOUS,
     GROUPS,
@@ -93,16 +94,16 @@ def assess(
         right, groups = [], []
         for world in range(len(worlds)):
             rng = np.random.default_rng([SEED, world, list(GROUPS).index(kind)])
-            row = _row(pairs, world, kind, rng)
-            before = _picture(pairs, row, row.source)
-            thing = _mask(pairs, row, THING)
+            row = draw_row(pairs, world, kind, rng)
+            before = picture_of(pairs, row, row.source)
+            thing = mask_of(pairs, row, THING)
             mask = thing if kind in ("color", "material") else ~thing
             text = instruction(
                 kind, int(worlds.things[world]), worlds.looks[world, row.target], rng
             )
             image = answer(before, text, world)
             choices = [k for k in GROUPS[kind] if worlds.valid[world, k]]
-            true = [_picture(pairs, row, k) for k in choices]
+            true = [picture_of(pairs, row, k) for k in choices]
             right.append(choices[nearest(image, true, mask)] == row.target)
             groups.append(world)
             if kind == "color":
@@ -135,11 +136,11 @@ def _open(answer: Answer, pairs: Pictures, noises: int) -> Figure:
     right, groups = [], []
     for world in range(0, len(worlds), 4):
         rng = np.random.default_rng([SEED, world, 99])
-        row = _row(pairs, world, "color", rng)
-        before, mask = _picture(pairs, row, row.source), _mask(pairs, row, THING)
+        row = draw_row(pairs, world, "color", rng)
+        before, mask = picture_of(pairs, row, row.source), mask_of(pairs, row, THING)
         text = ambiguous_instruction("color", int(worlds.things[world]), rng)
         choices = [k for k in GROUPS["color"] if k != row.source and worlds.valid[world, k]]
-        true = [_picture(pairs, row, k) for k in choices]
+        true = [picture_of(pairs, row, k) for k in choices]
         for seed in range(noises):
             right.append(nearest(answer(before, text, seed), [before, *true], mask) > 0)
             groups.append(world)
@@ -151,7 +152,7 @@ def _open(answer: Answer, pairs: Pictures, noises: int) -> Figure:
     )
 
 
-def _row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -> Row:
+def draw_row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -> Row:
     """A pair of looks of a world; half of the pictures are cut about the thing, as in training."""
     worlds = pairs.worlds
     assert kind in AMBIGUOUS
@@ -163,22 +164,24 @@ def _row(pairs: Pictures, world: int, kind: str, rng: np.random.Generator) -> Ro
         row = Row(world, view, source, target, kind, False, pairs.corner(world, view, rng), False)
         if (
             not np.array_equal(worlds.looks[world, source], worlds.looks[world, target])
-            and _mask(pairs, row, THING).sum() >= 12
+            and mask_of(pairs, row, THING).sum() >= 12
         ):
             return row
 
 
-def _picture(pairs: Pictures, row: Row, look: int) -> Image:
+def picture_of(pairs: Pictures, row: Row, look: int) -> Image:
+    """(S, S, 3) in [0, 1], a look of a row's picture."""
     return np.clip((pairs.picture(row, look) + 1) / 2, 0, 1)
 
 
-def _mask(pairs: Pictures, row: Row, what: int) -> npt.NDArray[np.bool_]:
+def mask_of(pairs: Pictures, row: Row, what: int) -> npt.NDArray[np.bool_]:
+    """(S, S) where a row's picture shows nothing else than ``what``, such as :data:`training.editing_pairs.THING`."""
     return pairs.cut(pairs.worlds.ids[row.world, row.view] == what, row) > 0.99
 
 
 def editor_card(
     name: str, figures: Sequence[Figure], control: Sequence[Figure], facts: dict[str, Any],
-    carried: Sequence[Figure] = (), scenes: Sequence[Figure] = (),
+    scenes: Sequence[Figure] = (),
 ) -> str:  # fmt: skip
     """A bundled editor's card in Markdown.
 
@@ -186,7 +189,6 @@ def editor_card(
         name: of the editor.
         figures, control: of it and of an editor that changes nothing.
         facts: of its training.
-        carried: figures of :mod:`training.editor_carries`.
         scenes: figures of :mod:`training.editor_scenes`.
     """
     learned, missing = "", "parts of things (a jacket, a pot), "
@@ -218,43 +220,31 @@ def editor_card(
         chance = "" if own.chance is None else f"{100 * own.chance:.0f} %"
         asked = "" if own.asked is None else f"{100 * own.asked:.0f} %"
         lines.append(
-            f"| {own.what} | **{100 * own.value:.0f} %** ({100 * own.low:.0f} to {100 * own.high:.0f})"
-            f" | {100 * other.value:.0f} % | {chance} | {asked} | {own.count} |"
+            f"| {own.what} | {percent(own)} | {100 * other.value:.0f} % | {chance} | {asked} | {own.count} |"
         )
-    if carried:
-        lines += [
-            "", "## Whether its attention carries the answer, and where", "",
-            "Features of a run that answered one colour go into a run from other noise that alone answers another, by the paper's decay"
-            " (`training/editor_carries.py`).", "", "| question | share | asked for | answers |", "|---|---|---|---|",
-        ]  # fmt: skip
-        for f in carried:
-            asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
-            lines.append(
-                f"| {f.what} | **{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f}) | {asked} | {f.count} |"
-            )
+    lines += short_of(figures)
+    card = "\n".join([*lines, ""])
     if scenes:
-        lines += [
-            "", "## On the package's own scenes and sentences", "",
-            "Six scenes of the studies, three views each, every sentence of theirs (`training/editor_scenes.py`). Intervals are over scenes.",
-            "", "| question | share | chance | asked for | answers |", "|---|---|---|---|---|",
-        ]  # fmt: skip
-        for f in scenes:
-            asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
-            lines.append(
-                f"| {f.what} | **{100 * f.value:.0f} %** ({100 * f.low:.0f} to {100 * f.high:.0f})"
-                f" | {100 * (f.chance or 0):.0f} % | {asked} | {f.count} |"
-            )
-    short = [
-        f.what for f in (*figures, *carried, *scenes) if f.asked is not None and f.value < f.asked
-    ]
-    if short:
-        lines += ["", "Short of what was asked for: " + "; ".join(short) + "."]
-    return "\n".join([*lines, ""])
+        card = with_section(card, _scenes_section(scenes))
+    return card
+
+
+def _scenes_section(scenes: Sequence[Figure]) -> str:
+    lines = [
+        "## On the package's own scenes and sentences", "",
+        "Six scenes of the studies, three views each, every sentence of theirs (`training/editor_scenes.py`). Intervals are over scenes.",
+        "", "| question | share | chance | asked for | answers |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for f in scenes:
+        asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
+        lines.append(
+            f"| {f.what} | {percent(f)} | {100 * (f.chance or 0):.0f} % | {asked} | {f.count} |"
+        )
+    return "\n".join(lines + short_of(scenes))
 
 
 def assess_editor(
-    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, rounds: int = 0,
-    scenes: bool = False,
+    folder: Path, data: Path, facts: dict[str, Any], *, worlds: int | None = None, scenes: bool = False,
 ) -> str:  # fmt: skip
     """The card of an exported editor.
 
@@ -263,11 +253,9 @@ def assess_editor(
         data: of the pictures.
         facts: of its training.
         worlds: of each test split; all if left out.
-        rounds: pairs of noises a picture for the figures of swapped features; 0 leaves these out.
         scenes: whether to judge it on the package's own scenes too.
     """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
-    from training.editor_carries import carries
     from training.editor_scenes import scene_figures
 
     torch.set_num_threads(1)
@@ -288,10 +276,6 @@ def assess_editor(
         for results, answer in ((own, answers_of(editor)), (control, unedited)):
             figures = assess(answer, tests, size=facts["large"], kinds=("color",), noises=0)
             results += [replace(f, what=f"at {facts['large']} px: {f.what}") for f in figures]
-    carried = []
-    if rounds:
-        tests = load_pairs(data, "edit-test", count=worlds)
-        carried = carries(editor, tests, size=size, rounds=rounds)
 
     def millions(net: Any) -> float:
         return float(sum(p.numel() for p in net.parameters()) / 1e6)
@@ -301,4 +285,4 @@ def assess_editor(
         "text_guidance": TEXT_GUIDANCE, "image_guidance": IMAGE_GUIDANCE,
     }  # fmt: skip
     seen = scene_figures(answers_of(editor), size=size) if scenes else []
-    return editor_card(folder.name, own, control, {**given, **facts}, carried, seen)
+    return editor_card(folder.name, own, control, {**given, **facts}, seen)

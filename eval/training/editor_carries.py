@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from attnwarp.editing.attention import (
 from attnwarp.editing.editor import Image, edit
 from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_surfaces
 from training.assess import Figure, figure
+from training.card_sections import Kept, percent, short_of
 from training.editing_pairs import GROUPS, SIZE, VIEWS, Worlds
 from training.editor_assess import SEED, nearest
 from training.editor_pictures import Pictures, Row
@@ -38,6 +40,10 @@ INSTRUCTION = "change its color"
 
 STEPS = 20
 BATCH = 16
+
+PAIRS = 200
+MOST_ROUNDS = 20
+"""Of pictures; an editor that seldom answers two colours would never come to an end."""
 
 CONSTANT = 0.9
 """The weight of features where it does not fall."""
@@ -72,12 +78,19 @@ class Case:
         return nearest(image, self.answers, self.thing if where is None else self.thing & where)
 
 
-def cases_of(worlds: Worlds, size: int) -> list[Case]:
-    """Both whole views of every world whose thing is large enough."""
+def cases_of(worlds: Worlds, size: int, number: int = 0) -> list[Case]:
+    """Both whole views of every world whose thing is large enough.
+
+    Args:
+        worlds: of the test split.
+        size: of the pictures in px.
+        number: of the round, which draws the colour that each world has before.
+    """
     pairs = Pictures(worlds, size)
+    further = [number] if number else []
     cases = []
     for world in range(len(worlds)):
-        rng = np.random.default_rng([SEED, world, 5])
+        rng = np.random.default_rng([SEED, world, 5, *further])
         colors = [k for k in GROUPS["color"] if worlds.valid[world, k]]
         source = int(rng.choice(colors))
         for view in range(VIEWS):
@@ -139,69 +152,98 @@ class Swap:
             return self.run(guides, noise)
 
 
-def swap_figures(editor: Any, worlds: Worlds, *, size: int, rounds: int = 4) -> list[Figure]:
+QUESTIONS = {
+    "same": ("features of the same picture make it their colour", 0.8),
+    "held": (f"... with a constant weight of {CONSTANT:g}", None),
+    "follows": ("injected in the left half, that half follows", 0.75),
+    "keeps": ("... and the other half keeps its own", 0.75),
+    "other": ("features of another picture make it their colour (at most 15 % asked)", None),
+}
+
+Marks = dict[str, list[tuple[bool, int]]]
+"""Whether each answer was right, and its world, by a key of :data:`QUESTIONS`."""
+
+
+def swap_figures(
+    editor: Any, worlds: Worlds, *, size: int, pairs: int = PAIRS, kept: Kept | None = None
+) -> list[Figure]:
     """Figures of features swapped within a picture, from another picture, and in a half.
+
+    Rounds of other pictures and noises go on until every question has as many answers as were asked for.
 
     Args:
         editor: to judge.
         worlds: of the test split.
         size: of the pictures in px.
-        rounds: pairs of noises a picture.
+        pairs: answers asked of every question; after :data:`MOST_ROUNDS` rounds it is as many as were had.
+        kept: results of batches, so that a stopped measurement goes on.
     """
-    swap, cases = Swap(editor), cases_of(worlds, size)
-    left = np.zeros((size, size), dtype=bool)
-    left[:, : size // 2] = True
-    same: list[tuple[bool, int]] = []
-    held: list[tuple[bool, int]] = []
-    other: list[tuple[bool, int]] = []
-    follows: list[tuple[bool, int]] = []
-    keeps: list[tuple[bool, int]] = []
-    for number in range(rounds):
+    swap = Swap(editor)
+    marks: Marks = {key: [] for key in QUESTIONS}
+    number = 0
+    while number < MOST_ROUNDS and min(len(values) for values in marks.values()) < pairs:
+        cases = cases_of(worlds, size, number)
         for first in range(0, len(cases), BATCH):
             batch = cases[first : first + BATCH]
-            guides = [case.before for case in batch]
-            seeds = [1000 * (first + k) + 2 * number for k in range(len(batch))]
-            noise_a = swap.noise(seeds, guides[0])
-            noise_b = swap.noise([s + 1 for s in seeds], guides[0])
-            run_a, recording = swap.recorded(guides, noise_a)
-            run_b = swap.run(guides, noise_b)
-            # The next picture of the batch gets this one's features.
-            order = [(k + 1) % len(batch) for k in range(len(batch))]
-            strange = swap.injected(recording, [guides[k] for k in order], noise_b[order])
-            whole = swap.injected(recording, guides, noise_b)
-            constantly = swap.injected(recording, guides, noise_b, weight=constant(CONSTANT))
-            half = swap.injected(recording, guides, noise_b, mask=left)
-            for k, case in enumerate(batch):
-                a, b = case.answer(run_a[k]), case.answer(run_b[k])
-                if 0 in (a, b) or a == b:
-                    continue
-                same.append((case.answer(whole[k]) == a, case.world))
-                held.append((case.answer(constantly[k]) == a, case.world))
-                both = (case.thing & left).mean(), (case.thing & ~left).mean()
-                if min(both) >= LEAST_SHARE and case.answer(run_a[k], left) == a:
-                    follows.append((case.answer(half[k], left) == a, case.world))
-                    keeps.append((case.answer(half[k], ~left) == b, case.world))
-            for k, image in zip(order, strange, strict=True):
-                # The colour that the other picture's run answered, as this picture has it.
-                giver, case = batch[(k - 1) % len(batch)], batch[k]
-                a, b = giver.answer(run_a[(k - 1) % len(batch)]), case.answer(run_b[k])
-                if giver.world == case.world or 0 in (a, b):
-                    continue
-                wanted = _same_color(giver.answers[a], giver.thing, case)
-                if wanted not in (0, b):
-                    other.append((case.answer(image) == wanted, case.world))
-    rows = (
-        ("features of the same picture make it their colour", same, 0.8),
-        (f"... with a constant weight of {CONSTANT:g}", held, None),
-        ("injected in the left half, that half follows", follows, 0.75),
-        ("... and the other half keeps its own", keeps, 0.75),
-        ("features of another picture make it their colour (at most 15 % asked)", other, None),
-    )
+            compute = partial(_swapped, swap, batch, 1000 * first, number)
+            name = f"swap {len(worlds)} {number} {first}"
+            found = compute() if kept is None else kept.get(name, compute)
+            for key, values in found.items():
+                marks[key] += values
+        number += 1
     return [
-        figure(what, [r for r, _ in values], [w for _, w in values], asked=asked)
-        for what, values, asked in rows
-        if values
+        figure(what, [r for r, _ in marks[key]], [w for _, w in marks[key]], asked=asked)
+        for key, (what, asked) in QUESTIONS.items()
+        if marks[key]
     ]
+
+
+def _swapped(swap: Swap, batch: Sequence[Case], seed: int, number: int) -> Marks:
+    """The answers of a batch of pictures.
+
+    Args:
+        swap: of the editor.
+        batch: the pictures, those of a world one after the other.
+        seed: of the first picture's noise.
+        number: of the round: it chooses the noises, and whose features another picture gets.
+    """
+    marks: Marks = {key: [] for key in QUESTIONS}
+    guides = [case.before for case in batch]
+    size = len(guides[0])
+    left = np.zeros((size, size), dtype=bool)
+    left[:, : size // 2] = True
+    seeds = [seed + 1000 * k + 2 * number for k in range(len(batch))]
+    noise_a = swap.noise(seeds, guides[0])
+    noise_b = swap.noise([s + 1 for s in seeds], guides[0])
+    run_a, recording = swap.recorded(guides, noise_a)
+    run_b = swap.run(guides, noise_b)
+    # Two pictures on, since the next one is often the same world's other view; further in later rounds.
+    shift = 1 + (number + 1) % max(1, len(batch) - 1)
+    order = [(k + shift) % len(batch) for k in range(len(batch))]
+    strange = swap.injected(recording, [guides[k] for k in order], noise_b[order])
+    whole = swap.injected(recording, guides, noise_b)
+    constantly = swap.injected(recording, guides, noise_b, weight=constant(CONSTANT))
+    half = swap.injected(recording, guides, noise_b, mask=left)
+    for k, case in enumerate(batch):
+        a, b = case.answer(run_a[k]), case.answer(run_b[k])
+        if 0 in (a, b) or a == b:
+            continue
+        marks["same"].append((case.answer(whole[k]) == a, case.world))
+        marks["held"].append((case.answer(constantly[k]) == a, case.world))
+        both = (case.thing & left).mean(), (case.thing & ~left).mean()
+        if min(both) >= LEAST_SHARE and case.answer(run_a[k], left) == a:
+            marks["follows"].append((case.answer(half[k], left) == a, case.world))
+            marks["keeps"].append((case.answer(half[k], ~left) == b, case.world))
+    for giving, (k, image) in enumerate(zip(order, strange, strict=True)):
+        # The colour that the other picture's run answered, as this picture has it.
+        giver, case = batch[giving], batch[k]
+        a, b = giver.answer(run_a[giving]), case.answer(run_b[k])
+        if giver.world == case.world or 0 in (a, b):
+            continue
+        wanted = _same_color(giver.answers[a], giver.thing, case)
+        if wanted not in (0, b):
+            marks["other"].append((case.answer(image) == wanted, case.world))
+    return marks
 
 
 def _same_color(image: Image, mask: Mask, case: Case) -> int:
@@ -302,9 +344,30 @@ def _disagreement(target: Image, source: Image, grid: Any) -> float:
     )
 
 
-def carries(editor: Any, worlds: Worlds, *, size: int, rounds: int = 4) -> list[Figure]:
-    """All figures of this module."""
+def carries(
+    editor: Any, worlds: Worlds, *, size: int, pairs: int = PAIRS, kept: Kept | None = None
+) -> list[Figure]:
+    """All figures of this module; arguments as of :func:`swap_figures`."""
     return [
-        *swap_figures(editor, worlds, size=size, rounds=rounds),
+        *swap_figures(editor, worlds, size=size, pairs=pairs, kept=kept),
         warped_figure(editor, worlds, size=size),
     ]
+
+
+def carried_section(carried: Sequence[Figure], pairs: int) -> str:
+    """A card's section of these figures.
+
+    Args:
+        carried: of :func:`carries`.
+        pairs: that were asked of each question about a swap.
+    """
+    lines = [
+        "## Whether its attention carries the answer, and where", "",
+        "Features of a run that answered one colour go into a run from other noise that alone answers another, by the paper's decay"
+        f" (`training/editor_carries.py`). At least {pairs} swaps a question were asked for; the last column says how many were had.", "",
+        "| question | share | asked for | answers |", "|---|---|---|---|",
+    ]  # fmt: skip
+    for f in carried:
+        asked = "" if f.asked is None else f"{100 * f.asked:.0f} %"
+        lines.append(f"| {f.what} | {percent(f)} | {asked} | {f.count} |")
+    return "\n".join(lines + short_of(carried))

@@ -45,19 +45,19 @@ def test_an_editor_that_knows_every_answer_gets_all_and_one_that_changes_nothing
     worlds, monkeypatch
 ):
     asked = {}
-    draw = editor_assess._row
+    draw = editor_assess.draw_row
 
     def remember(pairs, world, kind, rng):
         row = draw(pairs, world, kind, rng)
         asked["pairs"], asked["row"] = pairs, row
         return row
 
-    monkeypatch.setattr(editor_assess, "_row", remember)
+    monkeypatch.setattr(editor_assess, "draw_row", remember)
 
     def knows(image, text, seed):
         row = asked["row"]
-        assert np.allclose(image, editor_assess._picture(asked["pairs"], row, row.source))
-        return editor_assess._picture(asked["pairs"], row, row.target)
+        assert np.allclose(image, editor_assess.picture_of(asked["pairs"], row, row.source))
+        return editor_assess.picture_of(asked["pairs"], row, row.target)
 
     figures = {f.what: f for f in assess(knows, worlds, size=64, noises=2)}
     for what, found in figures.items():
@@ -74,16 +74,16 @@ def test_an_editor_that_knows_every_answer_gets_all_and_one_that_changes_nothing
     }  # fmt: skip
     card = editor_card("small-plain", list(control.values()), list(control.values()), facts)
     assert "10 of 100 planned steps" in card
-    swapped = figure("features make it their colour", [1, 0, 0, 0], [0, 0, 1, 1], asked=0.8)
+    seen = figure("a scene's own", [1, 0, 0, 0], [0, 0, 1, 1], asked=0.8)
     both = editor_card(
         "small",
         list(figures.values()),
         list(control.values()),
         facts | {"parts": 3, "before": 1200, "large": 128},
-        [swapped],
+        [seen],
     )
-    assert "| features make it their colour | **25 %**" in both
-    assert "Short of what was asked for: features make it their colour" in both.replace("\n", " ")
+    assert "| a scene's own | **25 %**" in both
+    assert both.rstrip().endswith("Short of what was asked for: a scene's own.")
     assert "parts of those of" in both
     assert "after 1,200 of the stages before" in both and "and of 128 x 128 px" in both
     assert "of the stages before" not in card and "128" not in card

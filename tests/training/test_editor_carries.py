@@ -5,8 +5,15 @@ import pytest
 import torch
 
 from training import editor_carries
+from training.card_sections import Kept
 from training.editing_pairs import GROUPS, LOOKS, SIZE, VIEWS, Worlds
-from training.editor_carries import Displaced, cases_of, swap_figures, warped_figure
+from training.editor_carries import (
+    Displaced,
+    carried_section,
+    cases_of,
+    swap_figures,
+    warped_figure,
+)
 
 COLORS = np.array([[220, 30, 30], [30, 30, 220], [30, 180, 40], [230, 220, 40]], np.uint8)
 
@@ -77,16 +84,62 @@ def test_features_that_carry_the_answer_and_where_score_so(
     worlds, monkeypatch, obeys, same, follows, keeps
 ):
     cases = cases_of(worlds, 64)
-    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size: cases)
+    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number=0: cases)
     monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(cases, obeys))
-    figures = swap_figures(None, worlds, size=64, rounds=2)
+    figures = swap_figures(None, worlds, size=64, pairs=2)
     assert [f.value for f in figures[:4]] == [same, same, follows, keeps]
+
+
+def test_rounds_of_other_pictures_go_on_until_every_question_has_as_many_pairs_as_asked(
+    worlds, monkeypatch, tmp_path
+):
+    """Six pictures answer two colours in each round; a stopped run takes up its rounds again."""
+    drawn = {n: cases_of(worlds, 64, n) for n in range(5)}
+    befores = {tuple(tuple(c.before[32, 32]) for c in cases) for cases in drawn.values()}
+    assert len(befores) == 5
+    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number: drawn[number])
+    ran = []
+
+    class Counted(Scripted):
+        def recorded(self, guides, noise):
+            ran.append(len(guides))
+            if len(ran) == 3:
+                raise KeyboardInterrupt
+            return super().recorded(guides, noise)
+
+    everything = [c for cases in drawn.values() for c in cases]
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Counted(everything, "carry"))
+    path = tmp_path / "kept.json"
+    with pytest.raises(KeyboardInterrupt):
+        swap_figures(None, worlds, size=64, pairs=12, kept=Kept(path))
+    figures = swap_figures(None, worlds, size=64, pairs=12, kept=Kept(path))
+    counts = {f.what: f.count for f in figures}
+    assert min(counts.values()) >= 12
+    rounds = len(ran) - 1
+    assert counts["features of the same picture make it their colour"] == 6 * rounds
+    # One round less would not have been enough; features of another picture are asked about least.
+    least = min(counts.values())
+    assert least - 6 < 12
+    section = carried_section(figures, 12)
+    assert "At least 12 swaps" in section and f"| {least} |" in section
+
+
+def test_an_editor_that_never_answers_comes_to_an_end(worlds, monkeypatch):
+    class Silent(Scripted):
+        def answers(self, guides, noise):
+            return list(guides)
+
+    cases = cases_of(worlds, 64)[:2]
+    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number: cases)
+    monkeypatch.setattr(editor_carries, "MOST_ROUNDS", 2)
+    monkeypatch.setattr(editor_carries, "Swap", lambda editor: Silent(cases, "carry"))
+    assert swap_figures(None, worlds, size=64, pairs=5) == []
 
 
 @pytest.mark.parametrize(("obeys", "clear"), [("carry", 1), ("ignore", 0)])
 def test_a_warp_that_is_displaced_is_told_from_the_true_one(worlds, monkeypatch, obeys, clear):
     cases = cases_of(worlds, 64)
-    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size: cases)
+    monkeypatch.setattr(editor_carries, "cases_of", lambda worlds, size, number=0: cases)
     monkeypatch.setattr(editor_carries, "Swap", lambda editor: Scripted(cases, obeys))
     figure = warped_figure(None, worlds, size=64, noises=3)
     assert (figure.value, figure.count) == (clear, 3)
