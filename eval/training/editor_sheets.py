@@ -1,8 +1,8 @@
-"""A sheet of what a bundled editor does: eight worlds that it has never seen, six instructions each."""
+"""A sheet of what a bundled editor does: eight worlds that it has never seen, six instructions or descriptions each."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +10,11 @@ import PIL.Image
 from PIL import ImageDraw
 
 from attnwarp.editing.editor import Image
+from training.depth_editor import Prompts
 from training.editing_pairs import GROUPS, SIZE, Worlds
-from training.editor_assess import Answer
+from training.editor_assess import Answer, picture_of
 from training.editor_pictures import Pictures, Row
+from training.worlds import NOUNS, OBJECTS
 
 INSTRUCTIONS = (
     "make it red",
@@ -22,6 +24,18 @@ INSTRUCTIONS = (
     "put it in the snow",
     "show it at sunset",
 )
+
+DESCRIPTIONS = (
+    "a red {} on grass",
+    "a blue {} on sand",
+    "a golden {} on tiles",
+    "a wooden {} in the snow",
+    "a white {} at night",
+    "a green {} at sunset",
+)
+
+DepthAnswer = Callable[[Prompts, Row, str, int], Image]
+"""The picture of a row's depth map, a description and a seed."""
 
 ROWS = 8
 SCALE = 2
@@ -41,22 +55,40 @@ def sheet(
     """
     pairs = Pictures(worlds, size)
     rows = []
+    for row in _spread(pairs):
+        before = picture_of(pairs, row, row.source).astype(np.float32)
+        rows.append([before, *(answer(before, text, row.world) for text in instructions)])
+    return _arranged(rows, ["before", *instructions])
+
+
+def depth_sheet(
+    draw: DepthAnswer, worlds: Worlds, *, size: int, descriptions: Sequence[str] = DESCRIPTIONS
+) -> PIL.Image.Image:
+    """A picture with a row a world: its depth map, nearer is brighter, then what each description gives.
+
+    Args:
+        draw: the editor: the picture of a row of prompts, a description and a seed.
+        worlds: of a test split; spread evenly over it.
+        size: of the pictures in px.
+        descriptions: one a column; braces stand for the thing.
+    """
+    prompts = Prompts(worlds, size)
+    rows = []
+    for row in _spread(prompts):
+        noun = NOUNS[OBJECTS[int(worlds.things[row.world])]][0]
+        drawn = [draw(prompts, row, d.format(noun), row.world) for d in descriptions]
+        rows.append([prompts.control(row), *drawn])
+    return _arranged(rows, ["depth", *(d.format("...") for d in descriptions)])
+
+
+def _spread(pairs: Pictures) -> Iterator[Row]:
+    """Pictures of :data:`ROWS` worlds, spread evenly over a split, each in its first colour."""
+    worlds, size = pairs.worlds, pairs.size
     for world in np.linspace(0, len(worlds) - 1, ROWS).astype(int).tolist():
         rng = np.random.default_rng([world, 6])
         color = next(k for k in GROUPS["color"] if worlds.valid[world, k])
-        row = Row(
-            world,
-            0,
-            color,
-            color,
-            "color",
-            False,
-            pairs.corner(world, 0, rng) if size < SIZE else (0, 0, 1),
-            False,
-        )
-        before = np.clip((pairs.picture(row, color) + 1) / 2, 0, 1).astype(np.float32)
-        rows.append([before, *(answer(before, text, world) for text in instructions)])
-    return _arranged(rows, ["before", *instructions])
+        corner = pairs.corner(world, 0, rng) if size < SIZE else (0, 0, 1)
+        yield Row(world, 0, color, color, "color", False, corner, False)
 
 
 def _arranged(rows: Sequence[Sequence[Image]], titles: Sequence[str]) -> PIL.Image.Image:

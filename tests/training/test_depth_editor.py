@@ -201,3 +201,4 @@ def test_an_editor_that_knows_every_answer_gets_all(worlds, monkeypatch):
     }  # fmt: skip
     card = depth_card("small-depth", results, facts)
     assert card.count("**100 %**") == len(results) == 5
+    assert "(../../../../reports/editor/small-depth.png)" in card
