@@ -187,7 +187,7 @@ def by_clip(
     from training.editor_by_clip import by_clip_section, judgements
 
     editor, size, kept = judged(name, weights, "by-clip")
-    worlds, judge = load_pairs(data, "edit-test"), load_encoder("clip-small")
+    worlds, judge = load_pairs(data, "edit-test"), load_encoder("clip-small", "clip")
     results = judgements(answers_of(editor), worlds, judge, kept, size=size, draws=draws)
     add_section(name, weights, by_clip_section(results, worlds=len(worlds), draws=draws))
 

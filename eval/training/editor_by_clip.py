@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -84,13 +85,8 @@ def judgements(
     for kind, name in JUDGED.items():
         rows = []
         for draw in range(draws):
-            rows += kept.get(
-                f"clip {kind} {len(worlds)} {draw}",
-                lambda kind=kind, draw=draw: [
-                    _judged(answer, worlds, encoder, kind, world, draw, size)
-                    for world in range(len(worlds))
-                ],
-            )
+            compute = partial(_drawn, answer, worlds, encoder, kind, draw, size)
+            rows += kept.get(f"clip {kind} {len(worlds)} {draw}", compute)
         editor, true, color, choices = np.array(rows).T
         ids = np.tile(np.arange(len(worlds)), draws)
         chance = float((1 / choices).mean())
@@ -104,9 +100,22 @@ def judgements(
     return results
 
 
+Found = tuple[bool, bool, bool, int]
+"""Of a picture, see :func:`_judged`."""
+
+
+def _drawn(
+    answer: Answer, worlds: Worlds, encoder: TextImageEncoder, kind: str, draw: int, size: int
+) -> list[Found]:
+    """One picture of every world."""
+    return [
+        _judged(answer, worlds, encoder, kind, world, draw, size) for world in range(len(worlds))
+    ]
+
+
 def _judged(
     answer: Answer, worlds: Worlds, encoder: TextImageEncoder, kind: str, world: int, draw: int, size: int
-) -> tuple[bool, bool, bool, int]:  # fmt: skip
+) -> Found:  # fmt: skip
     """Whether the judge finds the look in the editor's and in the true picture, whether its mean colour is right,
     and how many looks there were to choose from."""
     from attnwarp_eval.metrics import directional_similarity

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -113,7 +114,7 @@ def answered(
     for first in range(0, noises, BATCH):
         seeds = range(first, min(first + BATCH, noises))
         name = f"{question.kind} {question.world} {steps} {seeds.start}-{seeds.stop}"
-        counts.update(kept.get(name, lambda seeds=seeds: batch(seeds)))
+        counts.update(kept.get(name, partial(batch, seeds)))
     return counts
 
 
