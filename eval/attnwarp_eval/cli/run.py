@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +11,6 @@ import typer
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
 
 if TYPE_CHECKING:
-    from attnwarp.editing.editor import Guide
     from attnwarp_eval.study.cell import Cell
     from attnwarp_eval.study.record import Failure
     from attnwarp_eval.study.results import Results
@@ -105,11 +104,8 @@ def run(
             raise fail(f"{option}: needs --data; on scenes, a study names its editors itself")
     if data is not None:
         words = (instruction, target_prompt, source_prompt)
-        named: dict[Guide, str | None] = {"picture": editor, "depth": depth_editor}
-        editors = {guide: name for guide, name in named.items() if name is not None}
-        _run_on_capture(
-            lambda: load_study(study), data, ply, words, editors, device, out, size, scale
-        )
+        editors = (editor, depth_editor, device)
+        _run_on_capture(lambda: load_study(study), data, ply, words, editors, out, size, scale)
     elif dry_run:
         _print_plan(load, out)
     else:
@@ -121,8 +117,7 @@ def _run_on_capture(
     data: Path,
     ply: Path | None,
     words: tuple[str | None, str | None, str | None],
-    editors: Mapping[Guide, str],
-    device: str,
+    editors: tuple[str | None, str | None, str],
     out: Path | None,
     size: int | None,
     scale: int,
@@ -141,7 +136,7 @@ def _run_on_capture(
         if words[0] is None:
             raise InputError(f"--data {data}: needs --instruction, such as 'make it snow'")
         loaded = load()
-        by_guide = captured.Editors(editors, device)
+        by_guide = captured.Editors(*editors)
         folder = out or Path("runs") / f"{loaded.name}-{data.resolve().name}"
         try:
             dataset = read_dataset(data, points=False, scale=scale)

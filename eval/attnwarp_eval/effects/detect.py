@@ -302,8 +302,9 @@ def describe(scene: Scene, about: dict[str, Any]) -> Iterator[str]:
                 else f"{equal:.1f} times{_span(cost['interval'])}"
             )
         )
-        low, high = cost["again"]
-        yield f"  the plan's time against itself: {low:.2f} to {high:.2f}"
+        if cost["again"] is not None:
+            low, high = cost["again"]
+            yield f"  the plan's time against itself: {low:.2f} to {high:.2f}"
         if cap := cost["cap"]:
             whose = "the measured" if scene.spec.appearance.bounces == "auto" else "the scene's"
             if cap["bias"] is not None:

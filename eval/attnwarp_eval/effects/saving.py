@@ -72,7 +72,7 @@ class Cost:
         interval: 95 % of :attr:`at_equal_noise`, by resampling the rounds; None where the plan has
             no noise.
         again: 95 % of the ratio of the plan's seconds to its own, as it ran twice a round: inside
-            this band nothing is faster or slower.
+            this band nothing is faster or slower. None from too few rounds.
         cap: None where the scene has no cap.
 
     Example:
@@ -88,7 +88,7 @@ class Cost:
     faster: float
     variance: tuple[float, float]
     interval: tuple[float, float] | None
-    again: tuple[float, float]
+    again: tuple[float, float] | None
     cap: Cap | None = None
 
     @property
@@ -174,7 +174,7 @@ def measure(
         faster,
         (variance[0], variance[1]),
         interval,
-        (again.low, again.high),
+        (again.low, again.high) if again.bounded else None,
         cap,
     )
 

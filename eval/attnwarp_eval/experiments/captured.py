@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,16 +77,24 @@ class Editors:
     """What edits single views.
 
     Attributes:
-        named: by guide, a name or folders in place of the study's editors of that guide, as
-            :func:`attnwarp.editing.small.load_editor` takes it. A study's own guidance stays.
+        picture, depth: in place of the study's editors that take a picture, or depth maps: a name
+            or folders, as :func:`attnwarp.editing.small.load_editor` takes them; None keeps the
+            study's. A study's own guidance stays.
         device: "cpu" or "cuda".
 
     Raises:
         InputError: no such device or editor, or one of another guide.
     """
 
-    named: Mapping[Guide, str] = field(default_factory=dict)
+    picture: str | None = None
+    depth: str | None = None
     device: str = "cpu"
+
+    @property
+    def named(self) -> dict[Guide, str]:
+        """Those in place of the study's, by guide."""
+        given: dict[Guide, str | None] = {"picture": self.picture, "depth": self.depth}
+        return {guide: name for guide, name in given.items() if name is not None}
 
     def __post_init__(self) -> None:
         device_of(self.device)
