@@ -180,7 +180,7 @@ def by_clip(
     name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS,
     draws: Annotated[int, typer.Option(min=1, help="Pictures of each world and kind.")] = 2,
 ) -> None:  # fmt: skip
-    """Judge finish, ground and time of day by clip-small, into the card. Two minutes; a stopped run goes on."""
+    """Judge finish, ground and time of day by clip-small, into the card. Four minutes; a stopped run goes on."""
     from attnwarp.encoders import load_encoder
     from training.editing_pairs import load_pairs
     from training.editor_assess import answers_of
