@@ -62,6 +62,7 @@ def test_a_row_is_worked_out_from_its_measurements() -> None:
     assert row["gigapairs_per_second"] == pytest.approx(0.727, abs=5e-4)
 
 
+@pytest.mark.slow
 def test_a_small_run_ends_in_a_table() -> None:
     sizes = [(16, 40), (16, 80), (32, 40), (32, 160), (48, 100)]
     cases = [benchmarks.render.Case("2d", size, count, 0.1) for size, count in sizes]

@@ -424,6 +424,7 @@ def test_pck_is_the_share_counted_by_hand(monkeypatch):
     assert found["middle of the thing"].value == near.mean()
 
 
+@pytest.mark.slow
 def test_parts_of_rendered_worlds_are_found_by_who_knows_their_points_and_by_chance_else(
     monkeypatch,
 ):

@@ -75,7 +75,7 @@ def test_no_instruction_of_the_scenes_is_ever_drawn():
     assert reserved() == theirs
     rng = np.random.default_rng(0)
     drawn, refused = set(), set()
-    for k in range(6000):
+    for k in range(3000):
         looks, _, _ = cached_looks(k % 25)
         kind = list(GROUPS)[k % len(GROUPS)]
         look = looks[int(rng.choice(list(GROUPS[kind])))]
@@ -159,6 +159,7 @@ def checkpoint(folder):
     return torch.load(folder / "drawn.pt", weights_only=True)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
     data, tmp_path, tokenizer, monkeypatch
 ):

@@ -133,6 +133,7 @@ def pictures():
     return drawn()
 
 
+@pytest.mark.slow
 def test_who_reads_everything_is_right_and_who_guesses_is_right_by_chance(pictures):
     for f in part_assess.part_figures(Reading(pictures), pictures):
         # Now and then two directions of many features are alike, or two words for a part meet.
