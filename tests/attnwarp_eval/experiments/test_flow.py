@@ -43,6 +43,7 @@ def test_yaws_that_are_no_degrees_are_one_line(tmp_path, yaws):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
     result = run(tmp_path, "--yaws", "5")
     (row,) = json.loads((tmp_path / "flow.json").read_text())
