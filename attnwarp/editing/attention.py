@@ -167,6 +167,11 @@ class RecordingPlan:
         dtype: of what is stored. Half precision halves the memory and rounds.
         store: "device" leaves features where they are made, "cpu" moves them to main memory, a
             Path of a folder writes them there. Each recording has a folder of its own in it.
+        chosen: numbers of the steps to record, from 0; all of them if left out. The others are
+            neither stored nor injected, so half of the steps take half of the memory.
+
+    Raises:
+        ValueError: nothing to record, or an unknown branch, step or store; the message names it.
 
     Example:
         >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
@@ -175,6 +180,9 @@ class RecordingPlan:
         True
         >>> print(plan)
         recording 1 layer, 1 branch (text), 20 steps in float32: 5.0 MiB on the device
+        >>> from dataclasses import replace
+        >>> print(replace(plan, chosen=range(10)))
+        recording 1 layer, 1 branch (text), 10 of 20 steps in float32: 2.5 MiB on the device
     """
 
     layers: tuple[Layer, ...]
@@ -185,6 +193,7 @@ class RecordingPlan:
     views: int = 1
     dtype: torch.dtype = torch.float32
     store: Literal["device", "cpu"] | Path = "device"
+    chosen: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -202,6 +211,22 @@ class RecordingPlan:
                 f"steps, views, latent_size: got {self.steps}, {self.views}, {self.latent_size},"
                 " expected at least 1"
             )
+        if self.chosen is not None:
+            for number in self.chosen:
+                check.number(number, 0, self.steps - 1, "chosen", whole=True)
+            if not self.chosen:
+                raise ValueError("chosen: got no step, expected at least one")
+
+    @property
+    def recorded(self) -> frozenset[int]:
+        """Numbers of the steps that are stored, from 0.
+
+        Example:
+            >>> layer = Layer("up_blocks.1.attentions.0.transformer_blocks.0.attn1", "self", 0, 64)
+            >>> sorted(RecordingPlan((layer,), (8, 8), ("text",), ("text",), steps=3).recorded)
+            [0, 1, 2]
+        """
+        return frozenset(range(self.steps) if self.chosen is None else self.chosen)
 
     @property
     def bytes(self) -> int:
@@ -210,7 +235,7 @@ class RecordingPlan:
         for layer in self.layers:
             h, w = layer.size(self.latent_size)
             values += h * w * layer.channels
-        return values * len(self.keep) * self.views * self.steps * self.dtype.itemsize
+        return values * len(self.keep) * self.views * len(self.recorded) * self.dtype.itemsize
 
     def __str__(self) -> str:
         return in_words([self])
@@ -240,11 +265,13 @@ def in_words(plans: Sequence[RecordingPlan]) -> str:
     sources = f"{len(plans)} sources, " if len(plans) > 1 else ""
     places = {"device": "on the device", "cpu": "in main memory"}
     folders = [plan.store for plan in plans if isinstance(plan.store, Path)]
+    some = len(first.recorded)
+    some_of = "" if some == first.steps else f"{some} of "
     place = f"in {os.path.commonpath(folders)}" if folders else places[str(first.store)]
     return (
         f"recording {sources}{counted(len(first.layers), 'layer')},"
         f" {counted(len(first.keep), 'branch')} ({', '.join(first.keep)}),"
-        f" {counted(first.steps, 'step')} in {kind}: {size} {place}"
+        f" {some_of}{counted(first.steps, 'step')} in {kind}: {size} {place}"
     )
 
 
@@ -254,7 +281,7 @@ class Recording:
 
     Attributes:
         plan: what was recorded.
-        timesteps: of the steps recorded so far, in their order.
+        timesteps: of the steps so far, in their order, those without features included.
     """
 
     plan: RecordingPlan
@@ -287,7 +314,13 @@ class Recording:
         Raises:
             ValueError: not recorded; the message names what is.
         """
-        self.step_of(timestep)
+        number = self.step_of(timestep)
+        if number not in self.plan.recorded:
+            listed = ", ".join(map(str, sorted(self.plan.recorded)))
+            raise ValueError(
+                f"timestep: {timestep:g} is step {number}, whose features were not chosen; those"
+                f" of {listed} were"
+            )
         if layer not in self.plan.layers:
             raise ValueError(f"layer: {layer.name} was not recorded")
         check.one_of(branch, self.plan.keep, "branch")
@@ -301,10 +334,10 @@ class Recording:
         return value[row : row + views]
 
     def step_of(self, timestep: float) -> int:
-        """The number of a timestep among the recorded ones, from 0.
+        """The number of a timestep among those of the recorded run, from 0.
 
         Raises:
-            ValueError: that timestep was not recorded.
+            ValueError: the run had no such timestep.
         """
         if timestep not in self.timesteps:
             listed = ", ".join(f"{t:g}" for t in self.timesteps) or "none"
@@ -424,7 +457,7 @@ def record(
     if announce is not None:
         announce(str(plan))
     recording = Recording(plan)
-    rows = len(plan.branches) * plan.views
+    rows, chosen = len(plan.branches) * plan.views, plan.recorded
 
     def keep(layer: Layer, features: Tensor, call: Call) -> None:
         _check_call(plan, call, rows)
@@ -434,6 +467,8 @@ def record(
                     f"steps: timestep {call.timestep:g} is one more than the {plan.steps} planned"
                 )
             recording.timesteps.append(call.timestep)
+        if recording.step_of(call.timestep) not in chosen:
+            return
         parts = features.chunk(len(plan.branches))
         selected = torch.cat([parts[plan.branches.index(branch)] for branch in plan.keep])
         recording.put(call.timestep, layer, selected)
@@ -489,7 +524,8 @@ def inject(
 ) -> Iterator[None]:
     """Blend recorded features into the UNet's attention while the block runs.
 
-    F = a (M warp(F_src) + (1 - M) F_new) + (1 - a) F_new, at each layer's own size.
+    F = a (M warp(F_src) + (1 - M) F_new) + (1 - a) F_new, at each layer's own size. Steps whose
+    features were not chosen stay as they are.
 
     Args:
         unet: the UNet that the features came from, or one of its shape.
@@ -524,7 +560,7 @@ def inject(
         True
     """
     weight = decay() if weight is None else weight
-    plan = recording.plan
+    plan, recorded = recording.plan, recording.plan.recorded
     chosen = plan.layers if layers is None else tuple(layers)
     for layer in chosen:
         if layer not in plan.layers:
@@ -550,7 +586,10 @@ def inject(
         if mask is not None:
             h, w = mask.shape
             check.same_aspect((h, w), call.latent_size, "mask", "transpose a mask of (W, H)")
-        alpha = weight(recording.step_of(call.timestep), plan.steps)
+        number = recording.step_of(call.timestep)
+        if number not in recorded:
+            return features
+        alpha = weight(number, plan.steps)
         _check_share(alpha, "weight")
         if alpha == 0:
             return features

@@ -216,6 +216,7 @@ class ViewEditor:
             s.steps,
             dtype=torch.float16 if s.feature_type == "float16" else torch.float32,
             store=self.store / str(view) if isinstance(self.store, Path) else self.store,
+            chosen=s.feature_range(),
         )
 
     def _source_guidance(self) -> float | None:

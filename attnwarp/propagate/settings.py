@@ -92,6 +92,8 @@ class PropagateSettings:
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
         fractions, kinds, blocks: layers, :func:`attnwarp.editing.attention.choose_layers`.
+        feature_steps: (from, until) shares of the steps whose features are recorded and injected.
+            The others leave every view its own: [0, 0.5] halves the memory.
         branches: guidance branches that get features. None: text and image of InstructPix2Pix,
             both of a ControlNet.
         feature_type: of the recorded features; float16 halves their memory and rounds.
@@ -154,6 +156,7 @@ class PropagateSettings:
     fractions: tuple[float, ...] = (1.0, 0.5)
     kinds: tuple[Kind, ...] = ("self", "cross")
     blocks: tuple[Block, ...] = ("up",)
+    feature_steps: tuple[float, float] = (0.0, 1.0)
     branches: tuple[str, ...] | None = None
     feature_type: FeatureType = "float32"
     composite: Composite = "original"
@@ -181,7 +184,7 @@ class PropagateSettings:
         self._check_latents()
         if not isinstance(self.warp, WarpSettings):
             raise ValueError(f"warp: got {self.warp!r}, expected WarpSettings")
-        for name in ("fractions", "kinds", "blocks", "branches", "start"):
+        for name in ("fractions", "kinds", "blocks", "feature_steps", "branches", "start"):
             value = getattr(self, name)
             if isinstance(value, list):
                 object.__setattr__(self, name, tuple(value))
@@ -194,6 +197,12 @@ class PropagateSettings:
             if value is not None or name not in _OPTIONAL:
                 check.number(value, low, high, name, whole=name in _WHOLE)
         _check_start(self.start)
+        _check_feature_steps(self.feature_steps)
+        if not self.feature_range():
+            raise ValueError(
+                f"feature_steps: got {list(self.feature_steps)}, in which none of {self.steps}"
+                " steps begins; widen it, or take more steps"
+            )
         if self.guidance_drop > 0 and self.text_guidance is None:
             raise ValueError(
                 f"guidance_drop: got {self.guidance_drop:g} without text_guidance, which it is"
@@ -262,8 +271,20 @@ class PropagateSettings:
             return None
         return self.text_guidance - self.guidance_drop * stage
 
+    def feature_range(self) -> range:
+        """Numbers of the steps whose features are recorded and injected, from 0.
 
-_LATER = ("latents", "source_prompt")
+        Example:
+            >>> from attnwarp.propagate import preset
+            >>> preset("corrected", steps=20, feature_steps=(0.0, 0.3)).feature_range()
+            range(0, 6)
+        """
+        # 0.1 * 30 is above 3 in floats: a share that names a step exactly means that step.
+        first, end = (math.ceil(share * self.steps - 1e-9) for share in self.feature_steps)
+        return range(first, end)
+
+
+_LATER = ("latents", "source_prompt", "feature_steps")
 _WHOLE = {
     "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
 }  # fmt: skip
@@ -302,6 +323,15 @@ def _check_start(start: tuple[int, int] | None) -> None:
         raise ValueError(
             f"start: got {list(start)}, expected [lowest, highest] timestep of Stable Diffusion, in"
             f" [0, {PUBLISHED_STEPS - 1}]"
+        )
+
+
+def _check_feature_steps(shares: tuple[float, float]) -> None:
+    right = len(shares) == 2 and all(type(share) in (int, float) for share in shares)
+    if not right or not 0 <= shares[0] < shares[1] <= 1:
+        raise ValueError(
+            f"feature_steps: got {list(shares)}, expected [from, until] shares of the steps, with"
+            " 0 <= from < until <= 1"
         )
 
 

@@ -358,6 +358,32 @@ def test_the_memory_is_what_was_announced_and_features_come_back_from_where_they
         assert len(files) == 2 * len(plan.layers)
 
 
+def test_chosen_steps_alone_are_stored_and_injected():
+    """Oracle: the whole recording, injected with a weight of 0 at the other steps."""
+    net = unet(8)
+    timesteps = (981, 721, 481, 241)
+    with record(net, plan_of(net, steps=4)) as whole:
+        run(net, timesteps=timesteps)
+    with record(net, plan_of(net, steps=4, chosen=[2, 0])) as some:
+        run(net, timesteps=timesteps)
+    assert some.timesteps == whole.timesteps
+    assert some.bytes == some.plan.bytes == whole.bytes / 2
+    assert "2 of 4 steps in float32" in str(some.plan)
+    layer = some.plan.layers[0]
+    assert torch.equal(some.features(481.0, layer, "text"), whole.features(481.0, layer, "text"))
+    with pytest.raises(ValueError, match="timestep: 721 is step 1, .* not chosen; those of 0, 2"):
+        some.features(721.0, layer, "text")
+
+    weights = [0.9, 0.0, 0.45, 0.0]
+    with inject(net, whole, branches=PIX2PIX_BRANCHES, weight=lambda step, steps: weights[step]):
+        expected = run(net, seed=1, timesteps=timesteps)
+    with inject(net, some, branches=PIX2PIX_BRANCHES):  # the paper's weights, by the run's steps
+        got = run(net, seed=1, timesteps=timesteps)
+    assert torch.equal(got, expected)
+    alone = run(net, seed=1, timesteps=timesteps)
+    assert [torch.equal(*pair) for pair in zip(got, alone, strict=True)] == [False, True, False, True]  # fmt: skip
+
+
 def test_recordings_in_one_folder_keep_their_own_features(tmp_path):
     """Oracle: the same recordings in memory."""
     net = unet(8)
@@ -423,6 +449,9 @@ def test_what_does_not_match_the_recording_is_refused_by_name():
         run(net)
     with pytest.raises(ValueError, match="timestep: 981 came twice"), record(net, plan_of(net)):
         run(net, timesteps=(981, 981))
+    for chosen, message in (([2], "got 2"), ([-1], "got -1"), ([0.5], "got 0.5"), ([], "no step")):
+        with pytest.raises(ValueError, match=f"chosen: .*{message}"):
+            plan_of(net, chosen=chosen)
     with pytest.raises(ValueError, match="keep: got 'control'"):
         plan_of(net, keep=("control",))
     for store in ("gpu", "disk", "a/folder"):  # no word is taken for a folder's name

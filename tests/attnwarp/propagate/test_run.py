@@ -921,6 +921,31 @@ def test_half_precision_halves_the_features_and_rounds_them_once(scene, editor):
             assert torch.equal(half.features(timestep, layer, "text"), exact.half())
 
 
+def test_features_of_chosen_steps_alone_reach_a_target(scene, editor):
+    """Oracle: a recording of all steps, with the first steps' weights alone."""
+    from attnwarp.editing.attention import decay, inject
+    from attnwarp.editing.editor import edit
+    from attnwarp.propagate.editing import Target, ViewEditor
+
+    settings = replace(QUICK, feature_steps=(0.0, 0.5))
+    some, whole = (ViewEditor(editor, "a bear", choice) for choice in (settings, QUICK))
+    source = some.source(Target(0, scene[2][0]))
+    everything = whole.source(Target(0, scene[2][0])).recording
+    first = settings.feature_range()
+    assert len(first) == QUICK.steps // 2 and 2 * source.recording.bytes == everything.bytes
+    target = Target(1, scene[2][1])
+    with inject(
+        editor.unet,
+        everything,
+        branches=editor.branches,
+        weight=lambda step, steps: decay()(step, steps) if step in first else 0.0,
+    ):
+        expected = edit(
+            editor, [target.guide], "a bear", steps=QUICK.steps, noise=whole.noise([target])
+        )
+    assert (some.targets([source], [target], 0)[0] == expected.images[0]).all()
+
+
 IDEAS = {
     "sources": {"sources": 3},
     "surface noise": {"noise": "surface"},

@@ -56,12 +56,28 @@ def test_settings_survive_json(name):
 
 def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
     """Folders and cells of studies are compared by it."""
-    later = {"latents", "source_prompt"}
+    later = {"latents", "source_prompt", "feature_steps"}
     assert not any(later & set(settings.to_dict()) for settings in PRESETS.values())
-    inverted = preset("corrected", latents="inversion", source_prompt="a bear")
-    data = json.loads(json.dumps(inverted.to_dict()))
-    assert {name: data[name] for name in later} == {"latents": "inversion", "source_prompt": "a bear"}  # fmt: skip
-    assert PropagateSettings.from_dict(data) == inverted
+    chosen = {"latents": "inversion", "source_prompt": "a bear", "feature_steps": [0.0, 0.5]}
+    changed = preset("corrected", **chosen)
+    data = json.loads(json.dumps(changed.to_dict()))
+    assert {name: data[name] for name in later} == chosen
+    assert PropagateSettings.from_dict(data) == changed
+
+
+@pytest.mark.parametrize(
+    ("steps", "shares", "numbers"),
+    [
+        (20, (0.0, 1.0), range(20)),
+        (20, (0.0, 0.5), range(10)),
+        (20, (0.5, 1.0), range(10, 20)),
+        (30, (0.1, 0.7), range(3, 21)),  # both products are off by a rounding in floats
+        (3, (0.0, 0.5), range(2)),  # steps 0 and 1 begin before half of the way
+        (1, (0.0, 0.2), range(1)),
+    ],
+)
+def test_shares_of_the_steps_are_those_that_begin_within(steps, shares, numbers):
+    assert preset("corrected", steps=steps, feature_steps=shares).feature_range() == numbers
 
 
 @pytest.mark.parametrize(
@@ -97,6 +113,13 @@ def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
         ),
         ({"source_prompt": "a bear"}, "source_prompt: got 'a bear' with random latents; set"),
         ({"latents": "inversion", "source_prompt": 5}, "source_prompt: got 5, expected a string"),
+        ({"feature_steps": 5}, "feature_steps: got 5, expected a list"),
+        ({"feature_steps": ["0", 1]}, r"feature_steps: got \['0', 1\], expected \[from, until\]"),
+        ({"feature_steps": [0.5, 0.5]}, r"feature_steps: .* 0 <= from < until <= 1"),
+        (
+            {"feature_steps": [0.6, 0.7], "steps": 2},
+            r"feature_steps: got \[0.6, 0.7\], in which none of 2 steps begins; widen it",
+        ),
         ({"warp": 3, "warp.opaque": 0.9}, "warp: got 3, expected its fields by name"),
     ],
 )
