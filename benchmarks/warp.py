@@ -1,8 +1,10 @@
 """How fast views and attention features are warped: ``python -m benchmarks.warp``.
 
 One process. All contestants run in turn (:func:`attnwarp_eval.cost.in_turn`), so that a slow moment
-of the machine falls on all of them. The table has the median over rounds, and ratios are medians of
-the ratios within a round.
+of the machine falls on all of them. The table has the median over rounds. A ratio is the median of
+the wall seconds' ratios within a round, with its 95 % interval (by order statistics, see
+:func:`attnwarp_eval.statistics.intervals.time_ratio`). What a ratio is taken to runs twice a round:
+its ratio to itself is what the machine's noise alone does.
 
 - A pair: the correspondence, every rule and the mask at image size, and feature grids of 1/8 and
   1/16; beside it the definition in torch, and the render of the target that it starts from.
@@ -13,14 +15,13 @@ the ratios within a round.
 The yardstick of memory is a copy of the bytes that a warp must move, the source's tokens once and
 the result's once, by the same threads in the same rounds. A warp's share of the bandwidth is the
 copy's time over its own; a blend moves other bytes and has none. Taps counted are those of weight
-above 0, times channels.
+above 0, times channels. Processor time is that of all threads; torch's spin while they wait.
 """
 
 from __future__ import annotations
 
 import math
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,6 +37,7 @@ from attnwarp.render.threads import ranges, run_jobs, thread_count
 from attnwarp.warp import FeatureWarp, WarpedView, render_surface, warp_surfaces
 from attnwarp.warp._kernels import sampling
 from attnwarp_eval.cost import in_turn
+from attnwarp_eval.statistics.intervals import time_ratio
 from benchmarks import command
 
 SPLATS = 40_000
@@ -55,23 +57,31 @@ class Case:
     wall: dict[str, list[float]] = field(default_factory=dict)
     cpu: dict[str, list[float]] = field(default_factory=dict)
 
+    @property
+    def runs(self) -> dict[str, Callable[[], object]]:
+        """All that takes turns: the contestants, and the yardstick once more."""
+        return {**self.contestants, f"{self.yardstick}, again": self.contestants[self.yardstick]}
+
     def rows(self) -> list[dict[str, Any]]:
-        """One line of the table for each contestant."""
-        base = self.cpu[self.yardstick]
-        return [
-            {
-                "case": self.name,
-                "contestant": name,
-                "wall_ms": 1e3 * statistics.median(self.wall[name]),
-                "wall_best_ms": 1e3 * min(self.wall[name]),
-                "cpu_ms": 1e3 * statistics.median(self.cpu[name]),
-                f"times_{self.yardstick}": statistics.median(
-                    a / b for a, b in zip(self.cpu[name], base, strict=True)
-                ),
-                **self.counters,
-            }
-            for name in self.contestants
-        ]
+        """One line of the table for each contestant, and for the yardstick against itself."""
+        base = self.wall[self.yardstick]
+        rows = []
+        for name in self.runs:
+            ratio = time_ratio([self.wall[name]], [base])
+            known = not math.isnan(ratio.low)
+            rows.append(
+                {
+                    "case": self.name,
+                    "contestant": name,
+                    "wall_ms": 1e3 * statistics.median(self.wall[name]),
+                    "wall_best_ms": 1e3 * min(self.wall[name]),
+                    "cpu_ms": 1e3 * statistics.median(self.cpu[name]),
+                    f"times_{self.yardstick}": ratio.ratio,
+                    "interval": [ratio.low, ratio.high] if known else None,
+                    **self.counters,
+                }
+            )
+        return rows
 
 
 def shell(count: int = SPLATS) -> Gaussians:
@@ -177,23 +187,21 @@ def _others(layer: FeatureWarp, maps: Tensor) -> dict[str, Callable[[], object]]
     }
 
 
-def _timed(work: Callable[[], object]) -> Callable[[int], float]:
-    """The processor time in seconds of ``work``."""
+def _dropping(work: Callable[[], object]) -> Callable[[int], None]:
+    """``work`` without its result, which would fill the memory round by round."""
 
-    def timed(_: int) -> float:
-        start = time.process_time()
+    def run(_: int) -> None:
         work()
-        return time.process_time() - start
 
-    return timed
+    return run
 
 
 def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
     """Time the cases; all of the table, as JSON values."""
-    entries = [(case, name) for case in cases for name in case.contestants]
+    entries = [(case, name, work) for case in cases for name, work in case.runs.items()]
     with torch.no_grad():
-        turns = in_turn([_timed(case.contestants[name]) for case, name in entries], rounds)
-    for (case, name), wall, cpu in zip(entries, turns.seconds, turns.results, strict=True):
+        turns = in_turn([_dropping(work) for *_, work in entries], rounds)
+    for (case, name, _), wall, cpu in zip(entries, turns.seconds, turns.cpu, strict=True):
         case.wall[name], case.cpu[name] = wall, cpu
     rows = [row for case in cases for row in case.rows()]
     for row in rows:
@@ -205,7 +213,8 @@ def run(cases: Sequence[Case], rounds: int) -> dict[str, Any]:
 def table(result: dict[str, Any]) -> str:
     """The result for a person, as Markdown."""
     lines = [
-        f"{result['threads']} threads, {result['rounds']} rounds, medians; ratios of cpu time",
+        f"{result['threads']} threads, {result['rounds']} rounds, medians; ratios of wall time,"
+        " [95 %]",
         "",
         "| case | contestant | wall ms (best) | cpu ms | of the render | of a copy | of bandwidth"
         " | Mtaps |",
@@ -217,13 +226,20 @@ def table(result: dict[str, Any]) -> str:
             row["contestant"],
             f"{row['wall_ms']:.2f} ({row['wall_best_ms']:.2f})",
             f"{row['cpu_ms']:.2f}",
-            f"{row['times_render']:.2f}" if "times_render" in row else "",
-            f"{row['times_copy']:.2f}" if "times_copy" in row else "",
+            _ratio(row, "times_render"),
+            _ratio(row, "times_copy"),
             f"{100 * row['bandwidth_share']:.0f} %" if "bandwidth_share" in row else "",
             f"{row['taps'] / 1e6:.1f}" if "taps" in row else "",
         ]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _ratio(row: dict[str, Any], key: str) -> str:
+    if key not in row:
+        return ""
+    bounds = "" if row["interval"] is None else " [{:.2f}, {:.2f}]".format(*row["interval"])
+    return f"{row[key]:.2f}{bounds}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

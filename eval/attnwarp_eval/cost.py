@@ -109,11 +109,13 @@ class Turns(Generic[T]):
     Attributes:
         results: contestant -> round -> what it returned.
         seconds: contestant -> round -> wall seconds.
-        again: round -> seconds of the first contestant's second run.
+        cpu: contestant -> round -> seconds of all of this process's threads together.
+        again: round -> wall seconds of the first contestant's second run.
     """
 
     results: list[list[T]]
     seconds: list[list[float]]
+    cpu: list[list[float]]
     again: list[float]
 
 
@@ -152,18 +154,20 @@ def in_turn(
     rng = np.random.default_rng(seed)
     results: list[list[T]] = [[] for _ in contestants]
     seconds: list[list[float]] = [[] for _ in range(count + 1)]
+    cpu: list[list[float]] = [[] for _ in range(count + 1)]
     for turn in range(rounds + 1):
         for place in rng.permutation(count + 1):
             index, again = int(place) % count, place == count
             before(index)
-            start = time.perf_counter()
+            start, start_cpu = time.perf_counter(), time.process_time()
             result = contestants[index](turn + AGAIN if again else turn)
-            taken = time.perf_counter() - start
+            taken, taken_cpu = time.perf_counter() - start, time.process_time() - start_cpu
             if turn:
                 seconds[place].append(taken)
+                cpu[place].append(taken_cpu)
                 if not again:
                     results[index].append(result)
-    return Turns(results, seconds[:count], seconds[count])
+    return Turns(results, seconds[:count], cpu[:count], seconds[count])
 
 
 def peak_memory_mb() -> float:

@@ -35,6 +35,7 @@ def test_the_order_depends_on_the_seed_alone():
 def test_seconds_are_those_of_the_contestant_and_not_of_what_comes_before_it(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(cost.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(cost.time, "process_time", lambda: 2 * clock[0])  # two busy threads
 
     def takes(seconds):
         def work(turn):
@@ -47,6 +48,7 @@ def test_seconds_are_those_of_the_contestant_and_not_of_what_comes_before_it(mon
 
     turns = cost.in_turn([takes(2), takes(8)], 3, before=wait)
     assert turns.seconds == [[2, 4, 6], [8, 16, 24]] and turns.again == [2, 4, 6]
+    assert turns.cpu == [[4, 8, 12], [16, 32, 48]]
 
 
 def test_a_contestant_that_fails_ends_the_measurement():

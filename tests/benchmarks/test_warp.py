@@ -14,10 +14,15 @@ def test_a_small_run_ends_in_a_table() -> None:
         warp.tokens_case(8, 16, torch.float32, others=True),
         warp.tokens_case(8, 16, torch.bfloat16, others=False),
     ]
-    result = warp.run(cases, rounds=2)
+    result = warp.run(cases, rounds=6)
     copies = [row for row in result["rows"] if row["contestant"] == "copy"]
     assert [row["bytes"] for row in copies] == [2 * 2 * 64 * 16 * size for size in (4, 2)]
     assert all(row["bandwidth_share"] == pytest.approx(1) for row in copies)
+    assert all(row["interval"] == pytest.approx([1, 1]) for row in copies)
+    again = [row for row in result["rows"] if row["contestant"].endswith(", again")]
+    assert [row["contestant"] for row in again] == ["render, again", "copy, again", "copy, again"]
+    for row in again:  # the same work a second time: its ratio is noise, and is not 1 by definition
+        assert 0 < row["interval"][0] <= row["interval"][1] and row["interval"] != [1, 1]
     assert all(0 < row["taps"] <= 4 * 2 * 64 * 16 for row in copies)
     assert all(0 < row["wall_best_ms"] <= row["wall_ms"] for row in result["rows"])
     text = warp.table(result)
