@@ -39,6 +39,9 @@ def run(
     scenes: Annotated[
         str | None, typer.Option(help="Only these scenes (comma-separated names or paths).")
     ] = None,
+    seeds: Annotated[
+        str | None, typer.Option(help="Only these seeds (comma-separated whole numbers).")
+    ] = None,
     size: Annotated[
         int | None, typer.Option(min=16, max=4096, help="Image size in px, not the study's.")
     ] = None,
@@ -91,8 +94,9 @@ def run(
     from attnwarp_eval.study.study import load_study
 
     def load() -> Study:
-        return load_study(study, scenes=names(scenes), size=size)
+        return load_study(study, scenes=names(scenes), seeds=drawn, size=size)
 
+    drawn = _whole_numbers(seeds, "--seeds")
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
     for option, given in (
@@ -105,7 +109,9 @@ def run(
     if data is not None:
         words = (instruction, target_prompt, source_prompt)
         editors = (editor, depth_editor, device)
-        _run_on_capture(lambda: load_study(study), data, ply, words, editors, out, size, scale)
+        _run_on_capture(
+            lambda: load_study(study, seeds=drawn), data, ply, words, editors, out, size, scale
+        )
     elif dry_run:
         _print_plan(load, out)
     else:
@@ -193,6 +199,16 @@ def _who(cell: Cell) -> str:
     if cell.labels and cell.variant not in cell.labels:
         return f"{', '.join(cell.labels)} (in turn)"
     return " = ".join(cell.labels) or cell.variant
+
+
+def _whole_numbers(text: str | None, option: str) -> list[int] | None:
+    """Those of a comma-separated option; None if it was left out."""
+    parts = names(text)
+    if parts is None:
+        return None
+    if not parts or not all(part.isdecimal() for part in parts):
+        raise fail(f"{option}: got {text!r}, expected whole numbers such as 0,1")
+    return [int(part) for part in parts]
 
 
 def run_study(

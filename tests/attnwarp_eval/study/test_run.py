@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import pathlib
+import re
 import shutil
 import signal
 import subprocess
@@ -98,6 +99,16 @@ def test_a_dry_run_names_the_variants_that_one_cell_times_in_turn(folder):
     # Of another content each, they are no names of one variant.
     assert done.exit_code == 0 and len(rows) == 1
     assert "corrected, released (in turn)" in rows[0] and "=" not in rows[0]
+
+
+def test_seeds_of_the_command_line_stand_in_for_the_studys(folder):
+    """Oracle: the number of cells, of which calibration alone has no seed."""
+    counts = []
+    for seeds in ("5", "5,3"):
+        done = call("run", "study.yaml", "--out", "never", "--dry-run", "--seeds", seeds)
+        assert done.exit_code == 0 and f"seeds {seeds.replace(',', ', ')};" in done.stdout
+        counts.append(int(re.search(r"(\d+) cells, 0 done", done.stdout)[1]))
+    assert counts == [CELLS, 2 * (CELLS - 1) + 1]
 
 
 def without_timings(run):
@@ -359,6 +370,8 @@ def children(pid):
     [
         (("run", "quik"), "did you mean 'quick'"),
         (("run", "study.yaml", "--scenes", "sphere"), "did you mean 'spheres'"),
+        (("run", "study.yaml", "--seeds", "0,one"), "--seeds: got '0,one', expected whole numbers"),
+        (("run", "study.yaml", "--seeds", ","), "--seeds: got ',', expected whole numbers"),
         (("run", "study.yaml", "--jobs", "0"), "jobs"),
         (("run", "study.yaml", "--out", "study.yaml"), "study.yaml: is a file, expected a run"),
         (("verify", "nowhere"), "attnwarp-eval run"),
