@@ -23,7 +23,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -37,6 +36,7 @@ from attnwarp.editing.attention import (
     inject,
     record,
 )
+from attnwarp_eval.cost import peak_memory_mb, reset_peak_memory
 from benchmarks import command
 
 LATENT_SIZE, TOKENS = 64, 77
@@ -118,7 +118,7 @@ def measure(
             raise SystemExit(f"{name}: the network's output is not finite")
         if isinstance(result, Recording):
             recorded.append(result)
-        peak = peak_memory() / 2**20
+        peak = peak_memory_mb()
         seconds = time.process_time() - cpu, time.perf_counter() - wall
         above = peak - results[0].peak_mib if results else 0.0
         results.append(Row(name, *seconds, peak, above))
@@ -126,18 +126,12 @@ def measure(
 
 
 def reset_peak() -> None:
-    """Let the kernel count this process's peak memory from now on. Memory that was freed is given
-    back first: a run that used it again would not show in the peak.
+    """Count this process's peak memory from now on. Memory that was freed is given back first: a
+    run that used it again would not show in the peak.
     """
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    Path("/proc/self/clear_refs").write_text("5")
-
-
-def peak_memory() -> int:
-    """Peak bytes of this process since :func:`reset_peak`."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    reset_peak_memory()
 
 
 def table(rows: Sequence[Row]) -> str:

@@ -12,7 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -170,9 +170,20 @@ def in_turn(
     return Turns(results, seconds[:count], cpu[:count], seconds[count])
 
 
+def reset_peak_memory() -> None:
+    """Count this process's peak memory from now on, where the system can (Linux).
+
+    Memory that was freed and kept for later use still counts.
+    """
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+
+
 def peak_memory_mb() -> float:
-    """Peak resident memory of this process so far, in MiB; earlier cells of the process are in
-    it."""
+    """Peak resident memory of this process in MiB, since :func:`reset_peak_memory` on Linux."""
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:"))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
 

@@ -97,7 +97,8 @@ class Cost:
     Attributes:
         seconds: by stage; None where there was nothing to time.
         counters: of work, such as pixels or pairs.
-        peak_memory_mb: of the process so far, MiB.
+        peak_memory_mb: of the process while it computed the cell, MiB, with what it held before;
+            of the process so far where the system cannot count anew (not Linux).
         threads: of the renderer.
     """
 

@@ -10,7 +10,7 @@ import torch
 
 from attnwarp.process import core_count
 from attnwarp.render.threads import set_thread_count, thread_count
-from attnwarp_eval.cost import Meter, environment, peak_memory_mb
+from attnwarp_eval.cost import Meter, environment, peak_memory_mb, reset_peak_memory
 from attnwarp_eval.study.cell import Cell
 from attnwarp_eval.study.plugins import load_plugins
 from attnwarp_eval.study.probes.base import Probe, Work
@@ -37,6 +37,7 @@ def compute(probe: Probe[Any], cell: Cell, root: Path, threads: int | None = Non
     torch.set_num_threads(1)
     set_thread_count(threads or core_count())
     meter = Meter()
+    reset_peak_memory()
     scene_world = None
     if probe.needs_scenes:
         with meter.stage("setup"):

@@ -8,6 +8,7 @@ import json
 import math
 import pathlib
 
+import numpy as np
 import pytest
 import yaml
 from chord_probe import Chord
@@ -18,6 +19,7 @@ from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, load_study
 from attnwarp_eval.study.probes import probes, register, unregister
 from attnwarp_eval.study.run import execute, plan, verify
+from attnwarp_eval.study.work import compute
 
 YAWS = (30, 90)
 STUDY = {
@@ -91,6 +93,22 @@ def test_a_probe_in_one_file_runs_through_study_store_resume_and_report(tmp_path
     assert execute(resumed, store).complete
     write_report(store, timings=False)
     assert {name: (store.root / name).read_bytes() for name in names} == before
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self/clear_refs").exists(), reason="not Linux")
+def test_a_cells_peak_memory_leaves_out_what_an_earlier_cell_had_freed(tmp_path, monkeypatch):
+    """Oracle: the array that the first cell held."""
+    measured = Chord.compute
+
+    def hungry(self, work):
+        if work.cell.labels[0] == "plain":
+            np.ones(2**26)  # 512 MiB, which go back to the system
+        return measured(self, work)
+
+    monkeypatch.setattr(Chord, "compute", hungry)
+    _, *cells = plan(load(tmp_path), Store(tmp_path / "run")).cells
+    first, second = (compute(Chord(), cell, tmp_path).cost.peak_memory_mb for cell in cells)
+    assert 450 < first - second < 600
 
 
 @pytest.mark.parametrize(
