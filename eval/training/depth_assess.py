@@ -73,7 +73,7 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
             mask = thing if kind in ("color", "material") else ~thing
             if mask.sum() < 12:
                 continue
-            text = _prompt(editor, prompts, row, rng)
+            text = prompt_of(editor, prompts, row, rng)
             image = draw(editor, prompts, row, text, seed=world)
             true = [
                 np.clip((prompts.picture(row, k) + 1) / 2, 0, 1).astype(np.float32) for k in choices
@@ -106,13 +106,18 @@ def assess_depth(editor: Any, prompts: Prompts) -> list[tuple[Figure, Figure]]:
 
 def draw(editor: Any, prompts: Prompts, row: Row, prompt: str, *, seed: int) -> Image:
     """A picture by the depth map of a row."""
-    y, x, n = row.corner
-    depth = prompts.worlds.depth[row.world, row.view]
-    depth = depth[y : y + n * prompts.size, x : x + n * prompts.size][n // 2 :: n, n // 2 :: n]
+    depth = depth_of(prompts, row)
     return edit(editor, [depth], prompt, steps=STEPS, seed=seed).images[0]
 
 
-def _prompt(editor: Any, prompts: Prompts, row: Row, rng: np.random.Generator) -> str:
+def depth_of(prompts: Prompts, row: Row) -> npt.NDArray[np.float32]:
+    """(S, S) depth map of a row."""
+    y, x, n = row.corner
+    depth = prompts.worlds.depth[row.world, row.view]
+    return depth[y : y + n * prompts.size, x : x + n * prompts.size][n // 2 :: n, n // 2 :: n]
+
+
+def prompt_of(editor: Any, prompts: Prompts, row: Row, rng: np.random.Generator) -> str:
     """Everything that a look shows, in as many words as the editor takes."""
     thing, finish, color, second, ground, time = (
         int(v) for v in attributes_of(prompts.worlds, row.world)[row.target]

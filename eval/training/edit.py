@@ -135,16 +135,17 @@ def exported(name: str, weights: Path) -> tuple[Any, int]:
     return editor, editor.unet.config.sample_size * editor.factor
 
 
-def judged(name: str, weights: Path, command: str) -> tuple[Any, int, Kept]:
-    """An editor that takes pictures, their side in px, and what a command has kept of it.
+def judged(name: str, weights: Path, command: str, guide: str = "picture") -> tuple[Any, int, Kept]:
+    """An editor of the right guide, the side of its pictures in px, and what a command has kept of it.
 
-    BadParameter: it takes depth maps.
+    BadParameter: it takes another guide, "picture" or "depth".
     """
     from attnwarp.editing.small import SUMS, guide_of
     from training.card_sections import Kept
 
-    if guide_of(str(weights / name)) != "picture":
-        message = f"{name} takes depth maps; give an editor of pictures, such as small-plain"
+    takes = {"picture": "pictures, such as small-plain", "depth": "depth maps, such as small-depth"}
+    if guide_of(str(weights / name)) != guide:
+        message = f"{name} takes {takes['depth' if guide == 'picture' else 'picture'].split(',')[0]}; give an editor of {takes[guide]}"
         raise typer.BadParameter(message, param_hint="NAME")
     editor, size = exported(name, weights)
     sums = hashlib.sha256((weights / name / SUMS).read_bytes()).hexdigest()
@@ -205,6 +206,18 @@ def carries(
     worlds = load_pairs(data, "edit-test")
     figures = editor_carries.carries(editor, worlds, size=size, pairs=pairs, kept=kept)
     add_section(name, weights, editor_carries.carried_section(figures, pairs))
+
+
+@app.command()
+def inverts(name: str, data: Data = CACHE / "data", weights: Cards = WEIGHTS) -> None:
+    """Rebuild pictures from their DDIM inversion by an editor of depth maps, into the card. Three minutes."""
+    from training import depth_inverts
+    from training.depth_editor import Prompts
+    from training.editing_pairs import load_pairs
+
+    editor, size, kept = judged(name, weights, "inverts", "depth")
+    rebuilt = depth_inverts.inverts(editor, Prompts(load_pairs(data, "edit-test"), size), kept)
+    add_section(name, weights, depth_inverts.inverts_section(rebuilt, size=size))
 
 
 @app.command()

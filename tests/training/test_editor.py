@@ -215,6 +215,7 @@ def test_a_training_that_was_stopped_gives_the_bits_of_one_that_was_not(
         (["export", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
         (["assess", "drawn-64", "small"], "expected one of plain, drawn, features, control, depth"),
         (["answers", "small-depth"], "small-depth takes depth maps; give an editor of pictures"),
+        (["inverts", "small"], "small takes pictures; give an editor of depth maps"),
     ],
 )
 def test_an_unknown_stage_device_or_editor_is_refused_by_name(words, reason):
