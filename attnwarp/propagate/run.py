@@ -402,10 +402,13 @@ class _Run:
         )
 
     def _shown(self, recording: Recording) -> tuple[Layer, torch.Tensor]:
-        """The layer whose features are shown as colours, and its (h w, C) features half-way."""
+        """The layer whose features are shown as colours, and its (h w, C) features half-way
+        through those that were recorded.
+        """
         plan = recording.plan
         layer = min(plan.layers, key=lambda layer: (layer.level, layer.kind != "self"))
-        timestep = recording.timesteps[len(recording.timesteps) // 2]
+        numbers = sorted(plan.recorded)
+        timestep = recording.timesteps[numbers[len(numbers) // 2]]
         return layer, recording.features(timestep, layer, plan.keep[0])[0].float()
 
     def _edit_stage(self, number: int, stage: tuple[int, ...]) -> None:

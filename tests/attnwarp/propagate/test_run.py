@@ -946,6 +946,22 @@ def test_features_of_chosen_steps_alone_reach_a_target(scene, editor):
     assert (some.targets([source], [target], 0)[0] == expected.images[0]).all()
 
 
+def test_an_edit_with_features_of_chosen_steps_is_written_and_resumed(scene, editor, tmp_path):
+    """Oracles: half of the bytes, and the same pictures from what is kept."""
+    settings = replace(QUICK, iterations=0, feature_steps=(0.0, 0.5))
+    first = run(scene, editor, tmp_path / "some", settings)
+    run(scene, editor, tmp_path / "all", replace(QUICK, iterations=0))
+    some, everything = (
+        json.loads((tmp_path / name / "source.json").read_text())["feature_bytes"]
+        for name in ("some", "all")
+    )
+    assert 2 * some == everything
+    (tmp_path / "some" / "features.png").stat()
+    again = run(scene, editor, tmp_path / "some", settings)
+    for view, picture in first.edited.items():
+        assert (again.edited[view] == picture).all()
+
+
 IDEAS = {
     "sources": {"sources": 3},
     "surface noise": {"noise": "surface"},
