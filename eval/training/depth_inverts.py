@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -75,10 +76,7 @@ def inverts(
     result = []
     for count in steps:
         pairs = [
-            kept.get(
-                f"{count} {world}",
-                lambda world=world, count=count: rebuild(editor, prompts, world, count),
-            )
+            kept.get(f"{count} {world}", partial(rebuild, editor, prompts, world, count))
             for world in worlds.tolist()
         ]
         own, control = np.asarray(pairs).T

@@ -124,7 +124,8 @@ class Store:
         """Write the resolved study and its expected cells with their checksum. Cells of a former
         study stay.
         """
-        write_json(self.root / "study.json", {**study, "sha256": digest(study)})
+        # In the study's own order: seconds are taken on a scene's first edit.
+        write_json(self.root / "study.json", {**study, "sha256": digest(study)}, sort_keys=False)
 
     def read_study(self) -> dict[str, Any]:
         """The resolved study; without ``sha256`` where former code wrote it.

@@ -10,11 +10,12 @@ from ball_scene import SCENE
 from attnwarp_eval.document.numbers import number
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.scene.file import load_scene
-from attnwarp_eval.study import StudyError, cells_of, load_study
+from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes import editing, probe
 from attnwarp_eval.study.probes.base import Layout
 from attnwarp_eval.study.probes.editing import EditResult
+from attnwarp_eval.study.run import expected, plan, verify
 from attnwarp_eval.study.work import compute
 
 ROUNDS = 3
@@ -45,8 +46,20 @@ PLANNED = {
 
 def load(folder, **changes):
     (folder / "ball.yaml").write_text(yaml.safe_dump(SCENE))
-    (folder / "mine.yaml").write_text(yaml.safe_dump({**STUDY, **changes}))
+    (folder / "mine.yaml").write_text(yaml.safe_dump({**STUDY, **changes}, sort_keys=False))
     return load_study(str(folder / "mine.yaml"))
+
+
+def test_a_stored_study_times_the_edit_that_was_timed(tmp_path):
+    """The first of the file, which need not be the first by name."""
+    order = ["some_colour=red", "some_colour"]
+    study = load(tmp_path, editing={**STUDY["editing"], "edits": {"ball": dict.fromkeys(order)}})
+    store = Store(tmp_path / "run")
+    planned = plan(study, store)
+    (cell,) = (c for c in planned.cells if c.probe == "editing-timing")
+    assert order != sorted(order) and cell.spec["edit"]["name"] == order[0]
+    store.write_study(expected(planned))
+    assert not verify(store).damaged
 
 
 def test_every_setting_runs_once_a_round_with_the_network_passes_of_its_plan(
