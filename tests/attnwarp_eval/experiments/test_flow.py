@@ -77,6 +77,7 @@ def test_the_study_tells_views_that_agree_from_views_that_do_not(tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_a_study_that_was_interrupted_goes_on_and_ends_as_one_that_was_not(tmp_path, monkeypatch):
     real, measured = flow.measure_pair, []
 
