@@ -245,6 +245,10 @@ def heatmap(
     axes.set_title(title, loc="left", fontsize=9.5)
 
 
+MOST_NAMES = 12
+"""Of points in a figure of a front; more would cover one another's bars."""
+
+
 def cost_front(
     axes: Axes,
     points: Mapping[str, tuple[Interval, Interval]],
@@ -255,7 +259,8 @@ def cost_front(
     log: bool = True,
 ) -> list[str]:
     """Error against seconds with intervals on both axes; the front as a staircase, dominated points
-    in grey.
+    in grey. Of more than :data:`MOST_NAMES` points those on the front alone have names; the others
+    have them as titles.
 
     ``log``: whether the error's axis is logarithmic, as that of seconds always is.
 
@@ -279,9 +284,11 @@ def cost_front(
     error = [points[n][1].mean for n in names]
     on_front = front(cost, error)
     notes = []
+    known = np.isfinite(cost) & np.isfinite(error)
+    crowded = known.sum() > MOST_NAMES
     for i, name in enumerate(names):
         seconds, quality = points[name]
-        if not (np.isfinite(seconds.mean) and np.isfinite(quality.mean)):
+        if not known[i]:
             continue
         on = i in on_front
         colour = PALETTE[0] if on else "#999999"
@@ -296,17 +303,19 @@ def cost_front(
             capsize=2,
             xerr=_bars(seconds, True),
             yerr=_bars(quality, log),
+            zorder=3 if on and crowded else 2,
         )
-        notes.append(
-            axes.annotate(
-                name,
-                (seconds.mean, quality.mean),
-                textcoords="offset points",
-                xytext=(5, 5),
-                fontsize=7.5,
-                color=colour,
+        if on or not crowded:
+            notes.append(
+                axes.annotate(
+                    name,
+                    (seconds.mean, quality.mean),
+                    textcoords="offset points",
+                    xytext=(5, 5),
+                    fontsize=7.5,
+                    color=colour,
+                )
             )
-        )
         text = f"{name}: {spread(quality)} in {number(1000 * seconds.mean)} ms"
         hover(axes, seconds.mean, quality.mean, text)
     if on_front:

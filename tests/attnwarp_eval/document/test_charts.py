@@ -35,6 +35,18 @@ def test_names_at_a_front_do_not_cover_one_another(tmp_path, log) -> None:
     assert "variant 3" in (tmp_path / "front.svg").read_text()
 
 
+@pytest.mark.parametrize("dominated", [charts.MOST_NAMES - 2, charts.MOST_NAMES - 1])
+def test_a_crowded_front_names_its_own_points_and_the_others_in_titles(tmp_path, dominated) -> None:
+    points = {f"poor {k}": (around(5 + 0.1 * k), around(3.0)) for k in range(dominated)}
+    points |= {"fast": (around(1.0), around(2.0)), "exact": (around(2.0), around(1.0))}
+    with charts.drawing(tmp_path / "front.svg") as (axes,):
+        assert charts.cost_front(axes, points, x="s", y="e", title="f") == ["fast", "exact"]
+        names = {note.get_text() for note in axes.texts}
+    assert names == ({"fast", "exact"} if len(points) > charts.MOST_NAMES else set(points))
+    text = (tmp_path / "front.svg").read_text()
+    assert all(f"{name}: " in text for name in points)
+
+
 @pytest.mark.parametrize(("apart", "shifts"), [({}, (0, 0, 0)), ({"apart": 2.0}, (-2, 0, 2))])
 def test_lines_stand_where_their_numbers_are_or_apart_about_there(tmp_path, apart, shifts) -> None:
     series = [charts.Line(name, [0.5, 1.0], [around(1.0), around(2.0)]) for name in "abc"]
