@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from attnwarp.editing.editor import Image, edit, guided
+from attnwarp.editing.editor import edit, guided
 from attnwarp.editing.inversion import invert_view
+from attnwarp.losses import psnr_of_mse
 from training.assess import Figure, figure
 from training.card_sections import Kept
 from training.depth_assess import depth_of, prompt_of
@@ -42,11 +43,6 @@ class Rebuilt:
     enough: int
 
 
-def psnr(a: Image, b: Image) -> float:
-    """dB of pictures in [0, 1]."""
-    return float(-10 * np.log10(np.square(a.astype(np.float64) - b).mean()))
-
-
 def rebuild(editor: Any, prompts: Prompts, world: int, steps: int) -> tuple[float, float]:
     """PSNR of a world's picture rebuilt from its inversion, and of one drawn from other latents."""
     rng = np.random.default_rng([SEED, world, 6])
@@ -58,7 +54,9 @@ def rebuild(editor: Any, prompts: Prompts, world: int, steps: int) -> tuple[floa
     with guided(editor, 1.0):  # what was inverted without guidance is rebuilt without
         again = edit(editor, [depth], text, steps=steps, latents=latents).images[0]
         other = edit(editor, [depth], text, steps=steps, seed=world).images[0]
-    return psnr(again, picture), psnr(other, picture)
+    errors = (np.square(image.astype(np.float64) - picture).mean() for image in (again, other))
+    inverted, control = (psnr_of_mse(float(error)) for error in errors)
+    return inverted, control
 
 
 def inverts(
@@ -97,7 +95,7 @@ def inverts_section(rebuilt: Sequence[Rebuilt], *, size: int) -> str:
     lines = [
         "## A picture from its DDIM inversion", "",
         f"One picture of {size} x {size} px of each of {count} worlds, inverted and rebuilt with its own prompt and depth map, without guidance."
-        " PSNR to the picture in dB, 95 % intervals over worlds. The control draws from other latents by the same prompt and depth map."
+        " PSNR to the picture, the mean of the worlds' decibels with its 95 % interval over worlds. The control draws from other latents by the same prompt and depth map."
         f" Asked for: at least {ASKED:g} dB (`training/depth_inverts.py`).", "",
         f"| steps | rebuilt | control | at least {ASKED:g} dB |", "|---|---|---|---|",
     ]  # fmt: skip
