@@ -279,7 +279,12 @@ class Scene:
         spec = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
         # Scenes without mesh files keep the names that they had before meshes had a reader of ours.
         reader = (READER_PROTOCOL,) if files else ()
-        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader)
+        # Fog once ended at thin glass, so scenes with both have other names than they had.
+        panes = any(getattr(item.material, "thin", False) for item in self.spec.objects)
+        behind = ("fog behind thin glass",) if panes and self.spec.medium else ()
+        return content_key(
+            "world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader, *behind
+        )
 
     @functools.cached_property
     def content_hash(self) -> str:

@@ -176,8 +176,10 @@ def load_world(
                 and isinstance(item.material, GlassMaterial)
                 and _within(scene, owner, around)
             ):
-                # Light that leaves the glass is in the fog again.
+                # Light that leaves the glass is in the fog again, and a pane has fog on both sides.
                 extra["exterior"] = fog
+                if item.material.thin:
+                    extra["interior"] = fog
             shapes[key] = mi.load_dict(form() | extra, optimize=False) if extra else shape
         if fog is not None and around is not None:
             # Last, so that the others' places are those of :func:`_owners`.
