@@ -282,9 +282,7 @@ class Scene:
         # Fog once ended at thin glass, so scenes with both have other names than they had.
         panes = any(getattr(item.material, "thin", False) for item in self.spec.objects)
         behind = ("fog behind thin glass",) if panes and self.spec.medium else ()
-        return content_key(
-            "world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader, *behind
-        )
+        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader, *behind)
 
     @functools.cached_property
     def content_hash(self) -> str:

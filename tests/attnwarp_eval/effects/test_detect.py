@@ -398,6 +398,12 @@ def test_a_pane_lets_through_what_fresnel_says():
     assert np.allclose(foggy, math.exp(-0.2 * 4) * (1 - r) / (1 + r), rtol=0.08)
 
 
+def test_glass_that_light_could_not_leave_is_refused():
+    solid = {k: v for k, v in FLOOR.items() if k != "texture"} | {"material": GLASS}
+    with pytest.raises(SceneError, match="is glass and its shape a rectangle, .* say thin: true"):
+        plan(make([solid, ball()], [SKY], 4))
+
+
 def test_a_mirror_shows_what_stands_before_it_times_its_tint():
     mirror = {k: v for k, v in FLOOR.items() if k != "texture"} | {
         "material": MIRROR | {"tint": "#bcbcbc"}
