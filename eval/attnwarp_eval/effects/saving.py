@@ -148,7 +148,7 @@ def measure(
     turns = in_turn([rendered(made) for made in contestants], rounds, seed=seed)
     pictures, seconds = turns.results, turns.seconds
     again = time_ratio([turns.again], [seconds[0]])
-    scale = float(np.mean(pictures[1])) ** 2
+    scale = float(np.mean(pictures[1])) ** 2 or 1.0  # a black picture has no noise to scale
     taken = [np.array(p, np.float64).reshape(rounds, -1) for p in pictures]
     variance = [float(p.var(0, ddof=1).mean()) / scale for p in taken]
     medians = [float(np.median(s)) for s in seconds]

@@ -18,6 +18,7 @@ from attnwarp_eval.scene.base import (
     Coordinate,
     Length,
     Positive,
+    Seed,
     Spec,
     Vector,
     linear_rgb,
@@ -30,8 +31,8 @@ class RingSpec(Spec):
     """``count`` copies of a part about the upright through ``about``, over ``sweep`` degrees from
     where it stands.
 
-    ``jitter`` (0 to 1) turns each by up to that share of the step and makes it smaller by up to
-    half that share; ``lift`` raises each above the one before.
+    ``jitter`` (0 to 1) turns each by up to that share of the step, and makes ellipsoids, capsules
+    and tubes thinner by up to half that share; ``lift`` raises each above the one before.
     """
 
     count: int = Field(ge=1, le=500)
@@ -39,7 +40,7 @@ class RingSpec(Spec):
     sweep: float = 360.0
     jitter: float = Field(0.0, ge=0, le=1)
     lift: Coordinate = 0.0
-    seed: int = 0
+    seed: Seed = 0
 
 
 class _PartSpec(Spec):
@@ -152,7 +153,7 @@ class ReliefSpec(Spec):
     depth: Positive
     size: Positive
     octaves: int = Field(3, ge=1, le=8)
-    seed: int = 0
+    seed: Seed = 0
 
 
 class BodySpec(Spec):

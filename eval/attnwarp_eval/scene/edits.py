@@ -67,9 +67,17 @@ def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
     """One object after a change.
 
     Raises:
-        ValueError: ``recolor`` names a colour that the object does not have.
+        ValueError: ``recolor`` or ``keep`` names a colour that the object does not have, or the
+            object has no texture to change.
     """
     values = item.model_dump(mode="json", exclude_unset=True)
+    shows = change.material or item.material
+    if (change.paint or change.texture) and (item.emission or not isinstance(shows, TEXTURED)):
+        kind = "a lamp" if item.emission else shows.type
+        raise ValueError(
+            f"{'paint' if change.paint else 'texture'}: {item.name!r} is {kind}, which shows no"
+            " texture; use recolor or material"
+        )
     if change.recolor:
         met: set[str] = set()
         values = _recolored(values, change.recolor, met)
@@ -82,7 +90,15 @@ def changed(item: ObjectSpec, change: ObjectChange) -> ObjectSpec:
     if change.texture is not None:
         values["texture"] = change.texture.model_dump(mode="json")
     if change.paint is not None:
-        for part in values["shape"].get("parts", ()):
+        parts = values["shape"].get("parts", ())
+        own = {part.get("color", WHITE) for part in parts}
+        missing = sorted(set(change.keep) - own)
+        if missing:
+            raise ValueError(
+                f"keep: no part of {item.name!r} has the colour {missing[0]!r}; they have"
+                f" {', '.join(sorted(own)) or 'none'}"
+            )
+        for part in parts:
             if part.get("color", WHITE) not in change.keep:
                 part["color"] = WHITE
         if "texture" in values:

@@ -188,13 +188,14 @@ def _check(scene: Scene, root: yaml.Node) -> None:
             grounds = [
                 o.name
                 for o in scene.spec.objects
-                if isinstance(o.shape, TerrainSpec | RectangleSpec)
+                if isinstance(o.shape, TerrainSpec)
+                or (isinstance(o.shape, RectangleSpec) and not any(o.shape.facing[:2]))
             ]
             here = ("objects", k, "shape")
             if on is not None and on not in grounds:
                 refuse(
                     f"objects[{k}].shape.on: got {on!r}{suggest(on, grounds)}; expected the name of"
-                    " a terrain or a rectangle of this scene:"
+                    " a terrain or a level rectangle of this scene:"
                     f" {', '.join(grounds) or 'there is none'}",
                     *here,
                     "on",

@@ -189,7 +189,7 @@ class LensSpec(Spec):
     """A thin lens. ``aperture`` is its radius; sharp is what lies ``focus`` away along the optical
     axis.
 
-    Without ``focus`` that is the point the cameras look at.
+    Without ``focus`` that is ``cameras.look_at``, also in views that look elsewhere.
     """
 
     aperture: Positive

@@ -191,7 +191,8 @@ class Scene:
         ``object_id``.
 
         Raises:
-            SceneError: an object reaches farther than coordinates may, or a mesh file is damaged.
+            SceneError: an object reaches farther than coordinates may, a mesh file is damaged, or a
+                body cannot be meshed.
         """
         shapes = []
         for k, item in enumerate(self.spec.objects):
@@ -228,7 +229,11 @@ class Scene:
                         np.array(spec.center) + step, np.array(spec.size) / 2, axes, object_id
                     )
             case BodySpec():
-                yield _placed(spec.mesh(), _turn_z(spec.yaw), spec.scale, spec.position, object_id)
+                try:
+                    body = spec.mesh()
+                except ValueError as error:
+                    raise SceneError(f"object {item.name!r}: {error}", self.path) from error
+                yield _placed(body, _turn_z(spec.yaw), spec.scale, spec.position, object_id)
             case MeshSpec():
                 path = self.mesh_path(spec)
                 try:
@@ -274,7 +279,10 @@ class Scene:
         spec = self.spec.model_dump(mode="json", include={"objects", "lights", "medium"})
         # Scenes without mesh files keep the names that they had before meshes had a reader of ours.
         reader = (READER_PROTOCOL,) if files else ()
-        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader)
+        # Fog once ended at thin glass, so scenes with both have other names than they had.
+        panes = any(getattr(item.material, "thin", False) for item in self.spec.objects)
+        behind = ("fog behind thin glass",) if panes and self.spec.medium else ()
+        return content_key("world", SCENE_PROTOCOL, MESHING_PROTOCOL, spec, files, *reader, *behind)
 
     @functools.cached_property
     def content_hash(self) -> str:

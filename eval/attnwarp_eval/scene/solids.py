@@ -25,6 +25,9 @@ MESHING_PROTOCOL = 2
 key.
 """
 
+MOST_POINTS = 10**9
+"""Points of a lattice, 8 GB; a cube at the highest resolution has 140 million."""
+
 BLOCK = 8
 """Lattice points along the side of the blocks that are sampled, or left out, together."""
 
@@ -334,6 +337,10 @@ def mesh_body(
     Returns:
         A mesh facing outward with vertex normals and the parts' colours as tint. It is cached by
         content.
+
+    Raises:
+        ValueError: the parts are too thin for the resolution, or blend or relief are so much wider
+            than they are that the lattice would not fit into memory.
     """
     # repr of frozen dataclasses of floats is exact and readable, which makes it a good key. Colours
     # are no part of
@@ -369,7 +376,14 @@ def _march(
     def distance(points: Array) -> Array:
         return body_distance(parts, blend, points, relief)
 
-    counts = np.ceil((high - low) / step).astype(int) + 1
+    sides = np.ceil((high - low) / step) + 1
+    if sides.prod() > MOST_POINTS:
+        raise ValueError(
+            f"body: blend {blend:g} and relief {depth:g} deep about parts {step * resolution:.3g}"
+            f" wide make {sides.prod():.2g} lattice points, more than {MOST_POINTS:,}; make blend"
+            " and relief smaller, or lower the resolution"
+        )
+    counts = sides.astype(int)
     axes = [low[k] + step * np.arange(counts[k]) for k in range(3)]
     volume = _sample(axes, distance, depth)
     if volume.min() >= 0:

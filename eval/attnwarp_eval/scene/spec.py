@@ -212,6 +212,8 @@ class ObjectChange(Spec):
             )
         if self.paint and (self.recolor or self.texture):
             raise ValueError("got paint beside recolor or texture; keep one of them")
+        if self.keep and not self.paint:
+            raise ValueError("got keep without paint, which alone it is for; leave it out")
         return self
 
 

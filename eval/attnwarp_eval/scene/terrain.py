@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from attnwarp_eval.scene.base import Color, Coordinate, Positive, Spec, Vector, linear_rgb
+from attnwarp_eval.scene.base import Color, Coordinate, Positive, Seed, Spec, Vector, linear_rgb
 from attnwarp_eval.scene.shapes import Mesh
 from attnwarp_eval.scene.textures import fractal_noise, lattice_noise
 
@@ -36,7 +36,7 @@ class TerrainSpec(Spec):
     feature: Positive
     octaves: int = Field(4, ge=1, le=8)
     level: tuple[Coordinate, Coordinate] = (0.0, 0.0)
-    seed: int = 0
+    seed: Seed = 0
     resolution: int = Field(320, ge=2, le=2048)
 
     @model_validator(mode="after")
@@ -107,7 +107,7 @@ class ScatterSpec(Spec):
     avoid: tuple[tuple[Coordinate, Coordinate, Positive], ...] = ()
     colors: tuple[Color, ...] = ("#ffffff",)
     on: str | None = None
-    seed: int = 0
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _ordered(self) -> ScatterSpec:

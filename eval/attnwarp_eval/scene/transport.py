@@ -21,6 +21,9 @@ from attnwarp_eval.scene.spec import SceneSpec, SkySpec
 VERTEX_COLORED = ("body", "mesh", "terrain", "scatter")
 """Shapes whose colours lie in the vertices of their mesh."""
 
+OPEN = ("rectangle", "terrain")
+"""Shapes that enclose nothing."""
+
 
 def called_for(spec: SceneSpec) -> dict[Effect, str]:
     """The effects that the words of a scene file call for, each with the words.
@@ -171,6 +174,19 @@ def contradictions(spec: SceneSpec) -> Iterator[tuple[str, tuple[int | str, ...]
                 (
                     f"objects: {item.name!r} is plastic and its shape a {item.shape.type}; plastic"
                     " can be a sphere, a box or a rectangle; say diffuse or metal, or another"
+                    " shape"
+                ),
+                ("objects", k, "material"),
+            )
+        if (
+            isinstance(item.material, GlassMaterial)
+            and not item.material.thin
+            and item.shape.type in OPEN
+        ):
+            yield (
+                (
+                    f"objects: {item.name!r} is glass and its shape a {item.shape.type}, which has"
+                    " no inside: light would never leave the glass; say thin: true, or another"
                     " shape"
                 ),
                 ("objects", k, "material"),

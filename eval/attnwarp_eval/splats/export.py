@@ -222,7 +222,7 @@ def export(
     """Write a scene as a data set: transforms.json, images/*.png and points.ply.
 
     One view of eight is in the split "test", the others in "train". Files that exist are
-    overwritten.
+    overwritten; a folder without transforms.json is one whose export did not end.
 
     Args:
         scene: any of scenes/.
@@ -242,6 +242,8 @@ def export(
     from attnwarp_eval.files import write_picture
 
     folder = Path(folder)
+    # It is written last: until then nothing may pass for the cameras of what is written here.
+    (folder / "transforms.json").unlink(missing_ok=True)
     progress("points")
     cloud = first_points(scene, points, noise=noise, seed=seed)
     cameras = orbit(scene, views, size)

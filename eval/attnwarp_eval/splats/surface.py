@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.truth.raycast import Geometry
 from attnwarp_eval.truth.shading import buried, emitted, frames, irradiance, object_albedo
@@ -125,8 +126,8 @@ def surface_splats(
         if not value > 0:
             raise ValueError(f"{name}: got {value}, expected a positive number")
     for name, value in {"position_noise": position_noise, "normal_noise": normal_noise}.items():
-        if not value >= 0:
-            raise ValueError(f"{name}: got {value}, expected a number >= 0")
+        if not 0 <= value < np.inf:
+            raise InputError(f"{name}: got {value}, expected a finite number >= 0")
     if samples is None:
         samples = colored_samples(scene, count, seed=seed, focus=focus, geometry=geometry)
     points, color = samples
@@ -230,7 +231,9 @@ def sample_surface(
         seed: any integer >= 0.
 
     Raises:
-        ValueError: a count below 1, or a scene without visible surfaces.
+        ValueError: a count below 1.
+        InputError: too little of the scene can be seen from outside it, as of a closed room, or a
+            sphere is too large for the focus.
 
     Example:
         >>> from attnwarp_eval.scene.file import load_scene
@@ -289,8 +292,9 @@ def sample_surface(
     # Surfaces inside other objects are seen by nobody; splats there would only shine through.
     free = ~buried(geometry, point, normals, primitive)
     if free.sum() < count:
-        raise ValueError(
-            f"count: got {count}, but too little of the surface can be seen from anywhere outside"
+        raise InputError(
+            f"count: got {count}, but too little of the surface can be seen from outside the scene;"
+            " open what encloses it, such as a room's ceiling"
         )
     point, normals, primitive = point[free], normals[free], primitive[free]
     spacing = np.sqrt(total * free.mean() / (count * weight(point)))
@@ -323,7 +327,7 @@ def _sphere_cells(radius: float, limit: float) -> tuple[Array, Array]:
     rows = max(4, int(np.ceil(np.pi * radius / limit)))
     columns = 2 * rows
     if rows * columns > MOST_CELLS:
-        raise ValueError(
+        raise InputError(
             f"focus: got {limit / PATCH:g} for a sphere of radius {radius:g}, which makes"
             f" {rows * columns:,} cells of {limit:g}; expected at most {MOST_CELLS:,}: give a focus"
             f" of at least {np.pi * radius / PATCH / np.sqrt(MOST_CELLS / 2):.3g}, or bring the"

@@ -73,8 +73,8 @@ class Pass:
 
 @dataclass(frozen=True)
 class Lens:
-    """A thin lens: radius and focus distance in scene units; ``focus`` None means what the cameras
-    look at.
+    """A thin lens: radius and focus distance in scene units; ``focus`` None means the depth of
+    the scene's ``cameras.look_at``.
     """
 
     aperture: float

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.errors import InputError
 from attnwarp_eval.progress import Tell, untold
 from attnwarp_eval.scene.extent import extent
 from attnwarp_eval.scene.meshes import read_mesh_file
@@ -77,12 +78,17 @@ def render_views(
 
     Yields:
         The files, as they are written; the sheet, ``sheet.png``, last.
+
+    Raises:
+        InputError: ``views`` is empty, or names a camera that the scene does not have.
     """
     from attnwarp_eval.colors import to_srgb
     from attnwarp_eval.files import write_picture
     from attnwarp_eval.truth import Geometry, appearance
 
     cameras = scene.cameras if views is None else [scene.camera(name) for name in views]
+    if not cameras:
+        raise InputError("views: got none, expected names of cameras; leave it out for all of them")
     geometry = Geometry(scene)
     rows = []
     for camera in cameras:

@@ -223,6 +223,13 @@ def test_light_cut_off_from_noiseless_or_black_pictures_has_no_interval_to_speak
     assert saving._cut(np.ones(1), np.ones(1)) == (None, None)
 
 
+def test_a_black_scene_has_a_cost_in_seconds_and_no_noise():
+    below = {"type": "point", "position": [0, 0, -2], "intensity": 5}
+    measured = saving.measure(make([FLOOR], [below], 1, size=8), size=8, spp=1, rounds=3)
+    assert measured.variance == (0.0, 0.0) and measured.at_equal_noise == float("inf")
+    assert measured.cap.bias is None and measured.seconds[0] > 0
+
+
 def test_the_interval_of_the_light_cut_off_is_scipys():
     a, b = (
         np.random.default_rng(0).uniform(0.7, 0.9, 7),

@@ -548,3 +548,37 @@ def test_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path):
 @pytest.mark.slow
 def test_many_damaged_meshes_are_refused_in_one_line_or_are_meshes(tmp_path):
     assert len(survey_meshes(tmp_path, 120)) == 600
+
+
+def test_a_mesh_turned_inside_out_is_told(tmp_path):
+    ball, sheet = trimesh.creation.icosphere(2), trimesh.creation.box((1, 1, 1e-5))
+    sheet.invert()
+    for name, mesh in (("ball", ball), ("sheet", sheet)):
+        mesh.export(tmp_path / f"{name}.ply")
+        read_mesh(tmp_path / f"{name}.ply")  # warnings are errors here
+    ball.invert()
+    ball.apply_translation([1e4, 0, 0])
+    ball.faces = ball.faces[1:]  # a small hole
+    for suffix in (".stl", ".ply"):
+        ball.export(tmp_path / f"turned{suffix}")
+        with pytest.warns(MeshNotice, match="its faces look inward, so that it gets no splats"):
+            turned = read_mesh(tmp_path / f"turned{suffix}")
+        assert len(turned.faces) == 319  # as they are in the file
+
+
+def test_a_texture_finer_than_its_mesh_is_told_where_pictures_are_made(tmp_path):
+    from attnwarp_eval.truth.mitsuba.build import load_shapes
+
+    square = trimesh.Trimesh(
+        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
+    )
+    square.export(tmp_path / "square.ply")
+    path = tmp_path / "thing.yaml"
+    text = SCENE.format(file="square.ply", scale=1)
+    path.write_text(text)
+    load_shapes(load_scene(path), 1.0)  # one colour needs no vertices
+    checker = "type: checker, colors: ['#ffffff', '#000000'], size: 0.5"
+    path.write_text(text.replace("type: plain, color: '#c04020'", checker))
+    # Every corner is white, capped at 0.9, and half of the square is black: 0.45.
+    with pytest.warns(MeshNotice, match=r"albedo of 0.4[3-7] on .* \(2 triangles\); subdivide"):
+        load_shapes(load_scene(path), 1.0)

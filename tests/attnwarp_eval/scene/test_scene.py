@@ -294,6 +294,25 @@ def test_what_is_wrong_with_an_own_mesh_is_told_with_its_line(tmp_path, old, new
     assert caught.value.line is not None
 
 
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("radii: [1, 1, 1.0e-4]}], resolution: 16", "too thin|no part is thick enough"),
+        (
+            "radii: [1.0e-3, 1.0e-3, 1.0e-3]}]",
+            "blend 0.1 .* lattice points, more than 1,000,000,000",
+        ),
+        ("radii: [1, 1, 1]}], relief: {depth: 100, size: 1}", "relief 100 deep .* make blend"),
+    ],
+)
+def test_a_body_that_cannot_be_meshed_is_told_with_its_name_and_remedy(tmp_path, body, says):
+    shape = f"{{type: body, parts: [{{type: ellipsoid, center: [0, 0, 0], {body}}}"
+    text = re.sub(r"shape:\n      type: sphere\n.*\n.*\n", f"shape: {shape}\n", SMALL)
+    path = write(tmp_path, text.replace("height: 1}", "height: 200}").replace("1.5}", "200}"))
+    with pytest.raises(SceneError, match=f"object 'ball': body: .*({says})"):
+        load_scene(path).shapes()
+
+
 def test_a_camera_inside_a_body_or_a_box_is_refused(tmp_path):
     for shape in (
         (

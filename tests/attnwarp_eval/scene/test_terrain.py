@@ -224,6 +224,16 @@ cameras: {look_at: [0, 0, 0], radius: 3, source: {yaw: 0, height: 1}, targets: [
             "source: {yaw: 0, height: -1}",
             "is inside the object 'floor'",
         ),
+        (
+            "{type: terrain, size: [8, 8], height: 0.1, feature: 1, resolution: 16}",
+            "{type: rectangle, center: [0, 0, 0], size: [8, 8], facing: [1, 0, 2]}",
+            "got 'floor'; expected the name of a terrain or a level rectangle .*: there is none",
+        ),
+        (
+            "radius: [0, 2]",
+            "radius: [0, 2], seed: 99999999999999999999",
+            r"small.yaml:8: objects\[1\].shape.seed: got 9+, but .* less than or equal",
+        ),
     ],
 )
 def test_a_mistake_in_ground_or_clutter_is_told_with_its_remedy(tmp_path, old, new, says):

@@ -108,6 +108,21 @@ def test_an_exported_scene_reads_back_as_it_is(spheres, tmp_path):
         np.testing.assert_array_equal(image, export.picture(spheres, ours, 1))
 
 
+def test_an_export_that_stops_half_way_leaves_no_cameras_of_the_one_before(
+    spheres, tmp_path, monkeypatch
+):
+    (tmp_path / "transforms.json").write_text('{"frames": []}')
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "picture", stop)
+    with pytest.raises(KeyboardInterrupt):
+        export.export(spheres, tmp_path, views=2, size=16, spp=1, points=20)
+    with pytest.raises(FileNotFoundError, match="neither a transforms.json nor"):
+        read_dataset(tmp_path)
+
+
 def test_errors_of_a_picture_are_those_of_scikit_image():
     from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 

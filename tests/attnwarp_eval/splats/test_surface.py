@@ -4,6 +4,7 @@ import torch
 from direct_light import direct
 from scipy.spatial import cKDTree
 
+from attnwarp.errors import InputError
 from attnwarp_eval.colors import to_srgb
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.scene.shapes import Box, Rectangle, Sphere
@@ -106,6 +107,18 @@ def test_nothing_is_put_where_two_things_touch_or_one_is_inside_the_other():
     assert buried(Geometry(shapes), points, up, hits.primitive_id).tolist() == [True, False]
 
 
+def test_a_closed_room_is_refused_with_what_to_do():
+    room = [
+        Rectangle(2 * sign * axis, np.roll(axis, 1) * 2, sign * np.roll(axis, 2) * 2)
+        for axis in np.eye(3)
+        for sign in (-1, 1)
+    ]
+    inward = [Rectangle(wall.center, wall.v, wall.u) for wall in room]
+    sample_surface(Geometry(room), 50, center=np.zeros(3), focus=2.0, seed=0)
+    with pytest.raises(InputError, match="seen from outside the scene; open what encloses it"):
+        sample_surface(Geometry(inward), 50, center=np.zeros(3), focus=2.0, seed=0)
+
+
 def test_quaternions_turn_z_into_the_normal_straight_down_too():
     random = np.random.default_rng(0).normal(size=(1000, 3))
     hard = [
@@ -205,7 +218,8 @@ def test_colours_are_those_of_rendered_views_that_see_the_splats(name):
     [
         ({"count": 0}, "count: got 0, expected at least 1"),
         ({"size": 0.0}, "size: got 0.0, expected a positive number"),
-        ({"position_noise": -1.0}, "position_noise: got -1.0, expected a number >= 0"),
+        ({"position_noise": -1.0}, "position_noise: got -1.0, expected a finite number >= 0"),
+        ({"normal_noise": float("inf")}, "normal_noise: got inf, expected a finite number >= 0"),
         ({"focus": float("nan")}, "focus: got nan, expected a positive number"),
         ({"kind": "4d"}, "kind: got '4d', expected one of '2d', '3d'"),
     ],

@@ -228,6 +228,21 @@ def test_an_edited_scene_is_rendered_from_every_camera_as_any_other(tmp_path):
             "    lights:\n" + 2 * "    - {type: sky, horizon: '#ffffff', zenith: '#8080ff'}\n",
             r"edits\[0\]: makes a scene that contradicts itself: lights\[1\]: a second sky",
         ),
+        (
+            "recolor: {'#c04020': '#2040c0'}",
+            "paint: '#2040c0', keep: ['#101010']",
+            "keep: no part of 'ball' has the colour '#101010'; they have none",
+        ),
+        (
+            "recolor: {'#c04020': '#2040c0'}",
+            "recolor: {'#c04020': '#2040c0'}, keep: ['#101010']",
+            "got keep without paint",
+        ),
+        (
+            "recolor: {'#c04020': '#2040c0'}",
+            "texture: {type: plain, color: '#000000'}, material: {type: metal}",
+            "texture: 'ball' is metal, which shows no texture; use recolor or material",
+        ),
     ],
 )
 def test_a_mistake_in_an_edit_is_told_with_its_place_and_remedy(tmp_path, old, new, says):
@@ -237,6 +252,23 @@ def test_a_mistake_in_an_edit_is_told_with_its_place_and_remedy(tmp_path, old, n
     assert old in SMALL
     path.write_text(SMALL.replace(old, new))
     with pytest.raises(SceneError, match=says):
+        load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("surface", "kind"),
+    [
+        ("emission: {radiance: 1, color: '#c04020'}", "a lamp"),
+        ("material: {type: metal, roughness: 0.2, tint: '#c04020'}", "metal"),
+    ],
+)
+def test_paint_that_nothing_would_show_is_refused(tmp_path, surface, kind):
+    text = SMALL.replace("texture: {type: plain, color: '#c04020'}", surface)
+    path = tmp_path / "small.yaml"
+    path.write_text(text)
+    load_scene(path)  # a colour is replaced wherever it stands
+    path.write_text(text.replace("recolor: {'#c04020': '#2040c0'}", "paint: '#2040c0'"))
+    with pytest.raises(SceneError, match=f"paint: 'ball' is {kind}, which shows no texture"):
         load_scene(path)
 
 

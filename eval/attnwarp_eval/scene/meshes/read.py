@@ -32,6 +32,12 @@ READERS = {
 MESH_SUFFIXES = tuple(READERS)
 
 
+INSIDE_OUT = (
+    "its faces look inward, so that it gets no splats, shines inward as a lamp and is a hollow as"
+    " glass: turn them over and export it again"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class MeshFile:
     """A mesh with what became of its file.
@@ -44,6 +50,7 @@ class MeshFile:
         unused: vertices that no polygon names.
         ignored: what else the file holds and nobody uses, in words.
         cut_off: why polygons may be missing at the file's end, or None.
+        inside_out: whether the faces of a closed surface look inward.
     """
 
     mesh: Mesh
@@ -53,6 +60,7 @@ class MeshFile:
     unused: int
     ignored: tuple[str, ...]
     cut_off: str | None
+    inside_out: bool
 
     def __str__(self) -> str:
         left_out = [
@@ -69,6 +77,7 @@ class MeshFile:
             + (f"; left out: {', '.join(left_out)}" if left_out else "")
             + (f"; not used: {', '.join(self.ignored)}" if self.ignored else "")
             + (f"; {self.cut_off}, so that its end may be missing" if self.cut_off else "")
+            + (f"; {INSIDE_OUT}" if self.inside_out else "")
         )
 
 
@@ -141,7 +150,28 @@ def read_mesh_file(path: Path) -> MeshFile:
         unused,
         surface.ignored,
         surface.cut_off,
+        _inside_out(mesh),
     )
-    if result.crossed or result.flat or result.unused or result.ignored or result.cut_off:
+    if (
+        result.crossed
+        or result.flat
+        or result.unused
+        or result.ignored
+        or result.cut_off
+        or result.inside_out
+    ):
         warnings.warn(f"{path.name}: {result}", MeshNotice, stacklevel=3)
     return result
+
+
+def _inside_out(mesh: Mesh) -> bool:
+    """Whether a surface is closed but for small holes, and its volume by the divergence theorem is
+    negative by more than a thousandth of a ball's of the same area.
+    """
+    corners = mesh.vertices[mesh.faces]
+    corners = corners - corners.mean((0, 1))
+    facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    area = float(np.linalg.norm(facing, axis=1).sum())
+    volume = float(np.einsum("ij,ij->", corners[:, 0], facing)) / 3
+    closed = np.linalg.norm(facing.sum(0)) < 1e-2 * area
+    return bool(closed and volume < -1e-3 * area**1.5 / (6 * np.sqrt(np.pi)))
