@@ -72,6 +72,14 @@ class Editor(Protocol):
         """Pictures of scaled latents."""
         ...
 
+    def pixels(self, latents: Tensor) -> Tensor:
+        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1]."""
+        ...
+
+    def latents(self, pixels: Tensor) -> Tensor:
+        """(B, C, h, w) scaled latents of (B, 3, H, W) pixels, whose values may leave [0, 1]."""
+        ...
+
     def timesteps(self, steps: int) -> list[int]:
         """Steps from pure noise, as the model's own scheduler spaces them."""
         ...
@@ -286,8 +294,17 @@ class Latent:
 
     def encode(self, pictures: Sequence[Image]) -> Tensor:
         """(B, C, h, w) scaled latents of (H, W, 3) pictures in [0, 1]."""
-        ready = tensor_of(pictures, "pictures", self.factor)
-        return self.raw_latents(ready) * self.vae.config.scaling_factor
+        return self.latents(tensor_of(pictures, "pictures", self.factor))
+
+    def latents(self, pixels: Tensor) -> Tensor:
+        """(B, C, h, w) scaled latents of (B, 3, H, W) pixels, whose values may leave [0, 1]."""
+        return self.raw_latents(pixels) * self.vae.config.scaling_factor
+
+    def pixels(self, latents: Tensor) -> Tensor:
+        """(B, 3, H, W) of scaled latents as they are decoded: values may leave [0, 1]."""
+        with torch.no_grad():
+            scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
+            return self.vae.decode(scaled, return_dict=False)[0].float() / 2 + 0.5
 
     def decode(self, latents: Tensor) -> list[Image]:
         """(H, W, 3) float32 pictures in [0, 1] of scaled latents.
@@ -295,11 +312,9 @@ class Latent:
         Raises:
             ValueError: latents, or what the decoder makes of them, that are not finite.
         """
-        with torch.no_grad():
-            scaled = latents.to(self.vae.dtype) / self.vae.config.scaling_factor
-            sample = self.vae.decode(scaled, return_dict=False)[0]
+        pixels = self.pixels(latents)
         # A NaN would become a black pixel.
-        for name, values in (("latents", latents), ("decoded latents", sample)):
+        for name, values in (("latents", latents), ("decoded latents", pixels)):
             finite = values.isfinite()
             if not finite.all():
                 raise ValueError(
@@ -307,8 +322,7 @@ class Latent:
                     " lower the guidance, or load the editor in float32 if it runs in half"
                     " precision"
                 )
-        pictures = (sample.float() / 2 + 0.5).clamp(0, 1).permute(0, 2, 3, 1)
-        return list(pictures.cpu().numpy())
+        return list(pixels.clamp(0, 1).permute(0, 2, 3, 1).cpu().numpy())
 
     def check_text(self, text: str) -> None:
         """Raise ValueError for a text that is longer than the encoder takes."""

@@ -29,7 +29,7 @@ from attnwarp.editing.schedule import steps_as_published
 from attnwarp.propagate.noise import FRESH, carried, own_seed, unmoved
 from attnwarp.propagate.pictures import Image
 from attnwarp.propagate.settings import PropagateSettings
-from attnwarp.propagate.sight import Sight
+from attnwarp.propagate.sight import Sight, SourceWarp
 
 Guide = npt.NDArray[Any]
 Store = Literal["device", "cpu"] | Path
@@ -365,28 +365,32 @@ class ViewEditor:
             [t.sight.warp(k) for k in range(len(sources))] if t.sight is not None else []
             for t in targets
         ]
+        carry = self._carry_picture if s.estimate_in == "picture" else _carry
 
         def change(number: int, x0: Tensor) -> Tensor:
             weight = s.estimate * (1 - number / max(1, s.estimate_until * s.steps))
             result = x0
             if weight > 0 and sources:
-                rows = []
-                size = (x0.shape[2], x0.shape[3])
-                for own, view_warps in zip(x0, warps, strict=True):
-                    tokens = own.flatten(1).T[None].contiguous()
-                    for warp, source in zip(view_warps, sources, strict=False):
-                        map_ = source.estimates[number].to(own)
-                        layer = warp.at(size, source_size=(map_.shape[1], map_.shape[2]))
-                        tokens = layer.blend_tokens(
-                            map_.flatten(1).T[None].contiguous(), tokens, weight
-                        )
-                    rows.append(tokens[0].T.reshape(own.shape))
+                maps = [source.estimates[number].to(x0) for source in sources]
+                rows = [carry(own, maps, ws, weight) for own, ws in zip(x0, warps, strict=True)]
                 result = torch.stack(rows)
             if store is not None:
                 store.append(result[0].clone())
             return result
 
         return change
+
+    def _carry_picture(
+        self, own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
+    ) -> Tensor:
+        """(C, h, w) latents of a target whose picture takes the sources', warped."""
+        pictures = [self.editor.pixels(map_[None])[0] for map_ in maps]
+        before = self.editor.pixels(own[None])
+        after = _carry(before[0], pictures, warps, weight)[None]
+        # What an autoencoder loses of a picture is lost in both, so that nothing changes where
+        # nothing is carried.
+        change = self.editor.latents(after) - self.editor.latents(before)
+        return own + change[0].to(own)
 
     def noise(self, targets: Sequence[Target], sources: Sequence[Source] = ()) -> Tensor:
         """(B, C, h, w) noise of views: one for all of a size, one of each view's own, or one that
@@ -445,6 +449,25 @@ class ViewEditor:
         return edit_friendly_invert(
             self.editor.schedule, task.predict, latents, timesteps, noises=noises
         )
+
+
+def _carry(
+    own: Tensor, maps: Sequence[Tensor], warps: Sequence[SourceWarp], weight: float
+) -> Tensor:
+    """(C, h, w) of a target that takes the sources' (C, h', w') maps, warped.
+
+    Args:
+        own: (C, h, w) the target's.
+        maps: of the sources.
+        warps: from the sources.
+        weight: of the sources', in [0, 1].
+    """
+    tokens = own.flatten(1).T[None].contiguous()
+    for warp, map_ in zip(warps, maps, strict=False):
+        h, w = own.shape[1:]
+        layer = warp.at((h, w), source_size=(map_.shape[1], map_.shape[2]))
+        tokens = layer.blend_tokens(map_.flatten(1).T[None].contiguous(), tokens, weight)
+    return tokens[0].T.reshape(own.shape)
 
 
 def _in_words(guidance: float | None) -> str:

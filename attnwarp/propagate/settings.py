@@ -17,6 +17,7 @@ Method = Literal["warp", "each view alone"]
 Noise = Literal["shared", "fresh", "surface"]
 Latents = Literal["random", "inversion"]
 StartPicture = Literal["render", "original"]
+EstimateIn = Literal["latents", "picture"]
 DepthFrom = Literal["frozen", "current"]
 Decay = Literal["linear", "constant"]
 FeatureType = Literal["float32", "float16"]
@@ -34,6 +35,7 @@ _CHOICES: dict[str, Any] = {
     "noise": Noise,
     "latents": Latents,
     "start_picture": StartPicture,
+    "estimate_in": EstimateIn,
     "depth_from": DepthFrom,
     "decay": Decay,
     "feature_type": FeatureType,
@@ -88,6 +90,9 @@ class PropagateSettings:
         estimate: weight at the first step of the source's warped estimate of the clean latents, in
             the target's estimate. It falls to 0 at ``estimate_until``. 0 leaves it out.
         estimate_until: share of the steps after which it is left out.
+        estimate_in: where it is warped: as "latents", whose cells keep the source's order of pixels
+            inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
+            The editor's decoder then runs once, and its encoder twice, in each step of a view.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
@@ -150,6 +155,7 @@ class PropagateSettings:
     confidence: bool = False
     estimate: float = 0.0
     estimate_until: float = 0.5
+    estimate_in: EstimateIn = "latents"
     depth_from: DepthFrom = "frozen"
     a0: float = 0.9
     decay: Decay = "linear"
@@ -284,7 +290,7 @@ class PropagateSettings:
         return range(first, end)
 
 
-_LATER = ("latents", "source_prompt", "feature_steps")
+_LATER = ("latents", "source_prompt", "feature_steps", "estimate_in")
 _WHOLE = {
     "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
 }  # fmt: skip
@@ -371,8 +377,9 @@ PRESETS: dict[str, PropagateSettings] = {
     "extended": PropagateSettings(
         sources=4,
         noise="surface",
-        estimate=0.5,
-        estimate_until=1.0,
+        estimate=1.0,
+        estimate_until=2.0,
+        estimate_in="picture",
     ),
 }
 """Sets of choices, each with the warp of that name (:data:`attnwarp.warp.PRESETS`).
@@ -390,7 +397,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 tunes on everything edited so far, with larger steps of the colours.
 
 ``extended``: ``corrected`` with ideas beyond the paper: further sources, noise that sticks to the
-surface, and the source's clean estimate. The study ``beyond`` has each alone and all together.
+surface, and the sources' clean pictures, with a weight that falls from 1 to a half. The study
+``beyond`` has each alone and all together.
 """
 
 

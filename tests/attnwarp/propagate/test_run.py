@@ -21,6 +21,7 @@ import attnwarp.warp
 from attnwarp import Camera, Gaussians
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import Schedule
+from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError
 from attnwarp.io import FileFormatError, read_image, read_ply
 from attnwarp.propagate import preset, propagate
@@ -1103,3 +1104,44 @@ def test_the_estimate_of_a_twin_is_the_sources(scene, editor):
 
     assert difference(settings) <= 1
     assert difference(replace(settings, estimate=0.0)) > 50
+
+
+def test_an_estimate_warped_as_a_picture_lands_on_its_pixel_within_a_cell():
+    """Two views of a wall are 3 px apart, and a cell of the latents is 4 px wide."""
+    shift, size = 3, 32
+    K = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1.0]])
+    poses = [np.diag([1.0, -1, -1, 1]) for _ in range(2)]
+    for pose, x in zip(poses, (0, shift * 4 / size), strict=True):
+        pose[:3, 3] = (x, 0, 4)  # the wall lies at depth 4
+    views = [Camera(K, pose, size, size, name) for name, pose in zip("ab", poses, strict=True)]
+    images = [np.random.default_rng(k).random((size, size, 3), np.float32) for k in range(2)]
+    settings = replace(
+        QUICK, method="each view alone", stages=1, iterations=0, estimate=1.0, estimate_until=1e9
+    )
+
+    def difference(**changes):
+        result = propagate(
+            wall(), views, images, load_editor("small-plain"), "make it red",
+            replace(settings, **changes),
+        )  # fmt: skip
+        source, target = (result.edited[k].astype(int) for k in range(2))
+        # The border's pixels have taps outside the source.
+        inside = slice(4, -4)
+        return np.abs(np.roll(source, shift, axis=1) - target)[inside, inside].max()
+
+    assert difference(estimate_in="picture") <= 2
+    assert difference() > 50
+
+
+def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(scene, editor):
+    """Though this autoencoder does not give back the picture that it is given."""
+    _, views, images = scene
+    away = Camera.look_at((0, 0, 8), (0, 0, 9), width=32, height=32, fov_y=40, up=(0, 1, 0))
+    settings = replace(QUICK, method="each view alone", stages=1, iterations=0)
+    pair = [views[0], replace(away, name="away")], images[:2]
+
+    def edited(weight):
+        changed = replace(settings, estimate=weight, estimate_in="picture")
+        return propagate(wall(), *pair, editor, "a bear", changed).edited[1]
+
+    assert np.array_equal(edited(0.0), edited(1.0))

@@ -44,7 +44,10 @@ def test_a_controlnet_of_the_released_code_draws_fresh_noise_and_has_other_guida
 
 
 def test_extended_is_corrected_with_ideas_beyond_the_paper():
-    ideas = {"sources": 4, "noise": "surface", "estimate": 0.5, "estimate_until": 1.0}
+    ideas = {
+        "sources": 4, "noise": "surface",
+        "estimate": 1.0, "estimate_until": 2.0, "estimate_in": "picture",
+    }  # fmt: skip
     assert PRESETS["extended"] == replace(PRESETS["corrected"], **ideas)
 
 
@@ -56,9 +59,11 @@ def test_settings_survive_json(name):
 
 def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
     """Folders and cells of studies are compared by it."""
-    later = {"latents", "source_prompt", "feature_steps"}
-    assert not any(later & set(settings.to_dict()) for settings in PRESETS.values())
+    later = {"latents", "source_prompt", "feature_steps", "estimate_in"}
+    former = [settings for name, settings in PRESETS.items() if name != "extended"]
+    assert not any(later & set(settings.to_dict()) for settings in former)
     chosen = {"latents": "inversion", "source_prompt": "a bear", "feature_steps": [0.0, 0.5]}
+    chosen["estimate_in"] = "picture"
     changed = preset("corrected", **chosen)
     data = json.loads(json.dumps(changed.to_dict()))
     assert {name: data[name] for name in later} == chosen

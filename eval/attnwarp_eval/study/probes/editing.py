@@ -77,6 +77,11 @@ FIDELITY = ("psnr", "mse", "ssim")
 inside the edited object."""
 
 
+LEAST_PIXELS = 16
+"""Agreement is undefined where fewer pixels of a view are compared, the area of one cell of the
+bundled editors' latents. Views count alike in a mean, so a single pixel would weigh as much as a
+whole view."""
+
 STOPWATCH = Stopwatch()
 """Seconds of the methods that this process has run."""
 
@@ -195,6 +200,7 @@ class EditingProbe(Probe[EditResult]):
     """One edit of one scene by one method."""
 
     name = "editing"
+    protocol = 2  # 1: views agreed or not however few of their pixels were compared
     study_part = StudyPart
     variant_part = VariantPart
     metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
@@ -641,8 +647,9 @@ class _Measure:
             row[f"multiview.same_answer.{kind}"] = _equal(own, self.judged.answer)
             part = truth.of([name])
             seen = {name: truth.union[name] & pair.visible}
-            there = metrics.answers_by_view({name: images[name]}, part.answers, seen)[name]
-            row[f"multiview.same_answer.{kind}_seen"] = _equal(there, self.judged.answer)
+            if seen[name].sum() >= LEAST_PIXELS:
+                there = metrics.answers_by_view({name: images[name]}, part.answers, seen)[name]
+                row[f"multiview.same_answer.{kind}_seen"] = _equal(there, self.judged.answer)
         for end, mask in (("", None), ("_inside", truth.masks[answer][name])):
             figures = self._above(images, answer, self.source, name, mask)
             for key in keys[1:]:
@@ -657,13 +664,16 @@ class _Measure:
     def _above(
         self, images: Mapping[str, Image], answer: str, first: str, second: str, mask: Any
     ) -> dict[str, float]:
+        """Of two views; NaN where fewer than :data:`LEAST_PIXELS` are compared."""
         true = self.truth.answers[answer]
-        return metrics.above_floor(
+        figures = metrics.above_floor(
             (images[first], images[second]),
             (true[first], true[second]),
             self._pair(first, second),
             mask=mask,
         )
+        few = figures["multiview.pixels"] < LEAST_PIXELS
+        return dict.fromkeys(figures, math.nan) if few else figures
 
     def _embedded(self) -> dict[str, dict[str, float]]:
         """The paper's similarities of renders; none without encoders."""

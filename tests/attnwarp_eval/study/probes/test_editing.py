@@ -17,6 +17,7 @@ from torch_threads import on_one_thread
 
 from attnwarp.baselines import Budget
 from attnwarp.encoders.bundled import WEIGHTS
+from attnwarp_eval import metrics
 from attnwarp_eval.compare.snapshot import read_snapshot
 from attnwarp_eval.metrics.gates import gated
 from attnwarp_eval.metrics.registry import METRICS
@@ -24,12 +25,14 @@ from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study import Store, StudyError, cells_of, load_study
 from attnwarp_eval.study.budgets import Spent, Stopwatch
+from attnwarp_eval.study.edit_truth import edit_truth
 from attnwarp_eval.study.editing_methods import EDITING_METHODS, EditedScene, Method
 from attnwarp_eval.study.probes import editing, probe
 from attnwarp_eval.study.probes.editing import EditResult
 from attnwarp_eval.study.run import execute, plan
 from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, two_view
+from attnwarp_eval.world import world
 
 STUDY = {
     "name": "mine",
@@ -130,6 +133,26 @@ def test_an_answer_for_each_view_is_seen_as_it_was_planned(folder, tmp_path, mon
     assert abs(above[1]) < 0.3
     # No view has another neighbour of its own answer but none here: red-green, green-red, blue-green.
     assert min(v for v in figure(record, "multiview.delta_e_above.edit_next") if v == v) > 20
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_agreement_over_fewer_pixels_than_a_cell_of_the_latents_is_undefined(
+    folder, tmp_path, monkeypatch, more
+):
+    monkeypatch.setitem(EDITING_METHODS, "true pictures", planned(["red"] * 4))
+    scene = load(folder).scenes[0]
+    of = world(scene, STUDY["size"])
+    mask = edit_truth(
+        scene, STUDY["size"], STUDY["spp"], "some_colour", (of.source.name, "yaw030")
+    ).masks["red"]["yaw030"]
+    black = np.zeros((*mask.shape, 3))
+    pair = of.between(of.source.name, "yaw030")
+    count = metrics.cross_view(black, black, pair, mask=mask).counted.sum()
+    monkeypatch.setattr(editing, "LEAST_PIXELS", count + more)
+    record = record_of(folder, tmp_path)
+    view = next(v for v in record.views if v.name.endswith("yaw030"))
+    for key in ("delta_e", "delta_e_floor", "delta_e_above"):
+        assert math.isnan(view.metrics[f"multiview.{key}.edit_inside"]) == bool(more)
 
 
 def test_where_the_source_is_not_edited_agreement_is_undefined_and_the_report_names_the_edit(
