@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -130,8 +130,13 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             continue
         how = digest({key: spec[key] for key in OF_A_METHOD if key in spec})
         for method in cell.variants:
-            item.methods = {method: own}
-            yield (cell.scene, edit.name, cell.seed), item, method, how
+            # An item of its own for each name: the reader keeps the first one and adds to it.
+            yield (
+                (cell.scene, edit.name, cell.seed),
+                replace(item, methods={method: own}),
+                method,
+                how,
+            )
 
 
 def read_picture(path: Path) -> bytes:
