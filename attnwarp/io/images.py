@@ -77,11 +77,10 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     import cv2
 
     path = existing_file(path)
-    rgba = _with_pillow(path, _alpha_lost_by_opencv)
+    rgba: npt.NDArray[np.uint8] | None = _with_pillow(path, _alpha_lost_by_opencv)
     _check_png(path)
     if rgba is not None:
-        image: npt.NDArray[Any] = rgba
-        return image
+        return rgba
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
