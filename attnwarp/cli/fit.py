@@ -59,7 +59,10 @@ def fit(
         typer.Option(min=1, help="Random first points, where DATA has none (default 10000)."),
     ] = None,
     hold_out: Annotated[
-        int, typer.Option(min=0, help="Hold out one view of so many; 0: none.")
+        int,
+        typer.Option(
+            min=0, help="Hold out one view of so many, 0 none; splits that DATA names go first."
+        ),
     ] = 8,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything random.")] = 0,
     change: Annotated[

@@ -77,8 +77,10 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     import cv2
 
     path = existing_file(path)
-    _with_pillow(path, lambda image: image.load())
+    rgba: npt.NDArray[np.uint8] | None = _with_pillow(path, _alpha_lost_by_opencv)
     _check_png(path)
+    if rgba is not None:
+        return rgba
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
@@ -157,6 +159,16 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
         raise FileFormatError(
             path, f"the picture is damaged ({first}); replace it or leave it out"
         ) from None
+
+
+def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8] | None:
+    """Decode a picture; return (H, W, 4) where OpenCV drops its alpha or multiplies it into the
+    colours: TIFF of 8 bits, and grey PNG with a transparent value.
+    """
+    image.load()
+    tiff = image.format == "TIFF" and image.mode in ("LA", "RGBA")
+    grey = image.mode in ("1", "L") and "transparency" in image.info
+    return np.array(image.convert("RGBA")) if tiff or grey else None
 
 
 def _check_png(path: Path) -> None:

@@ -73,6 +73,8 @@ class Tab:
             await self.send(
                 "Input.dispatchKeyEvent", type=kind, key=key, code=key,
                 windowsVirtualKeyCode=code,
+                # Without its text, Enter presses no button.
+                **({"text": "\r"} if (kind, key) == ("keyDown", "Enter") else {}),
             )  # fmt: skip
 
 

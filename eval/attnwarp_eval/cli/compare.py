@@ -45,6 +45,7 @@ def compare(
     from attnwarp_eval.files import write_atomic
 
     with clear_errors():
+        _check_outputs(baseline, {"--markdown": markdown, "--json": json, "--html": html}, update)
         measured, pictures = _run(run)
         if update:
             _update(baseline, measured, pictures)
@@ -71,6 +72,25 @@ def compare(
         raise Regression
     if result.too_little:
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
+
+
+def _check_outputs(baseline: Path, outputs: dict[str, Path | None], update: bool) -> None:
+    """Refuse files that would not be written, or be written over the baseline or each other."""
+    from attnwarp.errors import InputError
+    from attnwarp.io.file import check_other
+
+    named = {option: path for option, path in outputs.items() if path is not None}
+    if update and named:
+        raise InputError(
+            f"{next(iter(named))}: --update compares nothing that could be written there; compare"
+            " first, then update"
+        )
+    first: dict[Path, str] = {}
+    for option, path in named.items():
+        check_other(path, baseline, "the baseline")
+        other = first.setdefault(path.resolve(), option)
+        if other != option:
+            raise InputError(f"{option}: {path} is that of {other} too; name another file")
 
 
 def _page(

@@ -99,13 +99,27 @@ def run(
     drawn = _whole_numbers(seeds, "--seeds")
     if scheduler is not None and jobs > 1:
         raise fail("--jobs starts workers here, --scheduler uses others; give one of the two")
-    for option, given in (
-        ("--editor", editor is not None),
-        ("--depth-editor", depth_editor is not None),
-        ("--device", device != "cpu"),
-    ):
-        if given and data is None:
-            raise fail(f"{option}: needs --data; on scenes, a study names its editors itself")
+    with_data = {
+        "--ply": ply is not None,
+        "--instruction": instruction is not None,
+        "--target-prompt": target_prompt is not None,
+        "--source-prompt": source_prompt is not None,
+        "--scale": scale != 1,
+        "--editor": editor is not None,
+        "--depth-editor": depth_editor is not None,
+        "--device": device != "cpu",
+    }
+    without_data = {
+        "--scenes": scenes is not None,
+        "--dry-run": dry_run,
+        "--jobs": jobs > 1,
+        "--scheduler": scheduler is not None,
+        "--fail-fast": not keep_going,
+    }
+    for option in (option for option, given in with_data.items() if given and data is None):
+        raise fail(f"{option}: needs --data; on scenes, the study itself says what is edited, how")
+    for option in (option for option, given in without_data.items() if given and data is not None):
+        raise fail(f"{option}: has no meaning with --data, a capture edited here; leave it out")
     if data is not None:
         words = (instruction, target_prompt, source_prompt)
         editors = (editor, depth_editor, device)

@@ -84,7 +84,7 @@ def export(
         int, typer.Option(min=10, help="Points scattered about the surfaces.")
     ] = 5000,
     noise: Annotated[
-        float, typer.Option(min=0, help="How far, in spacings between the points.")
+        float, typer.Option(min=0, max=1e6, help="How far, in spacings between the points.")
     ] = 0.5,
     seed: Annotated[int, typer.Option(min=0, help="Of the points.")] = 0,
 ) -> None:

@@ -207,7 +207,8 @@ def markdown_table(table: Table) -> str:
         | paper | 0.01 |
     """
     lines = [
-        " | ".join(plain(cell.replace("|", "\\|")) for cell in cells)
+        # A row is one line; the texts of errors may have several.
+        " | ".join(plain(" ".join(cell.splitlines()).replace("|", "\\|")) for cell in cells)
         for cells in (table.columns, *table.rows)
     ]
     header, *rows = (f"| {line} |" for line in lines)

@@ -67,8 +67,8 @@ GATES: Mapping[str, Margin] = {
     "image.psnr": Margin(0.2),
     "stability.margin": Margin(0.5),
 }
-"""Margins by metric. PSNR is infinite for equal pictures, so it is left to its mean squared error
-where records have that; 0.2 dB are 5 % of it.
+"""Margins by metric. PSNR is infinite for equal pictures, so a comparison leaves it to its mean
+squared error where both sides have that; 0.2 dB are 5 % of it.
 """
 
 

@@ -120,8 +120,9 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
 
     Intervals are Student's t with the bootstrap's standard error, of the logit of a probability.
     Percentiles of the bootstrap cover too rarely with few people: 76 % instead of 95 % for all
-    pairs of four methods with six people. Where all people have the same share, the bootstrap has
-    no spread; the interval is then the exact binomial one of as many people.
+    pairs of four methods with six people. Where all people have the same share, or a method won
+    every choice, the bootstrap has no spread or no end; the interval is then the exact binomial one
+    of as many people.
 
     Args:
         choices: of each person.
@@ -156,10 +157,12 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
     ways = list(itertools.combinations(range(len(methods)), 2))
     p, several = chances(strengths(wins)), None if draws is None else chances(strengths(draws))
 
-    def share(value: Array, drawn: Array | None, level: float, defined: bool) -> Share:
-        if not defined:
+    made = wins.sum(0) + wins.sum(1)
+
+    def share(value: Array, drawn: Array | None, level: float, *of: int) -> Share:
+        if not connected[[*of]].all():
             return Share(math.nan, math.nan, math.nan)
-        return _interval(float(value), drawn, people, level)
+        return _interval(float(value), drawn, people, float(made[[*of]].min()), level)
 
     others = ~np.eye(len(methods), dtype=bool) & connected[None, :]
     weights = others / np.maximum(others.sum(1, keepdims=True), 1)
@@ -168,7 +171,7 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
             (p[k] * weights[k]).sum(),
             None if several is None else (several[:, k] * weights[k]).sum(-1),
             0.95,
-            bool(connected[k]),
+            k,
         )
         for name, k in index.items()
     }
@@ -178,7 +181,8 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
             p[i, j],
             None if several is None else several[:, i, j],
             together,
-            bool(connected[i] and connected[j]),
+            i,
+            j,
         )
         for i, j in ways
     }
@@ -194,27 +198,35 @@ def _resampled(by_person: Array, seed: int) -> Array:
     return np.tensordot(times.astype(np.float64), by_person, axes=1)
 
 
-def _interval(value: float, drawn: Array | None, people: int, level: float) -> Share:
+def _interval(
+    value: float, drawn: Array | None, people: int, choices: float, level: float
+) -> Share:
     from scipy import stats
 
     if drawn is None:
         return Share(value, math.nan, math.nan)
     tail = (1 - level) / 2
-    if np.ptp(drawn) < 1e-3:
-        # Clopper-Pearson of one choice a person; the ridge keeps shares from 0 and 1.
-        chose = people * (round(value) if min(value, 1 - value) < 1e-3 else value)
+    certain = min(value, 1 - value) < 0.5 / choices  # the ridge keeps shares from 0 and 1
+    if certain or np.ptp(drawn) < 1e-3:
+        # Clopper-Pearson of one choice a person.
+        chose = people * (round(value) if certain else value)
         low = stats.beta.ppf(tail, chose, people - chose + 1) if chose > 0 else 0.0
         high = stats.beta.ppf(1 - tail, chose + 1, people - chose) if chose < people else 1.0
         return Share(value, float(low), float(high))
     factor = math.sqrt(people / (people - 1))  # the bootstrap's variance has n, not n - 1
-    half = factor * stats.t.ppf(1 - tail, people - 1) * _logit(drawn).std()
-    low, high = (1 / (1 + np.exp(-(_logit(np.array(value)) + side * half))) for side in (-1, 1))
+    half = factor * stats.t.ppf(1 - tail, people - 1) * _logit(drawn, choices).std()
+    middle = _logit(np.array(value), choices)
+    low, high = (1 / (1 + np.exp(-(middle + side * half))) for side in (-1, 1))
     return Share(value, float(low), float(high))
 
 
-def _logit(p: Array) -> Array:
-    """Of probabilities, those of 0 and 1 moved to where the ridge keeps them."""
-    inner = np.clip(p, RIDGE, 1 - RIDGE)
+def _logit(p: Array, choices: float) -> Array:
+    """Of probabilities, those of 0 and 1 taken for half of one choice of so many.
+
+    Draws without the one person who chose otherwise have 0 or 1. Their logit is infinite, and that
+    of the ridge's 1e-6 would make a single other choice of a hundred outweigh the rest.
+    """
+    inner = np.clip(p, 0.5 / choices, 1 - 0.5 / choices)
     return np.log(inner / (1 - inner))
 
 

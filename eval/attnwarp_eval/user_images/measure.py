@@ -154,7 +154,7 @@ _EDIT, _CLIP, _DIRECTION, _DINO, _CLIP_IMAGE, _PERCEPTUAL = FIGURES = (
 _MASKED = (_EDIT, _PERCEPTUAL)
 """Figures that masks act on; the others are of whole pictures."""
 
-PROTOCOL = 2
+PROTOCOL = 3
 """Raised whenever the same pictures would give other figures."""
 
 

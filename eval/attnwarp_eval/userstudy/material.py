@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +63,8 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
 
     Args:
         runs: folders.
-        methods: variants to compare; all that have pictures if None.
+        methods: variants to compare, or the parts between commas of such names; all that have
+            pictures if None.
 
     Raises:
         InputError: there is none, a method that no run has, or runs that contradict each other.
@@ -86,6 +87,7 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
                 )
             item.methods.setdefault(method, one.methods[method])
     available = list(dict.fromkeys(name for item in items.values() for name in item.methods))
+    methods = None if methods is None else _joined(methods, available)
     for name in methods or ():
         if name not in available:
             listed = ", ".join(map(repr, available)) or "none"
@@ -103,6 +105,18 @@ def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> li
             " variants and views under 'pictures' in the study, and run it again"
         )
     return usable
+
+
+def _joined(parts: Sequence[str], available: Sequence[str]) -> list[str]:
+    """Names from the parts of a comma-separated option: a name may have commas itself."""
+    whole = {",".join(part.strip() for part in name.split(",")): name for name in available}
+    result, rest = [], list(parts)
+    while rest:
+        counts = range(len(rest), 1, -1)
+        count = next((n for n in counts if ",".join(rest[:n]) in whole), 1)
+        result.append(whole.get(",".join(rest[:count]), rest[0]))
+        rest = rest[count:]
+    return result
 
 
 def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
@@ -130,8 +144,13 @@ def _edited(run: Path) -> Iterator[tuple[tuple[str, str, int], Item, str, str]]:
             continue
         how = digest({key: spec[key] for key in OF_A_METHOD if key in spec})
         for method in cell.variants:
-            item.methods = {method: own}
-            yield (cell.scene, edit.name, cell.seed), item, method, how
+            # An item of its own for each name: the reader keeps the first one and adds to it.
+            yield (
+                (cell.scene, edit.name, cell.seed),
+                replace(item, methods={method: own}),
+                method,
+                how,
+            )
 
 
 def read_picture(path: Path) -> bytes:

@@ -215,6 +215,8 @@
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
     if (event.target.id === "angle") return;
+    // A button that has the focus does its own work.
+    if (event.key === "Enter" && event.target.tagName === "BUTTON") return;
     const trial = {
       ArrowLeft: () => choose("left"),
       ArrowRight: () => choose("right"),

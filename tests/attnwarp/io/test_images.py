@@ -35,6 +35,23 @@ def test_files_come_as_rgb_in_their_own_depth(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "clear.png"), rgba)
 
 
+@pytest.mark.parametrize(
+    ("name", "mode", "options"),
+    [
+        ("rgba.tif", "RGBA", {}),
+        ("rgba.png", "RGBA", {}),
+        ("grey.tif", "LA", {}),
+        ("grey.png", "LA", {}),
+        ("value.png", "L", {"transparency": 200}),
+    ],
+)
+def test_alpha_comes_straight_from_every_format(tmp_path, name, mode, options):
+    values = {"RGBA": (200, 100, 50, 128), "LA": (200, 128), "L": 200}
+    expected = {"RGBA": (200, 100, 50, 128), "LA": (200, 200, 200, 128), "L": (200, 200, 200, 0)}
+    Image.new(mode, (3, 2), values[mode]).save(tmp_path / name, **options)
+    np.testing.assert_array_equal(read_image(tmp_path / name)[1, 2], expected[mode])
+
+
 def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
     (tmp_path / "a.png").write_bytes(b"nothing")
     with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):

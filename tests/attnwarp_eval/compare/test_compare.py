@@ -23,7 +23,7 @@ from attnwarp_eval.canonical_json import digest
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.compare import Snapshot, compare, read_baseline, read_snapshot, write_baseline
 from attnwarp_eval.compare.judge import FEWEST_SCENES
-from attnwarp_eval.compare.snapshot import Figure, Measured, definition, snapshot
+from attnwarp_eval.compare.snapshot import Figure, Measured, definition, shortened, snapshot
 from attnwarp_eval.compare.write import document, summary
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
@@ -226,6 +226,47 @@ def test_an_added_cell_passes_and_is_named(stored):
     assert result.added == (f"{first.scene} / {first.probe} / {first.variants[0]} / seed 0",)
     assert not result.regressed
     assert compare(whole, part).regressed
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "verdicts"),
+    [
+        ((70.0, 1e-7), (math.inf, 0.0), {"mse": "equal"}),
+        ((math.inf, 0.0), (20.0, 1e-2), {"mse": "worse"}),
+        ((30.0, None), (20.0, None), {"psnr": "worse"}),  # without its error it stands for itself
+    ],
+)
+def test_an_error_that_falls_to_0_is_no_regression(before, now, verdicts):
+    def measured(psnr, mse):
+        values = {"psnr": psnr, "mse": mse}
+        figures = {
+            f"fidelity.preserved_{name}.edit": Figure(1, {"red/yaw030": shortened(value)})
+            for name, value in values.items()
+            if value is not None
+        }
+        return Snapshot("my", "", (Measured("bear", "editing", ("a",), 0, "", {}, figures),))
+
+    result = compare(measured(*before), measured(*now))
+    assert {
+        row.metric.split("_")[1].removesuffix(".edit"): row.verdict for row in result.rows
+    } == verdicts
+    assert result.faults == () and result.regressed == ("worse" in verdicts.values())
+
+
+def test_what_is_written_never_replaces_the_baseline_or_each_other(stored, run, tmp_path):
+    path = tmp_path / "baseline.jsonl"
+    shutil.copy(stored / "baseline.jsonl", path)
+    other = str(tmp_path / "summary")
+    for arguments, message in (
+        (("--json", path), "is the baseline"),
+        (("--markdown", path), "is the baseline"),
+        (("--json", other, "--html", other), "is that of --json too"),
+        (("--update", "--markdown", other), "--markdown: --update compares nothing"),
+    ):
+        done = gate(path, run, *arguments)
+        assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
+    assert path.read_bytes() == (stored / "baseline.jsonl").read_bytes()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["baseline.jsonl", "run"]
 
 
 def test_update_says_what_changed_and_then_the_run_passes(stored, run, tmp_path):

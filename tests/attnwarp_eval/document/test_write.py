@@ -52,6 +52,14 @@ def report(name):
     return Report(f"title {name}", [f"lead {name}"], [Section(name, [f"text {name}"], [table])])
 
 
+def test_an_error_of_several_lines_stays_in_its_cell():
+    table = Table(["cell", "error"], [["a", "ValueError: x\n  at y\nz"], ["b", "none"]])
+    text = markdown(Report("t", [], [Section("s", [], [table])]))
+    parsed = Parsed(python_markdown.markdown(text, extensions=["tables"]))
+    assert parsed.tags.count("tr") == 3 and parsed.tags.count("td") == 4
+    assert all(word in parsed.text for word in ("ValueError: x", "at y", "z"))
+
+
 def test_names_are_text_and_never_markup_or_columns(tmp_path):
     plain = python_markdown.markdown(markdown(report("plain")), extensions=["tables"])
     for name in NAMES:

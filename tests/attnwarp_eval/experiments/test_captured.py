@@ -207,10 +207,17 @@ def test_editors_of_ones_own_stand_for_the_studys_by_what_they_take(folder, tmp_
     assert asked == [(name, "cpu:0") for name in expected.values()]
 
 
-def test_editors_are_named_for_captures_alone(folder):
-    for option in ("--editor", "--depth-editor", "--device"):
-        done = CliRunner().invoke(app, ["run", str(folder / "study.yaml"), option, "cuda"])
+def test_options_of_captures_and_of_scenes_are_not_passed_over(folder):
+    of_captures = ["editor", "depth-editor", "device", "ply", "instruction", "target-prompt",
+                   "source-prompt"]  # fmt: skip
+    start = ["run", str(folder / "study.yaml")]
+    for option, *value in (*((f"--{name}", "cuda") for name in of_captures), ("--scale", "2")):
+        done = CliRunner().invoke(app, [*start, "--dry-run", option, *value])
         assert done.exit_code == 2 and f"{option}: needs --data" in done.stderr
+    for option, *value in (("--dry-run",), ("--scenes", "bear"), ("--jobs", "2"),
+                           ("--scheduler", "tcp://a:1"), ("--fail-fast",)):  # fmt: skip
+        done = CliRunner().invoke(app, [*start, "--data", str(folder), option, *value])
+        assert done.exit_code == 2 and f"{option}: has no meaning with --data" in done.stderr
 
 
 GIVEN = ("--ply", "scene.ply", "--instruction", "red")

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from scipy.stats import chi
+from typer.testing import CliRunner
 
 from attnwarp.io import read_dataset
+from attnwarp_eval.cli.main import app
 from attnwarp_eval.report import write_report
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.splats import export, fitted
@@ -214,3 +216,11 @@ def test_a_scene_is_fitted_above_27_db_in_two_thousand_steps(spheres, kind, tmp_
     assert result.history[-1].psnr > 27
     # 0.03 is what the first points give; surfaces are found to better than 1 %.
     assert result.history[-1].measures["depth.abs_rel"] < 0.03
+
+
+@pytest.mark.parametrize("noise", ["inf", "1e39", "nan", "-1"])
+def test_noise_beyond_any_scene_is_refused_and_nothing_is_written(tmp_path, noise):
+    arguments = ["scenes", "export", "spheres", str(tmp_path / "out"), "--noise", noise]
+    done = CliRunner().invoke(app, [*arguments, "--views", "1", "--size", "16", "--spp", "1"])
+    assert done.exit_code == 2 and "--noise" in done.stderr
+    assert not (tmp_path / "out").exists()

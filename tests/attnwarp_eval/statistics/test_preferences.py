@@ -59,6 +59,15 @@ def test_people_with_the_same_share_have_the_exact_interval_of_a_choice_each(peo
     assert share.low < 0.5
 
 
+def test_one_other_choice_of_many_leaves_a_narrow_interval():
+    people = {str(k): [("a", "b")] * 10 for k in range(12)}
+    people["0"] = [("a", "b")] * 9 + [("b", "a")]
+    share = preferences(people, ["a", "b"]).pairs["a", "b"]
+    # The exact interval of a rate, of one event; people may vary more than choices do.
+    most = stats.chi2.ppf(0.975, 4) / 2 / 120
+    assert 1 - 2 * most < share.low < 1 - 1 / 120 < share.high < 1
+
+
 def test_two_people_who_flip_five_coins_each_rarely_prefer_a_method():
     rng, runs, wrong = np.random.default_rng(4), 150, 0
     for _ in range(runs):

@@ -114,6 +114,10 @@ def test_the_last_choice_can_be_taken_back_and_a_pause_stops_the_clock(page, tmp
             await tab.until(shows("paused"))
             assert "1 of 20" in await tab.run("document.querySelector('#done').textContent")
             await tab.press(*LEFT)  # does nothing here
+            await tab.run("document.querySelector('#paused .save').focus()")
+            await tab.press("Enter", 13)  # saves, and does not go on
+            await tab.until("document.querySelector('#saved').textContent.startsWith('Saved')")
+            assert await tab.run(shows("paused"))
             await asyncio.sleep(4)
             await tab.press(*PAUSE)
             await tab.until(shows("trial"))

@@ -8,12 +8,15 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import yaml
 from edited_run import write_run
 from PIL import Image
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.document.write import LARGEST
+from attnwarp_eval.study import Store, load_study
+from attnwarp_eval.study.run import expected, plan
 from attnwarp_eval.userstudy.draw import SCRAMBLED
 
 
@@ -130,6 +133,34 @@ def test_what_cannot_be_built_is_one_line(run, tmp_path, arguments, message):
     done = build(run.root, "--out", tmp_path / "a", *arguments)
     assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
     assert not (tmp_path / "a").exists()
+
+
+def test_a_method_whose_name_has_a_comma_can_be_chosen(tmp_path):
+    run = write_run(tmp_path)
+    path = run.root / "study.json"
+    path.write_text(path.read_text().replace('"warped"', '"alone, warped"'))
+    study = json.loads(path.read_text())
+    del study["sha256"]  # a study without one is read too
+    path.write_text(json.dumps(study))
+    done = build(run.root, "--out", tmp_path / "a", "--methods", "third,alone, warped")
+    assert done.exit_code == 0, done.output
+    sides = [set(item["sides"]) - {SCRAMBLED} for item in read(tmp_path / "a")[1]["items"]]
+    assert sides == [{"third", "alone, warped"}] * 4
+
+
+def test_two_names_of_the_same_settings_are_both_on_the_page(tmp_path):
+    run = write_run(tmp_path)
+    path = tmp_path / "people.yaml"
+    study = yaml.safe_load(path.read_text())
+    study["variants"]["again"] = study["variants"]["alone"]
+    names = study["probes"]["editing"] = study["pictures"]["variants"] = ["alone", "again", "third"]
+    path.write_text(yaml.safe_dump(study, sort_keys=False))
+    store = Store(run.root)
+    store.write_study(expected(plan(load_study(str(path)), store)))
+    done = build(run.root, "--out", tmp_path / "a")
+    assert done.exit_code == 0, done.output
+    for item in read(tmp_path / "a")[1]["items"]:
+        assert set(names) <= set(item["sides"])
 
 
 @pytest.mark.parametrize(
