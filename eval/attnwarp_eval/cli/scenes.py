@@ -132,24 +132,33 @@ def effects(
     prove: Annotated[
         bool, typer.Option("--prove", help="Hold the plan against a rendering with everything on.")
     ] = False,
-    budget: Annotated[float, typer.Option(min=1, help="Seconds that a proof may render.")] = 60.0,
+    budget: Annotated[
+        float | None, typer.Option(min=1, help="Seconds that a proof may render; 60 if left out.")
+    ] = None,
     every: Annotated[
         bool,
         typer.Option(
             "--all", help="A table and pictures of every scene; goes on where it was left."
         ),
     ] = False,
-    out: Annotated[Path, typer.Option(help="Folder of --all.")] = Path("runs/effects"),
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of --all; runs/effects if left out.")
+    ] = None,
 ) -> None:
     """Which light transport a scene needs, what leaving out the rest saves, and a proof."""
     import json
 
     if every == (scene is not None):
         raise fail("name one scene, or say --all for a table of all of them")
+    if budget is not None and not prove:
+        raise fail("--budget: needs --prove, whose seconds it limits")
+    if out is not None and not every:
+        raise fail("--out: is the folder of --all; without it the answer is printed")
+    seconds = 60.0 if budget is None else budget
     if every:
         if as_json:
             raise fail("--json is of one scene; --all writes effects.json into --out")
-        _effects_of_all(out, prove, budget)
+        _effects_of_all(out or Path("runs/effects"), prove, seconds)
         return
     with clear_errors():
         from attnwarp_eval.effects import detect, proof
@@ -158,7 +167,7 @@ def effects(
 
         loaded = load_scene(str(scene))
         about = detect.report(loaded, cost=measure(loaded))
-        result = proof.prove(loaded, seconds=budget) if prove else None
+        result = proof.prove(loaded, seconds=seconds) if prove else None
     if result is not None:
         about["proof"] = result.to_dict()
     lines = [json.dumps(about, indent=2)] if as_json else list(detect.describe(loaded, about))

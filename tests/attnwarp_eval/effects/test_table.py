@@ -267,12 +267,14 @@ def test_a_dropped_light_shows_eight_times_as_strong_about_grey(small, monkeypat
     )
 
 
-def test_one_scene_or_all_must_be_asked_for():
+def test_one_scene_or_all_must_be_asked_for_and_no_option_is_passed_over():
     runner = CliRunner()
     for arguments, words in (
         ([], "name one scene, or say --all"),
         (["spheres", "--all"], "name one scene, or say --all"),
         (["--all", "--json"], "--json is of one scene"),
+        (["spheres", "--budget", "9"], "--budget: needs --prove"),
+        (["spheres", "--out", "table"], "--out: is the folder of --all"),
     ):
         result = runner.invoke(app, ["scenes", "effects", *arguments])
         assert result.exit_code == 2 and words in " ".join(result.output.split())
