@@ -10,7 +10,6 @@ from attnwarp_eval.cli.main import app
     ("arguments", "says"),
     [
         (["render", "opposed", "--views", ","], "views: got none, expected names of cameras"),
-        (["export", "opposed", "{out}", "--noise", "inf"], "position_noise: got inf, expected"),
     ],
 )
 def test_a_value_that_makes_no_sense_is_told_in_a_line(tmp_path, arguments, says):
