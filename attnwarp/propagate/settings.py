@@ -92,7 +92,8 @@ class PropagateSettings:
         estimate_until: share of the steps after which it is left out.
         estimate_in: where it is warped: as "latents", whose cells keep the source's order of pixels
             inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
-            The editor's decoder then runs once, and its encoder twice, in each step of a view.
+            In each step of a view the editor then decodes the view and each source, and encodes
+            twice.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
