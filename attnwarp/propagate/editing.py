@@ -362,7 +362,7 @@ class ViewEditor:
         if s.estimate == 0:
             return None
         warps = [
-            [t.sight.warp(k) for k in range(len(sources))] if t.sight is not None else []
+            [] if t.sight is None else [t.sight.warp(k, picture=True) for k in range(len(sources))]
             for t in targets
         ]
         carry = self._carry_picture if s.estimate_in == "picture" else _carry

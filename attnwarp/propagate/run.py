@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -505,7 +506,14 @@ class _Run:
         chosen = self.plan.sources[:sources]
         warps = [self._warp(source, view, model) for source in chosen]
         scales = [self._edit_share(source) / self._edit_share(view) for source in chosen]
-        return Sight(warps, s.confidence, scales)
+        margins = None
+        if s.estimate_margin > 0:
+            # Of the edit's pixels; the depth map has the picture's.
+            margins = [
+                math.ceil(s.estimate_margin / math.sqrt(self._edit_share(source)) - 1e-9)
+                for source in chosen
+            ]
+        return Sight(warps, s.confidence, scales, margins)
 
     def _edit_share(self, view: int) -> float:
         """Pixels of a view's edit for each of its picture."""

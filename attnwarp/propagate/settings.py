@@ -94,6 +94,8 @@ class PropagateSettings:
             inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
             In each step of a view the editor then decodes the view and each source, and encodes
             twice.
+        estimate_margin: px of the source's edit on either side of a depth edge that are not warped
+            as its estimate. Pixels there mix near and far.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
@@ -157,6 +159,7 @@ class PropagateSettings:
     estimate: float = 0.0
     estimate_until: float = 0.5
     estimate_in: EstimateIn = "latents"
+    estimate_margin: int = 0
     depth_from: DepthFrom = "frozen"
     a0: float = 0.9
     decay: Decay = "linear"
@@ -291,9 +294,10 @@ class PropagateSettings:
         return range(first, end)
 
 
-_LATER = ("latents", "source_prompt", "feature_steps", "estimate_in")
+_LATER = ("latents", "source_prompt", "feature_steps", "estimate_in", "estimate_margin")
 _WHOLE = {
     "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
+    "estimate_margin",
 }  # fmt: skip
 _OPTIONAL = {"views_per_stage", "size", "text_guidance", "source_text_guidance"}
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -310,6 +314,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "chain_coverage": (0, 1),
     "estimate": (0, 1),
     "estimate_until": (0, math.inf),
+    "estimate_margin": (0, 1000),
     "a0": (0, 1),
     "composite_blur": (0, math.inf),
     "iterations": (0, math.inf),

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.warp import FeatureWarp, WarpedView, depth_slope, sample, sample_depth
-from attnwarp.warp.depth import as_float64
+from attnwarp.warp.depth import Array, as_float64
 from attnwarp.warp.masks import axis_weights
 from attnwarp.warp.sampling import work_type
 from attnwarp.warp.surface import needed
@@ -75,6 +75,44 @@ def depth_margin(view: WarpedView) -> Tensor:
     return torch.nan_to_num(1 - share**2, nan=0.0).clamp(0, 1)
 
 
+EDGE = 0.05
+"""Relative step of the depth that is an edge, as two taps that are not blended
+(:attr:`attnwarp.warp.WarpSettings.depth_spread`)."""
+
+
+def near_edges(depth: Array, margin: int) -> Tensor:
+    """(H, W) bool: pixels among the first ``margin`` on either side of a depth edge.
+
+    A picture's pixels there mix near and far. Inverse depth is affine in the pixel on a plane, so a
+    step of it beyond its neighbours' is an edge: a plane at a grazing angle has none. Undefined
+    depth counts as infinite.
+
+    Args:
+        depth: (H, W), undefined where it is NaN, zero, negative or infinite.
+        margin: in px; 0 gives none.
+
+    Example:
+        >>> import torch
+        >>> near_edges(torch.tensor([[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]), 1)[0].int().tolist()
+        [0, 0, 1, 1, 0, 0]
+    """
+    z = as_float64(depth, "depth")
+    inverse = torch.where(torch.isfinite(z) & (z > 0), 1 / z, 0.0)
+    edge = torch.zeros(z.shape, dtype=torch.bool)
+    if margin == 0:
+        return edge
+    for axis in (0, 1):
+        if z.shape[axis] < 3:
+            continue
+        left, middle, right = (inverse.narrow(axis, k, z.shape[axis] - 2) for k in range(3))
+        bend = (left - 2 * middle + right).abs()
+        nearest = torch.maximum(torch.maximum(left, middle), right)
+        edge.narrow(axis, 1, z.shape[axis] - 2).logical_or_(bend > EDGE * nearest)
+    window = 2 * margin - 1
+    grown = torch.nn.functional.max_pool2d(edge[None].float(), window, 1, margin - 1)
+    return grown[0] > 0
+
+
 @dataclass(frozen=True, eq=False)
 class Sight:
     """A target seen by its sources.
@@ -85,6 +123,8 @@ class Sight:
         scales: of each source: its edit's pixels per pixel of its photograph, over the same of the
             target. Features have the edits' resolution, which photographs of several sizes need not
             differ in. None where all are 1.
+        margins: of each source: px of its depth map on either side of a depth edge whose picture is
+            not taken. None where all are 0.
 
     Example:
         >>> import numpy as np
@@ -104,7 +144,8 @@ class Sight:
     views: Sequence[WarpedView]
     soft: bool = False
     scales: Sequence[float] | None = None
-    _choices: dict[Size, Tensor] = field(default_factory=dict, repr=False)
+    margins: Sequence[int] | None = None
+    _choices: dict[tuple[Size, bool], Tensor] = field(default_factory=dict, repr=False)
 
     @cached_property
     def quality(self) -> list[Tensor]:
@@ -137,27 +178,55 @@ class Sight:
         weights = [weight * (choice == k) for k, weight in enumerate(self.confidence)]
         return torch.stack(weights).sum(dim=0)
 
-    def choice(self, size: Size) -> Tensor:
+    @cached_property
+    def clear(self) -> list[Tensor]:
+        """(H, W) bool of each source: what it shows there is farther from its depth edges than the
+        margin.
+        """
+        margins = [0] * len(self.views) if self.margins is None else self.margins
+        result = []
+        for view, margin in zip(self.views, margins, strict=True):
+            if margin == 0 or view.source is None:
+                result.append(torch.ones(view.mask.shape, dtype=torch.bool))
+                continue
+            near = near_edges(view.source.depth, margin).double()[None]
+            mixed, _ = sample(near, view.correspondence, mode="nearest")
+            result.append(torch.nan_to_num(mixed[0], nan=1.0) < 0.5)
+        return result
+
+    def mask_at(self, number: int, size: Size, *, picture: bool = False) -> Tensor:
+        """(h, w) bool: where a source's mask passes; of its picture, where it is clear as well."""
+        # The mask does not depend on the size of the source's grid.
+        mask = self.views[number].at(size, source_size=size).mask
+        if not picture or self.margins is None:
+            return mask
+        return mask & (averaged(self.clear[number], size) >= 0.5)
+
+    def choice(self, size: Size, *, picture: bool = False) -> Tensor:
         """(h, w) int64: number of the source of the best quality among those whose mask passes at
         that size, -1 where none does; of equals the first.
+
+        Args:
+            size: of the grid.
+            picture: of sources' pictures, which :attr:`margins` keep away from depth edges.
         """
-        if size not in self._choices:
-            # The mask does not depend on the size of the source's grid.
-            masks = [view.at(size, source_size=size).mask for view in self.views]
+        key = size, picture and self.margins is not None
+        if key not in self._choices:
+            masks = [self.mask_at(k, size, picture=picture) for k in range(len(self.views))]
             if len(self.views) == 1:
-                self._choices[size] = torch.where(masks[0], 0, -1)
+                self._choices[key] = torch.where(masks[0], 0, -1)
             else:
                 qualities = torch.stack([averaged(quality, size) for quality in self.quality])
                 qualities = torch.where(torch.stack(masks), qualities, -1.0)
                 best, number = qualities.max(dim=0)
                 # Rounding of the means must not decide between equals.
                 number = (qualities >= best - 1e-9).long().argmax(dim=0)
-                self._choices[size] = torch.where(best >= 0, number, -1)
-        return self._choices[size]
+                self._choices[key] = torch.where(best >= 0, number, -1)
+        return self._choices[key]
 
-    def warp(self, number: int) -> SourceWarp:
-        """The part of the target that takes a source."""
-        return SourceWarp(self, number)
+    def warp(self, number: int, *, picture: bool = False) -> SourceWarp:
+        """The part of the target that takes a source's features, or its picture."""
+        return SourceWarp(self, number, picture)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +237,12 @@ class SourceWarp:
     Args:
         sight: of the target.
         number: of the source.
+        picture: of its picture, not its features.
     """
 
     sight: Sight
     number: int
+    picture: bool = False
     _at: dict[tuple[int, ...], FeatureWarp | SoftWarp] = field(default_factory=dict, repr=False)
 
     def at(self, size: Size, *, source_size: Size | None = None) -> FeatureWarp | SoftWarp:
@@ -179,7 +250,8 @@ class SourceWarp:
         key = (*size, *(source_size or ()))
         if key not in self._at:
             layer = self.sight.views[self.number].at(size, source_size=source_size)
-            mask = layer.mask & (self.sight.choice(size) == self.number)
+            choice = self.sight.choice(size, picture=self.picture)
+            mask = layer.mask & (choice == self.number)
             own: FeatureWarp | SoftWarp = FeatureWarp(layer.correspondence, mask, layer.backend)
             if self.sight.soft:
                 weight = averaged(self.sight.confidence[self.number], size) * mask

@@ -59,11 +59,11 @@ def test_settings_survive_json(name):
 
 def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
     """Folders and cells of studies are compared by it."""
-    later = {"latents", "source_prompt", "feature_steps", "estimate_in"}
+    later = {"latents", "source_prompt", "feature_steps", "estimate_in", "estimate_margin"}
     former = [settings for name, settings in PRESETS.items() if name != "extended"]
     assert not any(later & set(settings.to_dict()) for settings in former)
     chosen = {"latents": "inversion", "source_prompt": "a bear", "feature_steps": [0.0, 0.5]}
-    chosen["estimate_in"] = "picture"
+    chosen |= {"estimate_in": "picture", "estimate_margin": 2}
     changed = preset("corrected", **chosen)
     data = json.loads(json.dumps(changed.to_dict()))
     assert {name: data[name] for name in later} == chosen

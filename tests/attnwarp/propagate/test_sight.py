@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from attnwarp import Camera
-from attnwarp.propagate.sight import Sight, depth_margin, pixel_ratio
+from attnwarp.propagate.sight import Sight, depth_margin, near_edges, pixel_ratio
 from attnwarp.propagate.stages import choose_chain
 from attnwarp.warp import Surface, preset, resize_mask, warp_surfaces
 
@@ -122,6 +122,63 @@ def test_confidence_is_foreshortening_times_the_margin_of_depth():
     expected = np.where(inside, np.minimum(1, pixel_ratio(view).numpy()) * margin, 0)
     assert np.allclose(sight.confidence[0].numpy(), expected, atol=1e-12)
     assert depth_margin(warp(SIDE, depth_agreement=False)).min() == 1
+
+
+@pytest.mark.parametrize("margin", [0, 1, 2, 3])
+def test_a_depth_edge_is_near_within_the_margin_of_a_box_before_a_wall(margin):
+    """Oracle: Chebyshev distance to the pixels on either side of the box's outline, by a loop."""
+    depth = torch.full((20, 24), 4.0)
+    depth[6:13, 9:17] = 3.0
+    depth[:3] = torch.nan  # the sky behind the wall's upper edge
+    both_sides = [
+        (y, x)
+        for y in range(20)
+        for x in range(24)
+        for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))
+        if 0 <= y + dy < 20
+        and 0 <= x + dx < 24
+        and not bool(depth[y, x].nan_to_num(9.0) == depth[y + dy, x + dx].nan_to_num(9.0))
+    ]
+    expected = torch.zeros(20, 24, dtype=torch.bool)
+    for y in range(20):
+        for x in range(24):
+            expected[y, x] = any(max(abs(y - v), abs(x - u)) <= margin - 1 for v, u in both_sides)
+    assert torch.equal(near_edges(depth, margin), expected)
+    assert expected.any() == (margin > 0)
+
+
+def test_a_plane_at_a_grazing_angle_has_no_depth_edge_though_its_depth_leaps():
+    grazing = Camera.look_at((0, -2.0, 0.1), (0, 0, 0), width=32, height=32, fov_y=40)
+    depth = torch.from_numpy(on_plane(grazing).depth)
+    below = depth[16:]  # the horizon lies above
+    assert (below[0] / below[1] > 1.2).all()
+    assert not near_edges(below, 3).any()
+
+
+def test_a_picture_is_taken_from_the_source_that_shows_no_edge_there():
+    """A post stands before the plane in one source's depth alone; features are taken as before."""
+    behind = on_plane(SIDE)
+    post = behind.depth.copy()
+    post[:, 10:14] *= 0.5
+    with_post = warp_surfaces(
+        SIDE, TARGET, on_plane(TARGET), Surface(post, behind.normal), preset("corrected")
+    )
+    views = [with_post, warp(FAR)]
+    plain, sight = Sight(views), Sight(views, margins=[2, 0])
+    size = (SIZE, SIZE)
+    assert torch.equal(sight.choice(size), plain.choice(size))
+    assert torch.equal(plain.choice(size, picture=True), plain.choice(size))
+    # Oracle: the column of the source in which a pixel lands; 2 px on either side of the post.
+    column = with_post.correspondence.xy[..., 0].floor()
+    near = ((column >= 8) & (column < 12)) | ((column >= 12) & (column < 16))
+    taken = plain.choice(size) == 0
+    assert (near & taken).any() and (~near & taken).any()
+    changed = torch.where(sight.mask_at(1, size), 1, -1)
+    assert torch.equal(
+        sight.choice(size, picture=True), torch.where(near & taken, changed, plain.choice(size))
+    )
+    layer = sight.warp(0, picture=True).at(size, source_size=size)
+    assert torch.equal(layer.mask, taken & ~near)
 
 
 def test_features_are_blended_by_confidence_in_float64():
