@@ -171,19 +171,24 @@ def lines(
             linewidth=1.4,
             elinewidth=0.8,
             capsize=2,
-            label=line.name,
+            label=_plain(line.name),
         )
         for place, value in zip(line.x, line.y, strict=True):
             if np.isfinite(value.mean):
                 hover(axes, place + shift, value.mean, f"{line.name}, {place:g}: {spread(value)}")
-    axes.set(xlabel=x, ylabel=y)
-    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.set(xlabel=_plain(x), ylabel=_plain(y))
+    axes.set_title(_plain(title), loc="left", fontsize=9.5)
     if log:
         axes.set_yscale("log")
     if share:
         axes.set_ylim(-0.03, 1.03)
     if legend:
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+
+
+def _plain(text: str) -> str:
+    """A text whose dollars stand for themselves; Matplotlib reads formulas between two."""
+    return text.replace("$", r"\$")
 
 
 def heatmap(
@@ -237,12 +242,14 @@ def heatmap(
                     (j + 0.04, i + 0.06), 0.92, 0.88, fill=False, linewidth=1.1, edgecolor="black"
                 )
             )
-    axes.set_xticks(np.arange(len(columns)) + 0.5, columns, rotation=30, ha="right")
-    axes.set_yticks(np.arange(len(rows)) + 0.5, rows)
+    axes.set_xticks(
+        np.arange(len(columns)) + 0.5, [_plain(name) for name in columns], rotation=30, ha="right"
+    )
+    axes.set_yticks(np.arange(len(rows)) + 0.5, [_plain(name) for name in rows])
     axes.tick_params(length=0)
     axes.spines[["left", "bottom"]].set_visible(False)
     axes.invert_yaxis()
-    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.set_title(_plain(title), loc="left", fontsize=9.5)
 
 
 MOST_NAMES = 12
@@ -308,7 +315,7 @@ def cost_front(
         if on or not crowded:
             notes.append(
                 axes.annotate(
-                    name,
+                    _plain(name),
                     (seconds.mean, quality.mean),
                     textcoords="offset points",
                     xytext=(5, 5),
@@ -327,8 +334,8 @@ def cost_front(
             linewidth=1,
             alpha=0.6,
         )
-    axes.set(xlabel=x, ylabel=y, xscale="log", yscale="log" if log else "linear")
-    axes.set_title(title, loc="left", fontsize=9.5)
+    axes.set(xlabel=_plain(x), ylabel=_plain(y), xscale="log", yscale="log" if log else "linear")
+    axes.set_title(_plain(title), loc="left", fontsize=9.5)
     axes.margins(0.2)
     _move_apart(axes, notes)
     return [names[i] for i in on_front]

@@ -66,3 +66,19 @@ def test_bars_of_a_front_are_whole_and_cut_on_logarithmic_axes_alone(tmp_path, l
         (bar,) = along.get_segments()
         assert bar[:, 1] == pytest.approx([lowest, 17.0])
         assert across.get_segments()[0][:, 0] == pytest.approx([0.9, 1.1])
+
+
+def test_dollars_in_a_name_stand_for_themselves(tmp_path) -> None:
+    """Two dollars would begin and end a formula; Matplotlib's SVG has every text as a comment."""
+    name, title = "costs $x_{ or $y", "$^ and $"
+    one = around(1.0)
+    with charts.drawing(tmp_path / "lines.svg") as (axes,):
+        charts.lines(axes, [charts.Line(name, [0.0, 1.0], [one, one])], x=title, y="y", title=title)
+    with charts.drawing(tmp_path / "front.svg") as (axes,):
+        charts.cost_front(axes, {name: (one, one)}, x="x", y="y", title=title)
+    with charts.drawing(tmp_path / "cells.svg") as (axes,):
+        shares = np.array([[0.5]])
+        charts.heatmap(axes, shares, rows=[name], columns=[name], framed=shares > 1, title=title)
+    for file in ("lines", "front", "cells"):
+        drawn = (tmp_path / f"{file}.svg").read_text()
+        assert f"<!-- {name} -->" in drawn and f"<!-- {title} -->" in drawn
