@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.encoders import EncoderInfo, Kind, load_encoder
+from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp_eval import metrics
 from attnwarp_eval.canonical_json import without_nan
@@ -202,6 +203,8 @@ def measure(
                 f" views and are left out, {maps[0]} first"
             )
     wanted = _possible(inputs, folders, encoders, done)
+    # Also where bundled encoders alone are needed, which would leave it unread.
+    device_of(device)
     loaded = _load(wanted, encoders, device, done)
     wanted = [figure for figure in wanted if figure.encoder is None or figure.encoder in loaded]
     if not wanted:

@@ -531,6 +531,10 @@ def test_other_folders_and_flags_that_will_not_do(data, models):
             (one, "--prompt=x", f"--clip={models['clip']}", "--device=gpu"),
             "device 'gpu': unknown, expected cpu or cuda",
         ),
+        (
+            (one, "--device=gpu"),
+            "device 'gpu': unknown, expected cpu or cuda",
+        ),
     ):
         done = call("metrics", *arguments, "--out", folder / "out")
         assert done.exit_code == 2 and complaint in done.stderr, done.output
