@@ -1145,3 +1145,23 @@ def test_an_estimate_warped_as_a_picture_changes_nothing_that_no_source_sees(sce
         return propagate(wall(), *pair, editor, "a bear", changed).edited[1]
 
     assert np.array_equal(edited(0.0), edited(1.0))
+
+
+@pytest.mark.parametrize(("size", "expected"), [(64, 3), (32, 6), (48, 4)])
+def test_the_estimates_margin_is_in_pixels_of_the_edit_whatever_the_photographs(
+    editor, monkeypatch, size, expected
+):
+    """Depth has the photographs' 64 px, of which an edit's pixel covers 64 / size."""
+    model, views = splats(), cameras(size=64)
+    margins, sight = [], run_module.Sight
+
+    def watched(*arguments):
+        margins.append(arguments[3])
+        return sight(*arguments)
+
+    monkeypatch.setattr(run_module, "Sight", watched)
+    settings = replace(
+        QUICK, stages=1, steps=1, iterations=0, size=size, estimate=1.0, estimate_margin=3
+    )
+    propagate(model, views[:2], pictures(model, views)[:2], editor, "a bear", settings)
+    assert margins == [[expected]]
