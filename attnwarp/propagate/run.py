@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -506,14 +505,13 @@ class _Run:
         chosen = self.plan.sources[:sources]
         warps = [self._warp(source, view, model) for source in chosen]
         scales = [self._edit_share(source) / self._edit_share(view) for source in chosen]
-        margins = None
-        if s.estimate_margin > 0:
-            # Of the edit's pixels; the depth map has the picture's.
-            margins = [
-                math.ceil(s.estimate_margin / math.sqrt(self._edit_share(source)) - 1e-9)
-                for source in chosen
-            ]
+        margins = [self._margin(source) for source in chosen] if s.estimate_margin > 0 else None
         return Sight(warps, s.confidence, scales, margins)
+
+    def _margin(self, source: int) -> int:
+        """Pixels of a source's depth map at a depth edge whose picture is not warped."""
+        camera = self.scene.cameras[source]
+        return round(self.settings.estimate_margin * min(camera.height, camera.width))
 
     def _edit_share(self, view: int) -> float:
         """Pixels of a view's edit for each of its picture."""

@@ -94,8 +94,9 @@ class PropagateSettings:
             inside, or as a "picture", which is decoded, warped pixel by pixel and encoded again.
             In each step of a view the editor then decodes the view and each source, and encodes
             twice.
-        estimate_margin: px of the source's edit on either side of a depth edge that are not warped
-            as its estimate. Pixels there mix near and far.
+        estimate_margin: what of the source on either side of a depth edge is not warped as its
+            estimate, since pixels there mix near and far; a share of its shorter side, rounded to
+            whole pixels.
         depth_from: the model before the edit ("frozen") or as tuned so far ("current").
         a0: weight of the injected features at the first step.
         decay: "linear", a_t = a0 (T - t) / T, or "constant".
@@ -159,7 +160,7 @@ class PropagateSettings:
     estimate: float = 0.0
     estimate_until: float = 0.5
     estimate_in: EstimateIn = "latents"
-    estimate_margin: int = 0
+    estimate_margin: float = 0.0
     depth_from: DepthFrom = "frozen"
     a0: float = 0.9
     decay: Decay = "linear"
@@ -297,7 +298,6 @@ class PropagateSettings:
 _LATER = ("latents", "source_prompt", "feature_steps", "estimate_in", "estimate_margin")
 _WHOLE = {
     "stages", "views_per_stage", "seed", "size", "steps", "batch", "sources", "iterations",
-    "estimate_margin",
 }  # fmt: skip
 _OPTIONAL = {"views_per_stage", "size", "text_guidance", "source_text_guidance"}
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -314,7 +314,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "chain_coverage": (0, 1),
     "estimate": (0, 1),
     "estimate_until": (0, math.inf),
-    "estimate_margin": (0, 1000),
+    "estimate_margin": (0, 1),
     "a0": (0, 1),
     "composite_blur": (0, math.inf),
     "iterations": (0, math.inf),
@@ -386,6 +386,7 @@ PRESETS: dict[str, PropagateSettings] = {
         estimate=1.0,
         estimate_until=2.0,
         estimate_in="picture",
+        estimate_margin=1 / 64,
     ),
 }
 """Sets of choices, each with the warp of that name (:data:`attnwarp.warp.PRESETS`).
@@ -403,8 +404,8 @@ ControlNet, where each view draws fresh noise, and the source has s_T 7.5 and th
 tunes on everything edited so far, with larger steps of the colours.
 
 ``extended``: ``corrected`` with ideas beyond the paper: further sources, noise that sticks to the
-surface, and the sources' clean pictures, with a weight that falls from 1 to a half. The study
-``beyond`` has each alone and all together.
+surface, and the sources' clean pictures, with a weight that falls from 1 to a half, but for their
+depth edges. The study ``beyond`` has each alone and all together.
 """
 
 

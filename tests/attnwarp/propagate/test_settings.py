@@ -47,6 +47,7 @@ def test_extended_is_corrected_with_ideas_beyond_the_paper():
     ideas = {
         "sources": 4, "noise": "surface",
         "estimate": 1.0, "estimate_until": 2.0, "estimate_in": "picture",
+        "estimate_margin": 1 / 64,
     }  # fmt: skip
     assert PRESETS["extended"] == replace(PRESETS["corrected"], **ideas)
 
@@ -63,7 +64,7 @@ def test_a_later_fields_default_leaves_the_json_of_former_edits_as_it_was():
     former = [settings for name, settings in PRESETS.items() if name != "extended"]
     assert not any(later & set(settings.to_dict()) for settings in former)
     chosen = {"latents": "inversion", "source_prompt": "a bear", "feature_steps": [0.0, 0.5]}
-    chosen |= {"estimate_in": "picture", "estimate_margin": 2}
+    chosen |= {"estimate_in": "picture", "estimate_margin": 0.02}
     changed = preset("corrected", **chosen)
     data = json.loads(json.dumps(changed.to_dict()))
     assert {name: data[name] for name in later} == chosen
