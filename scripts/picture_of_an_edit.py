@@ -25,7 +25,7 @@ SIZE = 128
 
 def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
     """Rows: before the edit, then alone or warped, each with own or with the same noise in every
-    view. Columns: the source view and targets.
+    view, and last the preset `extended`. Columns: the source view and targets.
     """
     truth = world(scene, SIZE)
     cameras = [truth.source, *(truth.targets[view] for view in VIEWS)]
@@ -43,7 +43,9 @@ def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
         rows[f"each view alone,\n{words}"] = alone.edited
         warped = propagate(*scene_and_words, preset("corrected", noise=noise, **stage, **few))
         rows[f"attention warped,\n{words}"] = warped.edited
-    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 11.3), dpi=80)
+    beyond = preset("extended", **{**stage, "sources": 4}, **few)
+    rows["extended"] = propagate(*scene_and_words, beyond).edited
+    figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 13.5), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
         axis.set_title(title)
     for row, (title, pictures) in zip(axes, rows.items(), strict=True):
