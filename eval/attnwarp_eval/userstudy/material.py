@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,8 +55,14 @@ class Item:
 
     @property
     def views(self) -> list[str]:
-        """Views that every method has, in the order of their names."""
-        return sorted(set(self.before).intersection(*self.methods.values()))
+        """Views that every method has, in the order of their yaw, others by name."""
+        return sorted(set(self.before).intersection(*self.methods.values()), key=_along_the_orbit)
+
+
+def _along_the_orbit(view: str) -> tuple[float, str]:
+    """Sorts the names of :func:`attnwarp_eval.scene.scene.view_name`: yawm30, source, yaw7p5."""
+    yaw = re.fullmatch(r"yaw(m?\d+(?:p\d+)?)", view)
+    return (float(yaw[1].replace("m", "-").replace("p", ".")) if yaw else 0.0, view)
 
 
 def read_items(runs: Sequence[Path], methods: Sequence[str] | None = None) -> list[Item]:
