@@ -11,7 +11,7 @@ from torch import Tensor
 
 from attnwarp.camera import Camera
 from attnwarp.warp import FeatureWarp, WarpedView, depth_slope, sample, sample_depth
-from attnwarp.warp.depth import Array, as_float64
+from attnwarp.warp.depth import Array, as_float64, valid_depth
 from attnwarp.warp.masks import axis_weights
 from attnwarp.warp.sampling import work_type
 from attnwarp.warp.surface import needed
@@ -96,8 +96,8 @@ def near_edges(depth: Array, margin: int) -> Tensor:
         >>> near_edges(torch.tensor([[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]]), 1)[0].int().tolist()
         [0, 0, 1, 1, 0, 0]
     """
-    z = as_float64(depth, "depth")
-    inverse = torch.where(torch.isfinite(z) & (z > 0), 1 / z, 0.0)
+    z = valid_depth(depth, "depth")
+    inverse = torch.nan_to_num(1 / z, nan=0.0)
     edge = torch.zeros(z.shape, dtype=torch.bool)
     if margin == 0:
         return edge
