@@ -35,7 +35,7 @@ def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
     # The row shows edited views, so the splats need no tuning.
     noises: dict[Literal["fresh", "shared"], str] = {"fresh": "own noise", "shared": "same noise"}
     few: dict[str, Any] = {"iterations": 1, "seed": seed}
-    stage: dict[str, Any] = {"stages": 1, "views_per_stage": len(VIEWS), "sources": 1}
+    stage: dict[str, Any] = {"stages": 1, "views_per_stage": len(VIEWS)}
     scene_and_words = (model, cameras, before, editor, instruction)
     rows: dict[str, Mapping[int, Any]] = {"before": dict(enumerate(before))}
     for noise, words in noises.items():
@@ -43,7 +43,7 @@ def draw(out: Path, scene: str, instruction: str, seed: int) -> None:
         rows[f"each view alone,\n{words}"] = alone.edited
         warped = propagate(*scene_and_words, preset("corrected", noise=noise, **stage, **few))
         rows[f"attention warped,\n{words}"] = warped.edited
-    beyond = preset("extended", **{**stage, "sources": 4}, **few)
+    beyond = preset("extended", **stage, **few)
     rows["extended"] = propagate(*scene_and_words, beyond).edited
     figure, axes = pyplot.subplots(len(rows), len(cameras), figsize=(11, 13.5), dpi=80)
     for axis, title in zip(axes[0], ("source view", *VIEWS), strict=True):
