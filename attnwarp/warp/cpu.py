@@ -137,6 +137,22 @@ def resize_mask(mask: Tensor, size: tuple[int, int], mode: MaskResize, defined: 
     return torch.from_numpy(result)
 
 
+def taps_at(
+    correspondence: Correspondence, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+) -> Taps:
+    """:func:`attnwarp.warp.sampling.taps_at` by kernels; ``device`` is the host's memory."""
+    xy = correspondence.xy.contiguous().numpy()
+    shape = (4, *xy.shape[:2])
+    index = _pool.empty(shape, np.int32)
+    weight = _pool.empty(shape, np.float32 if dtype == torch.float32 else np.float64)
+    source, integer = _lens(correspondence.source), correspondence.pixel_centers == "integer"
+    run_jobs(
+        pair.taps_of,
+        [(*piece, xy, source, integer, size, SNAP, index, weight) for piece in _rows(xy.shape[0])],
+    )
+    return Taps(*(torch.from_numpy(part.reshape(4, -1)) for part in (index, weight)))
+
+
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
     """:func:`attnwarp.warp.sampling.sample_maps` by kernels."""
     planes = maps.reshape(-1, maps.shape[-1])

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from attnwarp import check
 from attnwarp.warp import sampling
-from attnwarp.warp.correspondence import Correspondence, positions_in
-from attnwarp.warp.taps import Taps, taps_of
+from attnwarp.warp.correspondence import Correspondence
+from attnwarp.warp.taps import Taps
 
 Backend: TypeAlias = Literal["auto", "reference"]
 """Who computes a warp: "reference" is the definition in torch, on any device. "auto" takes the
@@ -209,9 +209,8 @@ class FeatureWarp:
         dtype = sampling.work_type(features.dtype)
         key = (h, w, features.device, dtype)
         if key not in self._taps:
-            taps = taps_of(positions_in(self.correspondence, w, h), h, w)
-            index, weight = (t.to(features.device) for t in (taps.index, taps.weight.to(dtype)))
-            self._taps[key] = Taps(index, weight)
+            engine = self._engine(features)
+            self._taps[key] = engine.taps_at(self.correspondence, (h, w), dtype, features.device)
         return self._taps[key]
 
     def _mask_on(self, device: torch.device) -> Tensor:

@@ -131,6 +131,21 @@ def work_type(dtype: torch.dtype) -> torch.dtype:
     return torch.float32 if dtype in (torch.float16, torch.bfloat16) else dtype
 
 
+def taps_at(
+    correspondence: Correspondence, size: tuple[int, int], dtype: torch.dtype, device: torch.device
+) -> Taps:
+    """The taps of a correspondence in the source's image at another size.
+
+    Args:
+        size: (h, w) of that image.
+        dtype: of the weights, which are worked out in float64.
+        device: where the taps shall lie.
+    """
+    h, w = size
+    taps = taps_of(positions_in(correspondence, w, h), h, w)
+    return Taps(taps.index.to(device), taps.weight.to(dtype).to(device))
+
+
 def sample_maps(maps: Tensor, taps: Taps) -> Tensor:
     """(..., N) weighted sums of the pixels of maps, in the maps' type.
 

@@ -46,7 +46,7 @@ class Taps:
     """The four taps of N positions on one grid of pixels.
 
     Args:
-        index: (4, N) int64, flat indices into the grid's pixels, row by row.
+        index: (4, N) int64 or int32, flat indices into the grid's pixels, row by row.
         weight: (4, N) float64 or float32, in [0, 1]; 0 for a tap that is not read. A position that
             is undefined reads none.
     """
@@ -57,7 +57,8 @@ class Taps:
     @functools.cached_property
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """``index`` as uint32 and ``weight``, for the kernels."""
-        return self.index.cpu().numpy().astype(np.uint32), self.weight.cpu().numpy()
+        index = self.index.to(device="cpu", dtype=torch.int32).numpy()
+        return index.view(np.uint32), self.weight.cpu().numpy()
 
 
 def taps_of(xy: Tensor, h: int, w: int) -> Taps:

@@ -395,7 +395,7 @@ def render_surface(
     depth = settings.depth
     how = "peak" if depth == "intersection" and gaussians.kind == "3d" else depth
     with torch.no_grad():
-        plane = _near_plane(gaussians, camera) if near is None else near
+        plane = near_plane(gaussians, camera) if near is None else near
         seen = render(gaussians, camera, backend=backend, depth=how, near=plane)
     z = seen.depth if settings.depth_statistic == "expected" else seen.median_depth
     return Surface(
@@ -438,7 +438,8 @@ NO_DEPTH = "the target's depth is nowhere finite and above zero; check the depth
 
 
 def _warn_if_empty(view: WarpedView, without_surface: str) -> None:
-    if view.rules["defined"].any():
+    # numpy's any: torch's reads a byte at a time.
+    if view.rules["defined"].numpy().any():
         return
     surface = torch.isfinite(view.correspondence.target_depth).any()
     reason = "every point lies behind the source; check" if surface else without_surface
@@ -472,13 +473,29 @@ def _checked_segment(
     return tensor.cpu()
 
 
-def _near_plane(gaussians: Gaussians, camera: Camera) -> float:
+def near_plane(gaussians: Gaussians, camera: Camera) -> float:
+    """The default near plane, in scene units: the renderer's, or a hundredth of the median distance
+    of the splats from the camera if that is less.
+    """
     from attnwarp.render.constants import NEAR
 
-    if not len(gaussians):
+    if not len(gaussians) or _mostly_beyond(gaussians, camera, 100 * NEAR):
         return NEAR
     distances = np.linalg.norm(gaussians.world_means() - camera.position, axis=1)
     return min(NEAR, float(np.median(distances)) / 100)
+
+
+def _mostly_beyond(gaussians: Gaussians, camera: Camera, distance: float) -> bool:
+    """Whether more than half of the splats surely lie beyond a distance from the camera.
+
+    In the means' own precision, which takes a tenth of the time: what float32 may round lies within
+    the limit.
+    """
+    offset = camera.position - gaussians.origin
+    away = gaussians.means.detach() - gaussians.means.new_tensor(offset)
+    limit = 1.01 * distance + 1e-6 * float(np.linalg.norm(offset))
+    beyond = torch.linalg.vector_norm(away, dim=1) > limit
+    return 2 * int(beyond.sum()) > len(gaussians)
 
 
 def _normal_rule(

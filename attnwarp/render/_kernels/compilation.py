@@ -94,8 +94,18 @@ def exact(function: Any) -> Any:
     Without numba's reference counts: two threads that count the same array up and down for every
     token spend more on that than on the token. Such kernels allocate nothing.
     """
-    options: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
-    return by_one_process(numba.njit(**options)(function))
+    return by_one_process(numba.njit(**_EXACT)(function))
+
+
+def exact_inlined(function: Any) -> Any:
+    """As :func:`exact`, for what kernels call for each pixel: LLVM puts it into its callers.
+
+    By itself LLVM leaves the larger ones apart, and each call then hands over 50 fields.
+    """
+    return by_one_process(numba.njit(forceinline=True, **_EXACT)(function))
+
+
+_EXACT: Any = {"nogil": True, "cache": True, "error_model": "numpy", "_nrt": False}
 
 
 # Without numba's reference counts: LLVM cannot remove those of arrays passed to inlined functions,

@@ -18,7 +18,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from attnwarp.render._kernels.compilation import exact
+from attnwarp.render._kernels.compilation import exact, exact_inlined
 
 INVERSE, BILINEAR, NEAREST = range(3)
 """How depth is interpolated."""
@@ -108,24 +108,24 @@ def _fma(typing: Any, x: Any, y: Any, z: Any) -> Any:
     return types.float64(types.float64, types.float64, types.float64), build
 
 
-@exact
+@exact_inlined
 def _turn(matrix, row, x, y, z):
     """Row ``row`` of matrix @ (x, y, z)."""
     return _fma(z, matrix[row, 2], _fma(y, matrix[row, 1], x * matrix[row, 0]))
 
 
-@exact
+@exact_inlined
 def _valid(depth):
     return depth > 0 and depth < np.inf
 
 
-@exact
+@exact_inlined
 def _clamp(value, length):
     # Unsigned, so that numba does not look for indices that count from the end.
     return np.uint64(min(max(value, 0.0), length - 1.0))
 
 
-@exact
+@exact_inlined
 def _axis(position, length, snap):
     """Lower tap, upper tap and the upper one's share along one axis."""
     index = min(max(position - 0.5, -1.0), float(length))
@@ -138,7 +138,7 @@ def _axis(position, length, snap):
     return np.uint64(first), np.uint64(last), index - floor
 
 
-@exact
+@exact_inlined
 def _taps(x, y, shape, snap):
     """Columns and rows of four taps in an image of ``shape``, and their shares along both axes."""
     x0, x1, fx = _axis(x, shape[1], snap)
@@ -146,7 +146,7 @@ def _taps(x, y, shape, snap):
     return x0, x1, y0, y1, fx, fy
 
 
-@exact
+@exact_inlined
 def _blend_depth(depth, taps, how, spread):
     """Depth between four taps, NaN where they are undefined or spread too far."""
     x0, x1, y0, y1, fx, fy = taps
@@ -165,14 +165,14 @@ def _blend_depth(depth, taps, how, spread):
     return 1 / total if how == INVERSE else total
 
 
-@exact
+@exact_inlined
 def _nearest_depth(depth, x, y):
     """Depth of the pixel that holds the position, NaN where it is undefined."""
     value = float(depth[_clamp(np.floor(y), depth.shape[0]), _clamp(np.floor(x), depth.shape[1])])
     return value if _valid(value) else np.nan
 
 
-@exact
+@exact_inlined
 def _sample(image, taps):
     """An (h, w) image between four taps."""
     x0, x1, y0, y1, fx, fy = taps
@@ -185,21 +185,21 @@ def _sample(image, taps):
     return total
 
 
-@exact
+@exact_inlined
 def _step(z, neighbour):
     """Depth's change to a neighbour, infinite where that is undefined."""
     # An infinite neighbour is infinitely far: one comparison less.
     return abs(z - neighbour) if neighbour > 0 else np.inf
 
 
-@exact
+@exact_inlined
 def _smaller(before, after):
     """The smaller of two steps, 0 if both are infinite."""
     smaller = min(before, after)
     return smaller if smaller < np.inf else 0.0
 
 
-@exact
+@exact_inlined
 def _slope(depth, i, j):
     """Depth's change per pixel, 0 where it is undefined."""
     h, w = depth.shape
@@ -214,7 +214,7 @@ def _slope(depth, i, j):
     return _smaller(up, down) + _smaller(left, right)
 
 
-@exact
+@exact_inlined
 def _scaled(position, length, other, integer):
     """A position in pixels of an image of ``length``, in one of ``other`` pixels."""
     if integer:
@@ -222,14 +222,14 @@ def _scaled(position, length, other, integer):
     return position * (other / length)
 
 
-@exact
+@exact_inlined
 def _in_image(pair, shape, x, y):
     """A source position in pixels of an image of ``shape``."""
     u = _scaled(x, pair.source.width, float(shape[1]), pair.integer)
     return u, _scaled(y, pair.source.height, float(shape[0]), pair.integer)
 
 
-@exact
+@exact_inlined
 def _inside(x, y, width, height, integer):
     if integer:
         x, y = x - 0.5, y - 0.5
@@ -237,7 +237,7 @@ def _inside(x, y, width, height, integer):
     return x >= 0 and x <= width and y >= 0 and y <= height
 
 
-@exact
+@exact_inlined
 def _locate(pair, i, j, depth, positions):
     """Fill pixel (i, j) of ``positions`` from its depth; whether it has a position."""
     lens, other, pose = pair.target, pair.source, pair.pose
@@ -286,7 +286,7 @@ def layer(begin, end, pair, depth, how, spread, positions):
             _locate(pair, i, j, z, positions)
 
 
-@exact
+@exact_inlined
 def _angle(ax, ay, az, bx, by, bz):
     """Degrees between two vectors: :func:`attnwarp.warp.rules.angle_between`."""
     a, b = math.sqrt(ax * ax + ay * ay + az * az), math.sqrt(bx * bx + by * by + bz * bz)
@@ -296,7 +296,7 @@ def _angle(ax, ay, az, bx, by, bz):
     return 2 * math.atan2(minus, plus) * (180 / math.pi)
 
 
-@exact
+@exact_inlined
 def _normal_passes(pair, rules, normal, i, j, positions):
     x, y, z = float(normal[i, j, 0]), float(normal[i, j, 1]), float(normal[i, j, 2])
     length = x * x + y * y + z * z
@@ -329,7 +329,7 @@ def _normal_passes(pair, rules, normal, i, j, positions):
     return _angle(nx, ny, nz, -X, -Y, -Z) < rules.angle
 
 
-@exact
+@exact_inlined
 def _depth_passes(rules, depth, taps, u, v, z):
     """Depth ``z`` is what the source sees at (u, v), in pixels of its depth map."""
     h, w = depth.shape
@@ -341,7 +341,7 @@ def _depth_passes(rules, depth, taps, u, v, z):
     return error <= tolerance + rules.slope * change
 
 
-@exact
+@exact_inlined
 def _photometric_passes(pair, rules, source, target, i, j, x, y):
     h, w, channels = source.shape
     u, v = _in_image(pair, (h, w), x, y)
@@ -367,9 +367,20 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
     image = pair.source
     of_depth, of_alpha = source.depth.shape, source.alpha.shape
     together = of_depth == of_alpha
+    nowhere = _taps(0.5, 0.5, (1, 1), pair.snap)
     for i in range(begin, end):
         for j in range(width):
-            defined = _locate(pair, i, j, float(target.depth[i, j]), positions)
+            depth = float(target.depth[i, j])
+            defined = _locate(pair, i, j, depth, positions)
+            if not _valid(depth):  # the background: every rule but that of alpha fails
+                for row in range(len(passes)):
+                    passes[row, i, j] = False
+                if rules.row_opaque >= 0 and of_alpha[0] == 0:
+                    passes[rules.row_opaque, i, j] = (
+                        target.alpha.size == 0 or float(target.alpha[i, j]) >= rules.opaque
+                    )
+                mask[i, j] = False
+                continue
             x, y, z = positions.xy[i, j, 0], positions.xy[i, j, 1], positions.points[i, j, 2]
             inside = _inside(x, y, image.width, image.height, pair.integer)
             bounds = _inside(x, y, rules.bounds_width, rules.bounds_height, pair.integer)
@@ -380,7 +391,7 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
                 good = z > 0
                 passes[rules.row_in_front, i, j] = good
                 every = every and good
-            taps = _taps(0.5, 0.5, (1, 1), pair.snap)
+            taps = nowhere
             u = v = 0.5
             if inside and of_depth[0] > 0:
                 u, v = _in_image(pair, of_depth, x, y)
@@ -416,6 +427,32 @@ def rules_of_pair(begin, end, pair, rules, target, source, segment, positions, p
             if segment.size > 0:
                 every = every and segment[i, j]
             mask[i, j] = every
+
+
+@exact
+def taps_of(begin, end, xy, source, integer, shape, snap, index, weight):
+    """Rows ``begin`` to ``end``: the four taps of each position in an image of ``shape``.
+
+    Args:
+        xy: (H, W, 2) positions in pixels of the source's image.
+        source: its :class:`Lens`.
+        index: (4, H, W) int32, flat indices into the image of ``shape``.
+        weight: (4, H, W) float32 or float64, 0 where a position is undefined.
+    """
+    w = np.uint64(shape[1])
+    for i in range(begin, end):
+        for j in range(xy.shape[1]):
+            x = _scaled(xy[i, j, 0], source.width, float(shape[1]), integer)
+            y = _scaled(xy[i, j, 1], source.height, float(shape[0]), integer)
+            defined = abs(x) < np.inf and abs(y) < np.inf
+            if not defined:
+                x = y = 0.5
+            x0, x1, y0, y1, fx, fy = _taps(x, y, shape, snap)
+            index[0, i, j], index[1, i, j] = y0 * w + x0, y0 * w + x1
+            index[2, i, j], index[3, i, j] = y1 * w + x0, y1 * w + x1
+            one = 1.0 if defined else 0.0
+            weight[0, i, j], weight[1, i, j] = one * ((1 - fx) * (1 - fy)), one * (fx * (1 - fy))
+            weight[2, i, j], weight[3, i, j] = one * ((1 - fx) * fy), one * (fx * fy)
 
 
 @exact

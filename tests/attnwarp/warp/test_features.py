@@ -9,7 +9,7 @@ from closed_forms import orbit, sphere
 
 from attnwarp import Camera
 from attnwarp.render.threads import set_thread_count
-from attnwarp.warp import FeatureWarp, correspond
+from attnwarp.warp import FeatureWarp, correspond, cpu, sampling
 from attnwarp.warp.settings import preset
 from attnwarp.warp.view import Surface, warp_surfaces
 
@@ -78,8 +78,11 @@ def bits(tensor):
 
 
 def both(layer, call):
-    """What the kernels and what the definition gives."""
-    return call(layer), call(dataclasses.replace(layer, backend="reference"))
+    """What the kernels and what the definition gives, each with taps of its own."""
+    kernels, definition = (
+        dataclasses.replace(layer, backend=backend, _taps={}) for backend in ("auto", "reference")
+    )
+    return call(kernels), call(definition)
 
 
 @pytest.mark.parametrize("dtype", FLOATS, ids=str)
@@ -102,6 +105,26 @@ def test_kernels_have_the_bits_of_the_definition(layer, dtype, channels):
         assert torch.equal(torch.isnan(kernels), torch.isnan(definition))
         number = ~torch.isnan(definition)
         assert torch.equal(bits(kernels)[number], bits(definition)[number])
+
+
+@pytest.mark.parametrize("centers", ["half", "integer"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("size", [(16, 12), (8, 6), (1, 1), (31, 23)])
+def test_taps_by_kernels_have_the_bits_of_the_definition(centers, dtype, size):
+    # Positions beyond all borders, within rounding of pixel centres, and undefined ones.
+    camera = Camera(np.array([[16.0, 0, 6], [0, 16.0, 8], [0, 0, 1]]), np.eye(4), 12, 16)
+    c = correspond(camera, camera, np.full((16, 12), 2.0), pixel_centers=centers)
+    random = torch.Generator().manual_seed(0)
+    xy = 40 * torch.rand(16, 12, 2, generator=random, dtype=torch.float64) - 12
+    xy[0] = xy[0].round() + 0.5 + 1e-8 * torch.randn(12, 2, generator=random)
+    xy[1, :4, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e300])
+    moved = dataclasses.replace(c, xy=xy)
+    got, expected = (engine.taps_at(moved, size, dtype, xy.device) for engine in (cpu, sampling))
+    assert torch.equal(got.index.long(), expected.index.long())
+    assert got.weight.dtype == expected.weight.dtype == dtype
+    assert torch.equal(bits(got.weight), bits(expected.weight))
+    for ours, definition in zip(got.arrays, expected.arrays, strict=True):
+        assert ours.dtype == definition.dtype and np.array_equal(ours, definition)
 
 
 def test_maps_of_any_size_and_tokens_that_are_not_contiguous_are_read_right(layer):
@@ -309,10 +332,8 @@ def test_a_map_is_taken_at_every_size_that_a_network_makes_of_the_picture_and_no
 
 def test_a_layer_makes_its_taps_once(layer, monkeypatch):
     made = []
-    from attnwarp.warp import features
-
-    original = features.taps_of
-    monkeypatch.setattr(features, "taps_of", lambda *a: made.append(a) or original(*a))
+    original = cpu.taps_at
+    monkeypatch.setattr(cpu, "taps_at", lambda *a: made.append(a) or original(*a))
     fresh = dataclasses.replace(layer, _taps={}, _masks={})
     for dtype in (torch.float32, torch.float16, torch.float32):
         rows = tokens_of(random_maps(layer, dtype=dtype))

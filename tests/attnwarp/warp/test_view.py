@@ -14,7 +14,7 @@ from attnwarp.warp.rules import (
     in_front,
 )
 from attnwarp.warp.settings import PRESETS, WarpSettings, preset
-from attnwarp.warp.view import Surface, render_surface, warp_surfaces, warp_view
+from attnwarp.warp.view import Surface, near_plane, render_surface, warp_surfaces, warp_view
 
 
 def test_opposed_views_of_a_sphere_have_an_empty_mask():
@@ -81,6 +81,32 @@ def test_a_world_in_millimetres_has_the_depth_of_its_plane(backend):
     expected = target.pixel_centers()[middle] + [2.0, 0]
     assert np.abs(view.correspondence.xy[middle].numpy() - expected).max() < 1e-4
     assert view.mask[middle].all()
+
+
+@pytest.mark.parametrize("place", [0.0, 1e5])
+@pytest.mark.parametrize("origin", [0.0, 1e5])
+@pytest.mark.parametrize("scale", [0.1, 0.9, 0.995, 1.0, 1.02, 3.0])
+def test_the_near_plane_is_a_hundredth_of_the_median_distance_and_at_most_the_default(
+    scale, origin, place
+):
+    random = torch.Generator().manual_seed(3)
+    way = torch.nn.functional.normalize(torch.randn(101, 3, generator=random), dim=1)
+    distance = scale * torch.linspace(0.5, 1.5, 101)[:, None]
+    splats = Gaussians(
+        "2d",
+        way * distance + place,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(101, 1),
+        torch.full((101, 2), 0.1),
+        torch.ones(101),
+        torch.zeros(101, 1, 3),
+        origin=np.full(3, origin),
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = -(place + origin)
+    camera = Camera(np.array([[32.0, 0, 16], [0, 32.0, 16], [0, 0, 1]]), pose, 32, 32)
+    away = splats.means.numpy().astype(np.float64) + origin - (place + origin)
+    expected = min(0.01, np.median(np.sqrt((away**2).sum(axis=1))) / 100)
+    assert near_plane(splats, camera) == pytest.approx(expected, rel=1e-12)
 
 
 def test_nothing_nearer_than_the_near_plane_that_is_asked_for_is_seen():
