@@ -358,19 +358,39 @@ def _eliminate(points: Array, normals: Array, spacing: Array, count: int) -> npt
     radius = spacing / np.sqrt(2 * np.sqrt(3.0))
     k = min(n, 6 * CANDIDATES)
     distance, near = cKDTree(points).query(points, k=k, workers=-1)
-    distance, near = distance.reshape(n, k), near.reshape(n, k)
-    here = np.repeat(np.arange(n), k)
-    there = near.ravel()
-    # The two sides of a thin sheet do not crowd each other.
-    same_side = np.einsum("ij,ij->i", normals[here], normals[there]) > 0
-    closeness = 1 - distance.ravel() / (radius[here] + radius[there])
-    use = (here != there) & same_side & (closeness > 0)
-    crowd = csr_matrix((closeness[use] ** 8, (here[use], there[use])), shape=(n, n))
+    start, other, closeness = _crowds(distance.reshape(n, k), near.reshape(n, k), radius, normals)
+    crowd = csr_matrix((closeness**8, other, start), shape=(n, n))
+    crowd.sort_indices()
     crowd = crowd.maximum(crowd.T).tocsr()
     alive = _remove(
         crowd.indptr.astype(np.int64), crowd.indices.astype(np.int64), crowd.data, n - count
     )
     return np.flatnonzero(alive)
+
+
+@numba.njit(cache=True)
+def _crowds(distance, near, radius, normals):  # type: ignore[no-untyped-def]
+    """Who crowds whom, as the rows of a sparse matrix: (n + 1,) starts, others, and closeness.
+
+    1 minus the distance of two points over the sum of their radii, where that is positive. The two
+    sides of a thin sheet do not crowd each other.
+    """
+    n, k = near.shape
+    start = np.zeros(n + 1, np.int64)
+    other, closeness = np.empty(n * k, np.int64), np.empty(n * k)
+    count = 0
+    for i in range(n):
+        for c in range(k):
+            j = near[i, c]
+            close = 1 - distance[i, c] / (radius[i] + radius[j])
+            along = 0.0
+            for axis in range(3):
+                along += normals[i, axis] * normals[j, axis]
+            if j != i and close > 0 and along > 0:
+                other[count], closeness[count] = j, close
+                count += 1
+        start[i + 1] = count
+    return start, other[:count], closeness[:count]
 
 
 @numba.njit(cache=True)
