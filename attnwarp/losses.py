@@ -263,6 +263,14 @@ def normal_consistency(view: Render) -> Tensor:
         >>> normal_consistency(render(disc, camera)).item() < 1e-5  # a disc is flat
         True
     """
+    if view.backend == "cpu" and not view._pose.requires_grad:
+        # Here, as numba takes its time to import.
+        from attnwarp.render import consistency
+
+        pose = view._pose[:3, :3]
+        return consistency.normal_consistency(
+            view.depth, view.alpha, view.normal, view.camera, pose
+        )
     N = view.normal_from_depth
     defined = torch.isfinite(N.detach()).all(-1)
     agreement = (view.normal * torch.where(defined[..., None], N, 0.0)).sum(-1)

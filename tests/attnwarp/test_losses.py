@@ -1,5 +1,6 @@
 """Losses against other libraries, closed forms and finite differences."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 
 from attnwarp import Camera, Gaussians, losses
 from attnwarp.render import render
+from attnwarp.render.threads import set_thread_count
 
 
 def pictures(height=40, width=52, channels=3, dtype=torch.float64, seed=0):
@@ -177,6 +179,72 @@ def test_normal_consistency_of_nothing_is_zero_with_zero_gradient():
     loss.backward()
     assert float(loss.detach()) == 0
     assert float(sheet.means.grad.abs().max()) == 0
+
+
+def hilly(width, height, seed=0):
+    """A picture of hills with holes from a turned, skewed camera, as float32 maps; and the same as
+    leaves in float64 that the definition in torch reads.
+    """
+    random = np.random.default_rng(seed)
+    turn = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn * np.linalg.det(turn), [0.1, 0.2, 0.3]
+    K = np.array([[50.0, 1.5, 0.3 * width], [0, 60.0, 0.7 * height], [0, 0, 1]])
+    camera = Camera(K, pose, width, height)
+    y, x = np.mgrid[:height, :width]
+    depth = 2 + 0.3 * np.sin(x / 3) + 0.2 * np.cos(y / 4)
+    depth[random.random(depth.shape) < 0.05] = np.nan
+    maps = {
+        "depth": depth,
+        "alpha": random.random(depth.shape),
+        "normal": random.standard_normal((height, width, 3)),
+    }
+    maps = {name: torch.tensor(value, dtype=torch.float32) for name, value in maps.items()}
+    rendered = render(plane(0), camera, backend="reference")
+    views = []
+    for backend, dtype in (("cpu", torch.float32), ("reference", torch.float64)):
+        leaves = {name: m.to(dtype, copy=True).requires_grad_(True) for name, m in maps.items()}
+        views.append(dataclasses.replace(rendered, backend=backend, **leaves))
+    return views
+
+
+@pytest.mark.parametrize("size", [(31, 40), (64, 9), (3, 3), (2, 7), (1, 1)])
+def test_kernels_of_normal_consistency_have_the_definitions_value_and_gradients(size):
+    ours, definition = hilly(*size)
+    values = [losses.normal_consistency(view) for view in (ours, definition)]
+    assert float(values[0].detach()) == pytest.approx(float(values[1].detach()), abs=1e-7)
+    for value in values:
+        (3 * value).backward()
+    for name in ("depth", "alpha", "normal"):
+        got, expected = (getattr(view, name).grad for view in (ours, definition))
+        if expected is None:  # no pixel has a normal: the definition's 0 is a constant
+            assert min(size) < 3
+            expected = torch.zeros_like(got)
+        # Differences of float32 points keep 4 to 5 digits; the largest gradients set the scale.
+        scale = max(float(expected.abs().max()), 1e-12)
+        assert float((got - expected).abs().max()) < 2e-5 * scale, name
+
+
+def test_bits_of_normal_consistency_do_not_depend_on_threads():
+    results = []
+    try:
+        for threads in (1, 2, 5):
+            set_thread_count(threads)
+            view, _ = hilly(70, 50)
+            value = losses.normal_consistency(view)
+            value.backward()
+            results.append([value.detach(), *(getattr(view, n).grad for n in ("depth", "normal"))])
+    finally:
+        set_thread_count(None)
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            assert torch.equal(first, second)
+
+
+def test_normal_consistency_moves_a_camera_whose_pose_has_a_gradient():
+    pose = torch.tensor(CAMERA.world_to_camera, requires_grad=True)
+    losses.normal_consistency(render(plane(0), CAMERA, backend="cpu", pose=pose)).backward()
+    assert torch.isfinite(pose.grad).all()
 
 
 def two_discs(gap):
