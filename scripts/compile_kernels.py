@@ -17,6 +17,8 @@ import numpy as np
 import yaml
 
 from attnwarp.gaussians import Gaussians
+from attnwarp.losses import normal_consistency
+from attnwarp.render import render as rendered
 from benchmarks import render, warp
 
 STUDY = {
@@ -37,6 +39,7 @@ def main(float64: bool) -> None:
     for kind in ("2d", "3d"):
         splats = render.scene(kind, 100, 0.1)
         render.time_once(in_double(splats) if float64 else splats, render.camera(32))
+        consistency_of_normals(in_double(splats) if float64 else splats)
     if float64:
         return
     for work in warp.pair_case(64).contestants.values():
@@ -44,6 +47,13 @@ def main(float64: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["ATTNWARP_CACHE"] = str(Path(folder) / "derived")
         scenes_and_truth(Path(folder))
+
+
+def consistency_of_normals(splats: Gaussians) -> None:
+    """The loss's kernels, forward and backward."""
+    means = splats.means.clone().requires_grad_(True)
+    view = rendered(dataclasses.replace(splats, means=means), render.camera(32), backend="cpu")
+    normal_consistency(view).backward()
 
 
 def in_double(splats: Gaussians) -> Gaussians:
