@@ -84,7 +84,7 @@ install_libraries() {
     exit 2
 }
 
-# With LLVM 16 or later Mitsuba compiles its integrators, and true pictures take a third of the time. Without it the
+# With LLVM 16 or later Mitsuba compiles its integrators, and true pictures take a half to a third of the time. Without it the
 # interpreted ones do, so what cannot be installed is left out. Tests do without: each of their processes would compile.
 install_llvm() {
     [ "$extras" != dev ] && [[ ",$extras," == *,eval,* ]] || return 0

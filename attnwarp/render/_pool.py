@@ -8,6 +8,7 @@ the caller keeps are never written again.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -65,7 +66,9 @@ def clear() -> None:
 def empty(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array like ``np.empty``'s, on a 64-byte boundary if it has 16 KiB or more."""
     global _held
-    size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+    # Not numpy's product: dozens of arrays a picture, each of whose shapes it would make an array of.
+    length = math.prod(shape) if isinstance(shape, tuple) else int(shape)
+    size = length * np.dtype(dtype).itemsize
     if size < SMALLEST:
         return np.empty(shape, dtype)
     # Eight sizes between a power of two and the next.

@@ -17,6 +17,10 @@ SCALARS = frozenset({bool, int, float, np.float32, np.float64, np.int32, np.int6
 """Whose numba type follows from Python's; that of an integer of more bits follows from its value.
 """
 
+PLAIN, WRITEABLE = 0x101, 0x400
+"""numpy's flags of arrays: C-contiguous and aligned (NPY_ARRAY_CARRAY_RO), writeable. Read as one
+number, since each of them by name is an object of its own."""
+
 _machine_code: dict[tuple[Any, ...], Callable[..., Any]] = {}
 
 
@@ -24,9 +28,9 @@ def _type_key(value: Any) -> Any:
     """Equal for two values only if numba gives them the same type."""
     kind = type(value)
     if kind is np.ndarray:
-        flags = value.flags
-        if flags.c_contiguous and flags.aligned:
-            return value.dtype, value.ndim, flags.writeable
+        flags = value.flags.num
+        if flags & PLAIN == PLAIN:
+            return value.dtype, value.ndim, flags & WRITEABLE
     elif isinstance(value, tuple):
         return kind, *map(_type_key, value)
     elif kind in SCALARS and (kind is not int or value.bit_length() < 64):
