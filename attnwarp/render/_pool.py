@@ -66,7 +66,7 @@ def clear() -> None:
 def empty(shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
     """An array like ``np.empty``'s, on a 64-byte boundary if it has 16 KiB or more."""
     global _held
-    # Not numpy's product: dozens of arrays a picture, each of whose shapes it would make an array of.
+    # Not numpy's product, which makes an array of each shape: a picture takes dozens.
     length = math.prod(shape) if isinstance(shape, tuple) else int(shape)
     size = length * np.dtype(dtype).itemsize
     if size < SMALLEST:
