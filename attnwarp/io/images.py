@@ -80,7 +80,7 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
 
     path = existing_file(path)
     tiff = _unturned(path)
-    rgba: npt.NDArray[np.uint8] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
+    rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
     _check_png(path)
     if rgba is not None:
         return rgba
@@ -173,15 +173,20 @@ def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = Non
         ) from None
 
 
-def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8] | None:
+def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | None:
     """Decode a picture; return (H, W, 4) where OpenCV drops its alpha or multiplies it into the
     colours: TIFF of 8 bits, and grey PNG with a transparent value.
     """
     image.load()
+    clear = image.info.get("transparency")
+    if image.mode == "I;16" and clear is not None:
+        values = np.array(image, np.uint16)
+        alpha = np.where(values == clear, 0, 65535).astype(np.uint16)
+        return np.stack([values, values, values, alpha], axis=2)
     tiff = image.format == "TIFF" and image.mode in ("LA", "RGBA")
     # Pillow opens 16 bits as 8, and OpenCV reads them right.
     tiff = tiff and max(image.tag_v2.get(_BITS, (8,))) <= 8
-    grey = image.mode in ("1", "L") and "transparency" in image.info
+    grey = image.mode in ("1", "L") and clear is not None
     return np.array(image.convert("RGBA")) if tiff or grey else None
 
 

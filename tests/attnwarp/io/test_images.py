@@ -107,6 +107,28 @@ def test_alpha_comes_straight_from_every_format(tmp_path, name, mode, options):
     np.testing.assert_array_equal(read_image(tmp_path / name)[1, 2], expected[mode])
 
 
+def test_the_transparent_value_of_a_grey_png_of_16_bits_is_transparent(tmp_path):
+    """Oracle: a PNG written by the format's specification."""
+    grey = np.array([[7, 60000, 300], [60000, 0, 65535]], ">u2")
+
+    def chunk(kind, data):
+        check = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + check
+
+    rows = b"".join(b"\0" + row.tobytes() for row in grey)
+    (tmp_path / "a.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 16, 0, 0, 0, 0))
+        + chunk(b"tRNS", struct.pack(">H", 60000))
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+    image = read_image(tmp_path / "a.png")
+    assert image.dtype == np.uint16
+    np.testing.assert_array_equal(image[..., :3], np.repeat(grey[..., None], 3, axis=2))
+    np.testing.assert_array_equal(image[..., 3], [[65535, 0, 65535], [0, 65535, 65535]])
+
+
 def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):
     (tmp_path / "a.png").write_bytes(b"nothing")
     with pytest.raises(FileFormatError, match=r"a\.png: cannot be read as an image"):
