@@ -183,10 +183,8 @@ def _orientation(path: Path) -> int:
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with Pillow.open(path) as image:
-            # OpenCV turns TIFF itself.
-            if image.format != "TIFF":
-                turn = image.getexif().get(Base.Orientation, 1)
-                return turn if turn in range(1, 9) else 1
+            turn = image.getexif().get(Base.Orientation, 1)
+            return turn if turn in range(1, 9) else 1
     return 1
 
 

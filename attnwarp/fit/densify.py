@@ -32,12 +32,13 @@ def screen_gradient(
     """(N,) length of the loss's gradient in each splat's position on screen, the screen being 2
     wide and 2 high.
 
-    Let c = R m + t be the centre in camera axes and (x, y) = (fx X / Z, fy Y / Z) its pixel. A loss
-    that depends on a centre only through its pixel has dL/dX = fx / Z dL/dx and dL/dY = fy / Z
-    dL/dy. So the two components of R dL/dm across the view give the gradient on screen. A loss may
-    also depend on the centre's depth, on the direction of view, and on the outline. These parts
-    enter here; the published code leaves them out or, for 2DGS, overwrites them. A screen 2 wide
-    makes the thresholds of 3DGS independent of the image's size.
+    Let c = R m + t be the centre in camera axes and (x, y) = ((fx X + s Y) / Z, fy Y / Z) its
+    pixel, s the skew. A loss that depends on a centre only through its pixel has dL/dX = fx / Z
+    dL/dx and dL/dY = (s dL/dx + fy dL/dy) / Z. So the two components of R dL/dm across the view
+    give the gradient on screen. A loss may also depend on the centre's depth, on the direction of
+    view, and on the outline. These parts enter here; the published code leaves them out or, for
+    2DGS, overwrites them. A screen 2 wide makes the thresholds of 3DGS independent of the image's
+    size.
 
     Args:
         gradient, means: (N, 3) in world axes, ``means`` relative to ``origin``.
@@ -48,6 +49,7 @@ def screen_gradient(
     moved = torch.from_numpy(camera.rotation @ origin + camera.translation)
     z = means.double() @ R[2] + moved[2]
     across = gradient.double() @ R[:2].T
+    across[:, 1] -= float(camera.K[0, 1] / camera.K[0, 0]) * across[:, 0]
     focal = torch.tensor([camera.K[0, 0], camera.K[1, 1]])
     half = torch.tensor([camera.width / 2, camera.height / 2], dtype=torch.float64)
     on_screen = across * z[:, None] / focal * half

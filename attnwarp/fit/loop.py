@@ -368,8 +368,10 @@ class _Run:
         return "asked" if stop is not None and stop() else ""
 
     def _out_of_patience(self) -> bool:
-        patience = self.settings.patience
-        values = [record.psnr for record in self.history if record.psnr is not None]
+        patience, every = self.settings.patience, self.settings.evaluate_every
+        # A sitting that was stopped evaluated once more, and must not shorten the patience.
+        regular = (record for record in self.history if record.iteration % every == 0)
+        values = [record.psnr for record in regular if record.psnr is not None]
         if patience is None or len(values) <= patience:
             return False
         return max(values[-patience:]) < max(values[:-patience]) + self.settings.min_gain

@@ -66,8 +66,8 @@ class FitSettings:
         evaluate_every: iterations between two evaluations on the held-out views, which also the
             curve of the result is made of.
         patience: stop when the held-out PSNR has not risen by ``min_gain`` dB in so many
-            evaluations. None: never. The held-out figures of a fit that stopped early are slightly
-            optimistic.
+            evaluations. None: never. One more, at the end of a sitting, does not count. The
+            held-out figures of a fit that stopped early are slightly optimistic.
         min_gain: see ``patience``, dB.
 
     Raises:

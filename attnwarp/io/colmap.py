@@ -85,6 +85,7 @@ def read_colmap(
     resize_cameras: bool = False,
     points: bool = True,
     distorted: Distorted = "error",
+    scale: int = 1,
 ) -> Dataset:
     """Read a COLMAP sparse model; where both binary and text files are there, the binary ones, as
     COLMAP does.
@@ -103,6 +104,8 @@ def read_colmap(
             damaged.
         distorted: "error" to refuse lens distortion, or "keep" to hand it on in
             ``Dataset.lenses`` for :func:`undistort`.
+        scale: 4 for the folder ``images_4`` in place of ``images``, where ``images`` is left out;
+            the cameras are resized to its pictures.
 
     Raises:
         FileNotFoundError: no model there.
@@ -152,13 +155,13 @@ def read_colmap(
         )
         cameras.append(camera)
         lenses.append(lens)
-    folder = _image_folder(path, model, images)
+    folder = _image_folder(path, model, images, "images" if scale == 1 else f"images_{scale}")
     cameras, paths = with_images(
         source,
         cameras,
         [folder / pose.name for pose in poses],
         missing_images=missing_images,
-        resize_cameras=resize_cameras,
+        resize_cameras=resize_cameras or scale > 1,
     )
     cloud = model / f"points3D{suffix}"
     if not points or not cloud.is_file():
@@ -188,11 +191,16 @@ class _Pose:
     name: str
 
 
-def _image_folder(path: Path, model: Path, images: str | os.PathLike[str] | None) -> Path:
+def _image_folder(
+    path: Path, model: Path, images: str | os.PathLike[str] | None, name: str
+) -> Path:
+    """The folder that ``images`` says; left out, the one of that name nearest to the model."""
     if images is not None:
         return path / images if (path / images).is_dir() else Path(images)
     roots = [path, model.parent, model.parent.parent, model.parent.parent.parent]
-    return next((root / "images" for root in roots if (root / "images").is_dir()), path / "images")
+    # The parent of "." is "." itself.
+    roots += model.resolve().parents[:3]
+    return next((root / name for root in roots if (root / name).is_dir()), path / name)
 
 
 def _camera(

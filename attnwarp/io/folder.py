@@ -107,11 +107,12 @@ def read_dataset(
     if format == "colmap":
         return read_colmap(
             path,
-            images=images if scale == 1 else f"images_{scale}",
+            images=images,
             missing_images=missing_images,
-            resize_cameras=resize_cameras or scale > 1,
+            resize_cameras=resize_cameras,
             points=points,
             distorted=distorted,
+            scale=scale,
         )
     if images is not None:
         raise ValueError(

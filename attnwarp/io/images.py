@@ -6,7 +6,9 @@ returns a picture; Pillow, which refuses such a file, therefore decodes it first
 
 from __future__ import annotations
 
+import io
 import os
+import struct
 import warnings
 import zlib
 from collections.abc import Callable
@@ -43,7 +45,7 @@ def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
         (3, 2)
     """
     path = existing_file(path)
-    size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size)
+    size: tuple[int, int] | None = _with_pillow(path, lambda image: image.size, _unturned(path))
     if size is None:
         height, width = read_image(path).shape[:2]
         return width, height
@@ -77,11 +79,16 @@ def read_image(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     import cv2
 
     path = existing_file(path)
-    rgba: npt.NDArray[np.uint8] | None = _with_pillow(path, _alpha_lost_by_opencv)
+    tiff = _unturned(path)
+    rgba: npt.NDArray[Any] | None = _with_pillow(path, _alpha_lost_by_opencv, tiff)
     _check_png(path)
     if rgba is not None:
         return rgba
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    if tiff is None:
+        image = cv2.imread(str(path), flags)
+    else:
+        image = cv2.imdecode(np.frombuffer(tiff, np.uint8), flags)
     if image is None:
         raise FileFormatError(path, "cannot be read as an image; replace it or leave it out")
     if image.dtype not in (np.uint8, np.uint16):
@@ -131,10 +138,15 @@ def weighted_by_alpha(
     return np.round(np.clip(values, 0, 1) * top).astype(image.dtype)
 
 
-def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
+def _with_pillow(path: Path, use: Callable[[Any], Any], data: bytes | None = None) -> Any:
     """What ``use`` makes of the picture opened by Pillow, with its errors in one line.
 
     None for a format that Pillow does not know, such as TIFF of 16 bits and three channels.
+
+    Args:
+        path: of the picture.
+        use: called with it.
+        data: in place of the file's, if given.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -142,7 +154,7 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
         with warnings.catch_warnings():
             # A large picture or an odd tag is no reason to stop.
             warnings.simplefilter("ignore")
-            with Image.open(path) as image:
+            with Image.open(path if data is None else io.BytesIO(data)) as image:
                 return use(image)
     except UnidentifiedImageError:
         return None
@@ -161,14 +173,59 @@ def _with_pillow(path: Path, use: Callable[[Any], Any]) -> Any:
         ) from None
 
 
-def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8] | None:
+def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | None:
     """Decode a picture; return (H, W, 4) where OpenCV drops its alpha or multiplies it into the
     colours: TIFF of 8 bits, and grey PNG with a transparent value.
     """
     image.load()
+    clear = image.info.get("transparency")
+    if image.mode == "I;16" and clear is not None:
+        values = np.array(image, np.uint16)
+        alpha = np.where(values == clear, 0, 65535).astype(np.uint16)
+        return np.stack([values, values, values, alpha], axis=2)
     tiff = image.format == "TIFF" and image.mode in ("LA", "RGBA")
-    grey = image.mode in ("1", "L") and "transparency" in image.info
+    # Pillow opens 16 bits as 8, and OpenCV reads them right.
+    tiff = tiff and max(image.tag_v2.get(_BITS, (8,))) <= 8
+    grey = image.mode in ("1", "L") and clear is not None
     return np.array(image.convert("RGBA")) if tiff or grey else None
+
+
+_ORIENTATION, _BITS = 274, 258
+"""TIFF's tags that ask for a turn, and that hold the bits of each channel."""
+
+
+def _unturned(path: Path) -> bytes | None:
+    """A TIFF whose tag asks for a turn, with a tag that asks for none: OpenCV and Pillow turn the
+    pixels of this format whatever they are told. None for any other file.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(4)
+        order = {b"II": "<", b"MM": ">"}.get(head[:2])
+        layouts = {42: ("H", "I", 4), 43: ("Q", "Q", 8)}  # 43 is BigTIFF
+        if order is None or len(head) < 4:
+            return None
+        layout = layouts.get(struct.unpack(f"{order}2xH", head)[0])
+        if layout is None:
+            return None
+        data = head + stream.read()
+    count_type, offset_type, begin = layout
+    entry = struct.Struct(f"{order}HH{offset_type}{offset_type}")  # tag, type, count, value
+    try:
+        (place,) = struct.unpack_from(f"{order}{offset_type}", data, begin)
+        (count,) = struct.unpack_from(f"{order}{count_type}", data, place)
+        place += struct.calcsize(count_type)
+        for start in range(place, place + count * entry.size, entry.size):
+            tag, *_ = entry.unpack_from(data, start)
+            if tag != _ORIENTATION:
+                continue
+            # A short stands at the beginning of the field for the value.
+            value = start + entry.size - struct.calcsize(offset_type)
+            if struct.unpack_from(f"{order}H", data, value) == (1,):
+                return None
+            return data[:value] + struct.pack(f"{order}H", 1) + data[value + 2 :]
+    except struct.error:
+        pass  # damaged, as the decoders will find
+    return None
 
 
 def _check_png(path: Path) -> None:

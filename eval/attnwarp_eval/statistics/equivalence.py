@@ -219,8 +219,11 @@ def paired_test(a: npt.ArrayLike, b: npt.ArrayLike) -> PairedTest:
     """Student's t-test (1908) on mean(b_k) - mean(a_k).
 
     Args:
-        a, b: (n, ...) samples of which the k-th belong together, such as pictures of one seed; each
-            counts by its mean.
+        a, b: (n, ...) samples of which the k-th belong together, such as pictures of one seed, n >=
+            2; each counts by its mean.
+
+    Raises:
+        ValueError: another number of samples on a side, or fewer than two.
 
     Example:
         >>> result = paired_test([1.0, 2.0, 3.0], [1.5, 2.5, 3.6])
@@ -230,6 +233,10 @@ def paired_test(a: npt.ArrayLike, b: npt.ArrayLike) -> PairedTest:
     from scipy import stats
 
     first, second = _means(a), _means(b)
+    if len(first) != len(second) or len(first) < 2:
+        raise ValueError(
+            f"a, b: got {len(first)} and {len(second)} samples, expected as many, at least 2 pairs"
+        )
     scale = max(abs(float(second.mean())), 1e-300)
     d = (second - first) / scale
     error = float(d.std(ddof=1) / math.sqrt(len(d)))

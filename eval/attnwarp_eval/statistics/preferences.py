@@ -125,7 +125,7 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
     of as many people.
 
     Args:
-        choices: of each person.
+        choices: of each person; one without any counts for nothing.
         methods: all names.
         seed: of the bootstrap.
 
@@ -148,11 +148,12 @@ def preferences(choices: Choices, methods: Sequence[str], *, seed: int = 0) -> P
                 if name not in index:
                     raise ValueError(f"choices: got {name!r}, expected one of {list(methods)}")
             row[index[chosen], index[other]] += 1
-    wins = by_person.sum(0)
-    if not wins.any():
+    # Whoever chose nothing would be drawn like the others, and widen every interval.
+    by_person = by_person[by_person.any((1, 2))]
+    wins, people = by_person.sum(0), len(by_person)
+    if not people:
         raise ValueError("choices: got none, expected at least one")
     connected = _connected(wins)
-    people = int((by_person.sum((1, 2)) > 0).sum())
     draws = _resampled(by_person, seed) if people > 1 else None
     ways = list(itertools.combinations(range(len(methods)), 2))
     p, several = chances(strengths(wins)), None if draws is None else chances(strengths(draws))

@@ -42,9 +42,11 @@ def step(model):
     model.step(0.5)
 
 
-def test_gradient_on_screen_is_that_of_the_pixels_for_a_loss_of_pixels():
+@pytest.mark.parametrize("skew", [0.0, 7.0])
+def test_gradient_on_screen_is_that_of_the_pixels_for_a_loss_of_pixels(skew):
     random = np.random.default_rng(0)
-    camera = Camera.look_at([3, 1, 2], [0, 0, 0], width=80, height=60, fov_y=50)
+    pose = Camera.look_at([3, 1, 2], [0, 0, 0], width=80, height=60, fov_y=50).world_to_camera
+    camera = Camera(np.array([[64.0, skew, 31], [0, 70, 35], [0, 0, 1]]), pose, 80, 60)
     origin = np.array([0.2, -0.1, 0.3])
     means = torch.tensor(random.normal(0, 0.5, (20, 3)), requires_grad=True)
     upstream = torch.tensor(random.normal(0, 1, (20, 2)))

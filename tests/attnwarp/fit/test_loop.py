@@ -318,6 +318,27 @@ def test_patience_ends_a_fit_that_no_longer_gains(scene):
     assert (result.stopped, result.iteration) == ("patience", 20)
 
 
+def test_a_sitting_that_ends_between_evaluations_does_not_cost_patience(scene, tmp_path):
+    start, settings = begin(
+        scene, iterations=60, evaluate_every=20, patience=1, min_gain=0.05, **FAST
+    )
+    sitting = iter(range(100))
+    fit(
+        start,
+        scene[0],
+        settings,
+        held_out=scene[1],
+        folder=tmp_path,
+        stop=lambda: next(sitting) >= 21,
+    )
+    # One iteration gains no 0.05 dB; 20 may, or the uninterrupted fit ends there, too.
+    parts = fit(start, scene[0], settings, held_out=scene[1], folder=tmp_path)
+    whole = fit(start, scene[0], settings, held_out=scene[1])
+    assert (parts.stopped, parts.iteration) == (whole.stopped, whole.iteration)
+    assert 21 in [record.iteration for record in parts.history]
+    assert same_bits(parts.gaussians, whole.gaussians)
+
+
 def test_a_measure_of_the_callers_own_is_part_of_the_curve(scene, tmp_path):
     start, settings = begin(scene, iterations=20, sh_degree=0, evaluate_every=10)
     result = fit(

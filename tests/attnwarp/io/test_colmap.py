@@ -314,12 +314,28 @@ def test_smaller_images_in_another_folder_resize_the_cameras_when_asked(tmp_path
 
 
 @pytest.mark.parametrize("where", [".", "sparse", "sparse/0", "colmap/sparse/0"])
-def test_the_model_and_its_images_are_found_in_the_usual_places(tmp_path, where):
+def test_pictures_by_scale_are_those_beside_the_model_from_wherever_it_is_read(
+    tmp_path, monkeypatch, where
+):
+    model = write_binary(tmp_path / "data" / where)
+    pictures(tmp_path / "data" / "images_2", (4, 3))
+    pictures(tmp_path / "other" / "images_2", (4, 3))  # of another scene, with the same names
+    monkeypatch.chdir(tmp_path / "other")
+    for path in (tmp_path / "data", model):
+        data = read_dataset(path, scale=2)
+        assert {image.relative_to(tmp_path).parts[0] for image in data.image_paths} == {"data"}
+        assert data.cameras[2].K.tolist() == [[5, 0, 1.75], [0, 5.5, 1.625], [0, 0, 1]]
+
+
+@pytest.mark.parametrize("where", [".", "sparse", "sparse/0", "colmap/sparse/0"])
+def test_the_model_and_its_images_are_found_in_the_usual_places(tmp_path, monkeypatch, where):
     model = write_binary(tmp_path / where)
     pictures(tmp_path / "images")
     assert len(read_dataset(tmp_path)) == 3
     if where != ".":
         assert len(read_dataset(model)) == 3, "the model's own folder, images above it"
+        monkeypatch.chdir(model)
+        assert len(read_dataset(".")) == 3, "from inside it"
 
 
 def test_a_folder_that_is_both_kinds_or_none_is_not_guessed(tmp_path):

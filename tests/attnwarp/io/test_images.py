@@ -24,6 +24,61 @@ def test_a_tag_that_asks_to_turn_a_picture_is_not_followed(tmp_path):
     assert image[:, 0].min() > 200 and image[:, -1].max() < 50
 
 
+def tiff(pixels, turn, order, big):
+    """A TIFF of one strip by its specification, with a tag that asks for a turn."""
+    height, width, channels = pixels.shape
+    bits = 8 * pixels.itemsize
+    head = 16 if big else 8
+    data = pixels.astype(pixels.dtype.newbyteorder(order)).tobytes()
+    deep = struct.pack(f"{order}{channels}H", *[bits] * channels)
+    place = head + len(data)
+    wide = "Q" if big else "I"
+    tags = [
+        (256, 3, 1, width), (257, 3, 1, height), (258, 3, channels, place), (259, 3, 1, 1),
+        (262, 3, 1, 2), (273, 4, 1, head), (274, 3, 1, turn), (277, 3, 1, channels),
+        (278, 3, 1, height), (279, 4, 1, len(data)),
+        *([(338, 3, 1, 2)] if channels == 4 else []),
+    ]  # fmt: skip
+    fields = b""
+    for tag, kind, count, value in tags:
+        size = {3: 2, 4: 4}[kind]
+        room = 8 if big else 4
+        own = struct.pack(f"{order}{'H' if size == 2 else 'I'}", value).ljust(room, b"\0")
+        if size * count > room:
+            own = struct.pack(f"{order}{wide}", place)
+        elif count > 1:
+            own = deep.ljust(room, b"\0")
+        fields += struct.pack(f"{order}HH{wide}", tag, kind, count) + own
+    mark = b"II" if order == "<" else b"MM"
+    start = place + len(deep)
+    first = (
+        struct.pack(f"{order}HHHQ", 43, 8, 0, start)
+        if big
+        else struct.pack(f"{order}HI", 42, start)
+    )
+    number = struct.pack(f"{order}{'Q' if big else 'H'}", len(tags))
+    return mark + first + data + deep + number + fields + bytes(8 if big else 4)
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("shape", [(4, 6, 3), (5, 5, 4)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(("order", "big"), [("<", False), (">", False), ("<", True)])
+def test_a_tiff_that_asks_to_be_turned_comes_as_it_is_stored(
+    tmp_path, turn, shape, dtype, order, big
+):
+    """Oracle: the pixels of a file written by the format's specification."""
+    top = np.iinfo(dtype).max
+    pixels = np.random.default_rng(0).integers(0, top, shape, dtype=dtype, endpoint=True)
+    pixels[..., 3:] = top
+    path = tmp_path / "a.tif"
+    path.write_bytes(tiff(pixels, turn, order, big))
+    image = read_image(path)
+    np.testing.assert_array_equal(image, pixels)
+    assert image.dtype == dtype
+    assert image_size(path) == (shape[1], shape[0])
+
+
 def test_files_come_as_rgb_in_their_own_depth(tmp_path):
     rgb = np.array([[[60000, 3, 500]]], np.uint16)
     cv2.imwrite(str(tmp_path / "deep.png"), rgb[..., ::-1])
@@ -50,6 +105,28 @@ def test_alpha_comes_straight_from_every_format(tmp_path, name, mode, options):
     expected = {"RGBA": (200, 100, 50, 128), "LA": (200, 200, 200, 128), "L": (200, 200, 200, 0)}
     Image.new(mode, (3, 2), values[mode]).save(tmp_path / name, **options)
     np.testing.assert_array_equal(read_image(tmp_path / name)[1, 2], expected[mode])
+
+
+def test_the_transparent_value_of_a_grey_png_of_16_bits_is_transparent(tmp_path):
+    """Oracle: a PNG written by the format's specification."""
+    grey = np.array([[7, 60000, 300], [60000, 0, 65535]], ">u2")
+
+    def chunk(kind, data):
+        check = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + check
+
+    rows = b"".join(b"\0" + row.tobytes() for row in grey)
+    (tmp_path / "a.png").write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 16, 0, 0, 0, 0))
+        + chunk(b"tRNS", struct.pack(">H", 60000))
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+    image = read_image(tmp_path / "a.png")
+    assert image.dtype == np.uint16
+    np.testing.assert_array_equal(image[..., :3], np.repeat(grey[..., None], 3, axis=2))
+    np.testing.assert_array_equal(image[..., 3], [[65535, 0, 65535], [0, 65535, 65535]])
 
 
 def test_a_file_that_is_no_picture_is_refused_by_path(tmp_path):

@@ -124,6 +124,68 @@ def test_confidence_is_foreshortening_times_the_margin_of_depth():
     assert depth_margin(warp(SIDE, depth_agreement=False)).min() == 1
 
 
+def test_the_margin_of_depth_widens_with_the_slope_of_the_source_by_a_loop():
+    """Oracle: the tolerance written out, with the smaller of the two steps along each axis."""
+    behind = on_plane(SIDE)
+    nearer = Surface(behind.depth * 0.97, behind.normal)
+    settings = preset("corrected", depth_relative=0.02, depth_slope=0.5)
+    view = warp_surfaces(SIDE, TARGET, on_plane(TARGET), nearer, settings)
+    margin, depth = depth_margin(view).numpy(), nearer.depth
+    z, seen = view.correspondence.z.numpy(), 0
+    for row, column in np.argwhere(view.mask.numpy()):
+        x, y = (int(v) for v in view.correspondence.xy[row, column].floor())
+        if not (0 < x < SIZE - 1 and 0 < y < SIZE - 1):
+            continue
+        steps = [
+            min(abs(depth[y, x] - depth[y + dy, x + dx]), abs(depth[y, x] - depth[y - dy, x - dx]))
+            for dy, dx in ((0, 1), (1, 0))
+        ]
+        tolerance = 0.02 * z[row, column] + 0.5 * sum(steps)
+        # The source's depth is 0.97 of the distance, up to its interpolation.
+        expected = 1 - (0.03 * z[row, column] / tolerance) ** 2
+        assert margin[row, column] == pytest.approx(max(0, expected), abs=1e-6)
+        seen += 0 < expected < 0.9
+    assert seen > 20
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_pixels_weight_is_that_of_the_source_it_takes_by_a_loop(soft):
+    """Oracle: loops over a target that is wider than it is high."""
+    target = Camera.look_at((0, 0.3, 3), (0, 0, 0), width=30, height=18, fov_y=40, up=(0, 1, 0))
+    views = [
+        warp_surfaces(source, target, on_plane(target), on_plane(source), preset("corrected"))
+        for source in (camera((1.8, 0, 1.2)), camera((-1.5, 0.2, 2)))
+    ]
+    sight = Sight(views, soft)
+    ratios, margins = ([f(view).numpy() for view in views] for f in (pixel_ratio, depth_margin))
+    expected = np.zeros((18, 30))
+    taken = [0, 0, 0]
+    for row in range(18):
+        for column in range(30):
+            qualities = [
+                min(1.0, ratio[row, column]) * bool(view.mask[row, column])
+                for ratio, view in zip(ratios, views, strict=True)
+            ]
+            seen = [k for k, view in enumerate(views) if view.mask[row, column]]
+            assert bool(sight.mask[row, column]) == bool(seen)
+            best = max(seen, key=lambda k: qualities[k], default=-1)
+            taken[best] += 1
+            if seen:
+                confidence = qualities[best] * margins[best][row, column]
+                expected[row, column] = confidence if soft else 1.0
+    np.testing.assert_allclose(sight.weight.numpy(), expected, rtol=0, atol=1e-12)
+    assert min(taken) > 20  # both are taken, and neither
+
+
+def test_a_depth_edge_is_a_share_of_the_nearest_depth():
+    """Closed form: of three inverse depths 1, 1, 1 + x the bend is x and the nearest is 1 + x, so
+    an edge of 5 % begins at x = 1 / 19 = 0.0526.
+    """
+    for x, edge in ((0.0520, False), (0.0533, True)):
+        inverse = torch.tensor([[1.0, 1.0, 1.0, 1 + x, 1 + x, 1 + x]], dtype=torch.float64)
+        assert near_edges(1 / inverse, 1).any() == edge
+
+
 @pytest.mark.parametrize("margin", [0, 1, 2, 3])
 def test_a_depth_edge_is_near_within_the_margin_of_a_box_before_a_wall(margin):
     """Oracle: Chebyshev distance to the pixels on either side of the box's outline, by a loop."""

@@ -45,6 +45,9 @@ def test_too_few_samples_are_refused():
     for test in (equivalence.welch, equivalence.welch_interval):
         with pytest.raises(ValueError, match="got 1 and 5 samples, expected at least 2"):
             test(np.ones(1), np.ones(5))
+    for a, b in ((np.ones(1), np.zeros(1)), (np.ones(3), np.zeros(1))):
+        with pytest.raises(ValueError, match="expected as many, at least 2 pairs"):
+            equivalence.paired_test(a, b)  # one pair has no spread, so no p-value
 
 
 @pytest.mark.parametrize("level", [0.9, 0.95])

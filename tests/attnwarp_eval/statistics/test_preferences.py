@@ -88,6 +88,18 @@ def test_methods_that_nobody_compared_with_the_others_have_no_share():
     assert math.isnan(result.shares["c"].value) and math.isnan(result.pairs["a", "c"].value)
 
 
+def test_people_who_chose_nothing_change_no_interval():
+    made = {f"p{k}": [("a", "b")] * 3 + [("b", "a")] * (1 + k % 3) for k in range(6)}
+    silent = {f"q{k}": [] for k in range(30)}
+    alone, among = preferences(made, ["a", "b"]), preferences({**silent, **made}, ["a", "b"])
+    assert among.people == alone.people == 6
+    assert (among.shares, among.pairs) == (alone.shares, alone.pairs)
+    one = {**silent, "p": made["p0"]}
+    assert np.isnan(preferences(one, ["a", "b"]).shares["a"].low)
+    with pytest.raises(ValueError, match="choices: got none"):
+        preferences(silent, ["a", "b"])
+
+
 def test_one_person_has_no_interval_and_an_unknown_name_is_refused():
     result = preferences({"p": [("a", "b")]}, ["a", "b"])
     assert math.isnan(result.shares["a"].low)

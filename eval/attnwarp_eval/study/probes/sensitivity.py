@@ -676,11 +676,10 @@ def _costs(
     points: dict[str, tuple[Interval, Interval]] = {}
     powers = {}
     for row in rows:
-        taken = {
-            scene: [float(np.median(record.extra.seconds[row.cost]))]
-            for scene, record in records
-            if record.extra.seconds.get(row.cost)
-        }
+        taken: dict[str, list[float]] = {}
+        for scene, record in records:  # one for each seed
+            if rounds := record.extra.seconds.get(row.cost):
+                taken.setdefault(scene, []).append(float(np.median(rounds)))
         if not taken:
             continue
         seconds = interval(taken)

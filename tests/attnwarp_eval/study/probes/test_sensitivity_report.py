@@ -158,6 +158,25 @@ def test_records_of_several_seeds_are_of_one_scene(tmp_path):
         assert table.rows and not [text for row in table.rows for text in row if " of " in text]
 
 
+def test_seconds_of_several_seeds_are_averaged(tmp_path):
+    """Medians of 0.1 and 0.3 s."""
+    views = [{RIGHT: 0.5}]
+    both = [record(views, rounds={MSE: [t, t, 9.0]}) for t in (0.1, 0.3)]
+    study = {
+        "name": "by-hand",
+        "scenes": ["one"],
+        "seeds": [0, 1],
+        "encoders": {"clip": "clip-small"},
+        "probes": {"sensitivity": []},
+    }
+    outcomes = [written_runs.outcome("sensitivity", "one", ["metrics"], one) for one in both]
+    made = written_runs.results(study, outcomes)
+    *_, costs = [s for _, s in probe("sensitivity").sections(made, Layout(tmp_path))]
+    (table,) = costs.tables
+    shown = dict(zip(table.columns, table.rows[0], strict=True))
+    assert (shown["metric"], shown["ms a picture"]) == ("truth, PSNR", "200")
+
+
 def test_without_timings_two_reports_of_other_seconds_are_the_same_bytes(tmp_path):
     texts = []
     for seconds in (0.1, 0.7):
