@@ -10,7 +10,7 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from attnwarp.cli.files import UNSEEN, read_splats, read_views, write_image
+from attnwarp.cli.files import UNSEEN, check_kept, read_splats, read_views, write_image
 from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
@@ -63,7 +63,9 @@ def render(
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased)
-        views = read_views(cameras, reading, missing_images="none", points=False).cameras
+        dataset = read_views(cameras, reading, missing_images="none", points=False)
+        views = dataset.cameras
+        check_kept((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
         out.mkdir(parents=True, exist_ok=True)
         seen = False
         for camera, name in zip(views, file_stems(views), strict=True):

@@ -73,8 +73,7 @@ class Folder:
                 where results go, and no manifest that says whose they are.
         """
         path = self.path / MANIFEST
-        if not path.exists():
-            self._check_unclaimed()
+        self.check_unclaimed()
         manifest = json.loads(json.dumps({"format": FORMAT, "protocol": PROTOCOL, **manifest}))
         stored = self.read_json(MANIFEST) if path.exists() else manifest
         differing = list(_differences(stored, manifest))
@@ -89,10 +88,15 @@ class Folder:
         if not path.exists():
             self.write_json(MANIFEST, manifest)
 
-    def _check_unclaimed(self) -> None:
-        """Refuse files where results go: they would be written over, or taken for results of these
-        settings.
+    def check_unclaimed(self) -> None:
+        """Refuse files where results go, in a folder without a manifest: they would be written
+        over, or taken for results of these settings.
+
+        Raises:
+            InputError: there is such a file.
         """
+        if self.has(MANIFEST):
+            return
         places = [self.path / "source.json", *(self.path / name for name in self.folders)]
         files = (
             file for place in places for file in (place.iterdir() if place.is_dir() else [place])

@@ -516,9 +516,7 @@ def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
     assert files(folder) == before
 
 
-def test_pictures_of_another_program_where_results_go_are_refused_and_stay(
-    scene, editor, tmp_path
-):
+def test_pictures_of_another_program_where_results_go_are_refused_and_stay(scene, editor, tmp_path):
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "v1.png").write_bytes(b"a person's own")
     with pytest.raises(InputError, match=r"what .*masks/v1\.png is of; name another folder"):
