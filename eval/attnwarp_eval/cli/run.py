@@ -413,6 +413,6 @@ def studies() -> None:
     """List the studies that ship with the package."""
     from attnwarp_eval.study.study import load_study, shipped_studies
 
-    for name in shipped_studies():
-        loaded = load_study(name)
-        typer.echo(f"{name:12} {loaded.title}")
+    names = list(shipped_studies())
+    for name in names:
+        typer.echo(f"{name:{max(map(len, names))}}  {load_study(name).title}")
