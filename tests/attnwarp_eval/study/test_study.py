@@ -136,6 +136,29 @@ def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):
     assert path in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("tables", "expected"),
+    [
+        ([], ["in no table of the report: depth of corrected, again, slipped; warp of corrected, again, slipped;"]),
+        ([("warp", ["again", "slipped"])], ["in no table of the report: depth of corrected, again, slipped;"]),
+        ([("warp", ["again"]), ("depth", ["again", "slipped"])], ["in no table of the report: warp of slipped;"]),
+        ([("warp", ["again", "slipped"]), ("depth", ["again", "slipped"])], []),
+    ],
+)  # fmt: skip
+def test_variants_that_no_table_would_show_are_named_before_they_are_computed(
+    tmp_path, tables, expected
+):
+    ablations = [
+        {"title": probe, "probe": probe, "baseline": "corrected", "variants": variants}
+        for probe, variants in tables
+    ]
+    path = write(tmp_path, ablations=ablations)
+    done = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0
+    lines = done.stderr.splitlines()
+    assert [line.partition(" a table")[0] for line in lines] == expected
+
+
 def test_a_scene_in_place_of_a_study_is_told_as_one(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text("name: own\nobjects: []\nlights: []\ncameras: {}\n")
