@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -19,7 +20,7 @@ from imported_modules import modules_after
 from plyfile import PlyData
 from typer.testing import CliRunner
 
-from attnwarp import Camera, Gaussians, baselines
+from attnwarp import Camera, Gaussians, baselines, progress
 from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
@@ -410,8 +411,19 @@ def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
         assert done.exit_code == 0, done.stderr
         pictures = [cv2.imread(str(path)) for path in out.glob("*.png")]
         assert len(pictures) == 9 and any(picture.any() for picture in pictures) == (not expected)
-        said = f"warning: {tmp_path / name}: no view shows any of its splats; check"
+        said = (
+            f"warning: {tmp_path / name}: no view shows any of its splats beyond --near 0.01; check"
+        )
         assert done.stderr.count(said) == expected
+
+
+def test_render_says_how_far_it_is(data, tmp_path, monkeypatch):
+    """Oracle: a line a view where the time between lines is 0, and the last one in any case."""
+    write_ply(tmp_path / "m.ply", one_splat())
+    for seconds, counts in ((0.0, range(1, 10)), (100.0, [9])):
+        monkeypatch.setattr(progress, "LINE_SECONDS", seconds)
+        done = in_process("render", tmp_path / "m.ply", data, "--out", tmp_path / "views")
+        assert re.findall(r"^views \[(\d+)/9\]", done.stderr, re.M) == [str(k) for k in counts]
 
 
 @pytest.mark.parametrize("way", ["itself", "through a link", "from a link"])
@@ -509,7 +521,8 @@ def test_masks_are_not_passed_over_silently(data, tmp_path):
     assert done.exit_code == 0
     assert done.stderr.splitlines() == [
         f"attnwarp: warning: {data / 'masked.json'}: not used, as their meaning is not known:"
-        " exposure"
+        " exposure",
+        "out [9/9] done",
     ]
 
 
