@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,6 +102,39 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
             if float(render(splats, camera.resize(w, h), near=near).alpha.mean()) >= COVERED:
                 return
     raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
+
+
+def check_kept(results: Iterable[Path], read: Iterable[Path | None]) -> None:
+    """Refuse to write over what a command reads, under one name or two, or by a link.
+
+    Args:
+        results: files that the command writes.
+        read: files that it is given; None where there is none.
+
+    Raises:
+        InputError: a result would replace a file that is read.
+    """
+    existing = {_identity(path.lstat): path for path in results}
+    existing.pop(None, None)
+    for path in read:
+        if path is None:
+            continue
+        for look in (path.lstat, path.stat):
+            result = existing.get(_identity(look))
+            if result is not None:
+                raise InputError(
+                    f"{result}: is read, and a result would replace it; name another folder with"
+                    " --out"
+                )
+
+
+def _identity(look: Callable[[], os.stat_result]) -> tuple[int, int] | None:
+    """The file system's own name of a file; None where there is none."""
+    try:
+        status = look()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def write_image(path: Path, rgb: Any) -> None:

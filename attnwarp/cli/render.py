@@ -10,7 +10,7 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from attnwarp.cli.files import UNSEEN, read_splats, read_views, write_image
+from attnwarp.cli.files import UNSEEN, check_kept, read_splats, read_views, write_image
 from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
@@ -20,6 +20,7 @@ from attnwarp.cli.options import (
 )
 from attnwarp.cli.shell import check_out, clear_errors, use_threads
 from attnwarp.errors import InputWarning
+from attnwarp.progress import display
 
 
 @reading_options(without="missing_images")
@@ -63,29 +64,35 @@ def render(
 
         use_threads(threads)
         splats = read_splats(model, kind, antialiased)
-        views = read_views(cameras, reading, missing_images="none", points=False).cameras
+        dataset = read_views(cameras, reading, missing_images="none", points=False)
+        views = dataset.cameras
+        check_kept((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
         out.mkdir(parents=True, exist_ok=True)
         seen = False
-        for camera, name in zip(views, file_stems(views), strict=True):
-            if size is not None:
-                factor = size / max(camera.width, camera.height)
-                camera = camera.resize(
-                    max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-                )
-            view = attnwarp.render.render(splats, camera, background=behind, near=near)
-            seen = seen or bool(view.alpha.any())
-            write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
-            if depth:
-                buffer = io.BytesIO()
-                np.save(buffer, view.median_depth.numpy())
-                write_atomically(
-                    out / f"{name}.depth.npy", functools.partial(_put, data=buffer.getvalue())
-                )
-            if normal:
-                write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
+        with display(title=out.name) as show:
+            for number, (camera, name) in enumerate(zip(views, file_stems(views), strict=True), 1):
+                if size is not None:
+                    factor = size / max(camera.width, camera.height)
+                    camera = camera.resize(
+                        max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+                    )
+                view = attnwarp.render.render(splats, camera, background=behind, near=near)
+                seen = seen or bool(view.alpha.any())
+                write_image(out / f"{name}.png", view.color.clamp(0, 1).numpy())
+                if depth:
+                    buffer = io.BytesIO()
+                    np.save(buffer, view.median_depth.numpy())
+                    write_atomically(
+                        out / f"{name}.depth.npy", functools.partial(_put, data=buffer.getvalue())
+                    )
+                if normal:
+                    write_image(out / f"{name}.normal.png", (view.normal.numpy() + 1) / 2)
+                show(number, len(views), name if number < len(views) else "done")
         if not seen:
             warnings.warn(
-                f"{model}: no view shows any of its splats; {UNSEEN}", InputWarning, stacklevel=1
+                f"{model}: no view shows any of its splats beyond --near {near:g}; {UNSEEN}",
+                InputWarning,
+                stacklevel=1,
             )
         typer.echo(f"{out}: {len(views)} views of {len(splats)} splats")
 

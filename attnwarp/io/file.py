@@ -114,6 +114,7 @@ def write_atomically(
 
     Raises:
         FileNotFoundError: the folder does not exist.
+        IsADirectoryError: the path is a folder's.
         OSError: the disk is full, or the folder cannot be written to.
 
     Example:
@@ -128,6 +129,8 @@ def write_atomically(
         path = path.resolve()
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+    if path.is_dir() and not path.is_symlink():
+        raise IsADirectoryError(f"{path}: is a folder, expected a file; choose another name")
     _sweep(path.parent.resolve(), os.getpid())
     # Opened by name instead of tempfile.mkstemp, which would leave the result readable by its owner
     # alone. Of a long name a part, so that this one is not too long for the file system.

@@ -102,12 +102,13 @@ def edit_dataset(
 
     Raises:
         InputError: no such view, mask, editor or segmenter; masks and words; words without a
-            detection in a view.
+            detection in a view; files of something else where results go.
     """
     if masks is not None and words is not None:
         raise InputError("--where: got --masks too, expected one of the two")
     if words is not None and not words.strip():
         raise InputError(f"--where: got {words!r}, expected words such as 'bear'")
+    Folder(out, dataset.cameras).check_unclaimed()  # again in the edit, but here before a fit
     views = load_views(dataset, max_size=max_size)
     index = _view_of(views.cameras, source)
     images = images_of(views)

@@ -69,9 +69,11 @@ class Folder:
         """Write the manifest, or hold the one that is there against it; make the folders.
 
         Raises:
-            InputError: the folder holds an edit of other settings or inputs, by name.
+            InputError: the folder holds an edit of other settings or inputs, by name; or files
+                where results go, and no manifest that says whose they are.
         """
         path = self.path / MANIFEST
+        self.check_unclaimed()
         manifest = json.loads(json.dumps({"format": FORMAT, "protocol": PROTOCOL, **manifest}))
         stored = self.read_json(MANIFEST) if path.exists() else manifest
         differing = list(_differences(stored, manifest))
@@ -86,6 +88,26 @@ class Folder:
         if not path.exists():
             self.write_json(MANIFEST, manifest)
 
+    def check_unclaimed(self) -> None:
+        """Refuse files where results go, in a folder without a manifest: they would be written
+        over, or taken for results of these settings.
+
+        Raises:
+            InputError: there is such a file.
+        """
+        if self.has(MANIFEST):
+            return
+        places = [self.path / "source.json", *(self.path / name for name in self.folders)]
+        files = (
+            file for place in places for file in (place.iterdir() if place.is_dir() else [place])
+        )
+        first = next((file for file in files if file.is_file()), None)
+        if first is not None:
+            raise InputError(
+                f"{self.path}: has no {MANIFEST}, so it can't be told what {first} is of; name"
+                " another folder, or remove what an edit left in this one"
+            )
+
     def write_json(self, name: str, value: Any) -> None:
         """Write JSON atomically."""
         text = json.dumps(value, indent=2, allow_nan=False) + "\n"
@@ -98,12 +120,14 @@ class Folder:
             FileFormatError: it is damaged.
         """
         path = self.path / name
+        # Without its manifest, a folder's results are of no known settings.
+        remedy = "name another folder" if name == MANIFEST else "remove it, it is made anew"
         try:
             value = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise FileFormatError(path, f"not JSON ({error}); remove it, it is made anew") from None
+            raise FileFormatError(path, f"not JSON ({error}); {remedy}") from None
         if not isinstance(value, dict):
-            raise FileFormatError(path, "holds no JSON object; remove it, it is made anew")
+            raise FileFormatError(path, f"holds no JSON object; {remedy}")
         return value
 
     def write_picture(self, name: str, pixels: npt.NDArray[np.uint8]) -> None:
@@ -115,11 +139,15 @@ class Folder:
         """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
         return read_image(self.path / name)
 
-    def edited(self, picture: str) -> bool:
+    def edited(self, picture: str, *further: str) -> bool:
         """Whether a view is edited: beside its picture stands a record, NAME.json.
 
         A picture that is missing or damaged all the same leaves no edit. Its record is removed,
         so that the view is edited again.
+
+        Args:
+            picture: of the edit.
+            further: pictures that were written with it.
 
         Warns:
             InputWarning: a record was removed.
@@ -127,10 +155,11 @@ class Folder:
         record = record_of(picture)
         if not self.has(record):
             return False
-        if not self.has_picture(picture):
+        damaged = next((name for name in (picture, *further) if not self.has_picture(name)), None)
+        if damaged is not None:
             (self.path / record).unlink()
             warnings.warn(
-                f"{self.path / picture}: missing or damaged; the view is edited again",
+                f"{self.path / damaged}: missing or damaged; the view is edited again",
                 InputWarning,
                 stacklevel=2,
             )

@@ -339,10 +339,20 @@ class _Run:
             return choose_chain(views, source, s.sources, s.chain_coverage, seen)
 
     def _edited_sources(self) -> None:
-        finished = sum([self.folder.edited(self._picture(view)) for view in self.plan.sources])
+        finished = sum([self._is_edited(view) for view in self.plan.sources])
         self.done += finished * self.settings.steps
         if finished < len(self.plan.sources):
             _ = self.sources
+
+    def _is_edited(self, view: int) -> bool:
+        """Whether the folder has a view's edit, and what its record says was drawn with it."""
+        picture = self._picture(view)
+        record = record_of(picture)
+        about = self.folder.read_json(record) if self.folder.has(record) else {}
+        name = self.names[view]
+        warped = (f"masks/{name}.png", f"features/{name}.png") if "rules" in about else ()
+        recorded = ("features.png",) if about.get("feature_bytes") else ()
+        return self.folder.edited(picture, *warped, *recorded)
 
     @cached_property
     def sources(self) -> list[Source]:
@@ -413,7 +423,7 @@ class _Run:
 
     def _edit_stage(self, number: int, stage: tuple[int, ...]) -> None:
         for batch in self._batches(stage):
-            if all([self.folder.edited(self._picture(view)) for view in batch]):
+            if all([self._is_edited(view) for view in batch]):
                 self.done += len(batch) * self.settings.steps
                 continue
             self._edit_batch(number, stage, batch)

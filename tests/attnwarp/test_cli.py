@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -19,7 +20,7 @@ from imported_modules import modules_after
 from plyfile import PlyData
 from typer.testing import CliRunner
 
-from attnwarp import Camera, Gaussians, baselines
+from attnwarp import Camera, Gaussians, baselines, progress
 from attnwarp.cli import baseline
 from attnwarp.cli.main import app
 from attnwarp.io import Dataset, read_ply, write_ply, write_transforms
@@ -410,8 +411,61 @@ def test_render_says_where_no_view_shows_a_splat(data, tmp_path):
         assert done.exit_code == 0, done.stderr
         pictures = [cv2.imread(str(path)) for path in out.glob("*.png")]
         assert len(pictures) == 9 and any(picture.any() for picture in pictures) == (not expected)
-        said = f"warning: {tmp_path / name}: no view shows any of its splats; check"
+        said = (
+            f"warning: {tmp_path / name}: no view shows any of its splats beyond --near 0.01; check"
+        )
         assert done.stderr.count(said) == expected
+
+
+def test_render_says_how_far_it_is(data, tmp_path, monkeypatch):
+    """Oracle: a line a view where the time between lines is 0, and the last one in any case."""
+    write_ply(tmp_path / "m.ply", one_splat())
+    for seconds, counts in ((0.0, range(1, 10)), (100.0, [9])):
+        monkeypatch.setattr(progress, "LINE_SECONDS", seconds)
+        done = in_process("render", tmp_path / "m.ply", data, "--out", tmp_path / "views")
+        assert re.findall(r"^views \[(\d+)/9\]", done.stderr, re.M) == [str(k) for k in counts]
+
+
+@pytest.mark.parametrize("way", ["itself", "through a link", "from a link"])
+def test_render_leaves_the_photographs_of_its_cameras_alone(way, data, tmp_path):
+    """Oracle: the photographs' bytes."""
+    write_ply(tmp_path / "m.ply", one_splat())
+    capture = shutil.copytree(data, tmp_path / "capture")
+    images, out = capture / "images", capture / "images"
+    if way == "through a link":
+        out = tmp_path / "link"
+        out.symlink_to(images)
+    elif way == "from a link":
+        out = shutil.move(images, tmp_path / "photographs")
+        images.mkdir()
+        for path in out.iterdir():
+            (images / path.name).symlink_to(path)
+    before = {path.name: path.read_bytes() for path in images.iterdir()}
+    done = in_process("render", tmp_path / "m.ply", capture, "--out", out)
+    assert done.exit_code == 2
+    assert "0.png: is read, and a result would replace it; name another folder" in done.stderr
+    assert {path.name: path.read_bytes() for path in images.iterdir()} == before
+    assert {path.name for path in out.iterdir()} == set(before)
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        (["edit"], "--ply", "edited.ply"),
+        (["edit"], "--ply", "edited-3dgs.ply"),
+        (["edit"], "--source-picture", "source.png"),
+        (["baseline", "by_view"], "--ply", "edited.ply"),
+    ],
+)
+def test_an_edit_leaves_the_files_that_it_is_given_alone(command, option, name, data, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(b"a person's own")
+    done = in_process(
+        *command, data, "--instruction", "make it red", "--out", tmp_path, option, path
+    )
+    assert done.exit_code == 2
+    assert f"{path}: is read, and a result would replace it" in done.stderr
+    assert path.read_bytes() == b"a person's own" and list(tmp_path.iterdir()) == [path]
 
 
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):
@@ -467,7 +521,8 @@ def test_masks_are_not_passed_over_silently(data, tmp_path):
     assert done.exit_code == 0
     assert done.stderr.splitlines() == [
         f"attnwarp: warning: {data / 'masked.json'}: not used, as their meaning is not known:"
-        " exposure"
+        " exposure",
+        "out [9/9] done",
     ]
 
 

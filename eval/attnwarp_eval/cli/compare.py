@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, clear_errors, fail
+from attnwarp_eval.cli.shell import TOO_LITTLE, Regression, check_not_of_run, clear_errors, fail
 
 if TYPE_CHECKING:
     from attnwarp_eval.compare import Snapshot
@@ -45,7 +45,8 @@ def compare(
     from attnwarp_eval.files import write_atomic
 
     with clear_errors():
-        _check_outputs(baseline, {"--markdown": markdown, "--json": json, "--html": html}, update)
+        outputs = {"--markdown": markdown, "--json": json, "--html": html}
+        _check_outputs(baseline, run, outputs, update)
         measured, pictures = _run(run)
         if update:
             _update(baseline, measured, pictures)
@@ -74,8 +75,10 @@ def compare(
         raise fail(f"{run}: {result.too_little}", TOO_LITTLE)
 
 
-def _check_outputs(baseline: Path, outputs: dict[str, Path | None], update: bool) -> None:
-    """Refuse files that would not be written, or be written over the baseline or each other."""
+def _check_outputs(
+    baseline: Path, run: Path, outputs: dict[str, Path | None], update: bool
+) -> None:
+    """Refuse files that would not be written, or be written over what is compared or each other."""
     from attnwarp.errors import InputError
     from attnwarp.io.file import check_other
 
@@ -88,6 +91,8 @@ def _check_outputs(baseline: Path, outputs: dict[str, Path | None], update: bool
     first: dict[Path, str] = {}
     for option, path in named.items():
         check_other(path, baseline, "the baseline")
+        for folder in (baseline, run):
+            check_not_of_run(path, folder)
         other = first.setdefault(path.resolve(), option)
         if other != option:
             raise InputError(f"{option}: {path} is that of {other} too; name another file")

@@ -202,10 +202,31 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     )
     Console().print(terminal(table))
     scenes = f"scenes {', '.join(loaded.scene_names)}; " if loaded.scenes else ""
+    _say_untabled(loaded)
     typer.echo(
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
+
+
+def _say_untabled(study: Study) -> None:
+    """Name the variants that a study measures and its report shows in no table or front."""
+    from attnwarp_eval.study.probes import probe
+
+    shown = {(a.probe, name) for a in study.ablations for name in (a.baseline, *a.variants)}
+    shown |= {(front.probe, name) for front in study.fronts for name in front.variants}
+    untabled = {
+        name: [variant for variant in variants if (name, variant) not in shown]
+        for name, variants in study.probes.items()
+        if probe(name).columns
+    }
+    listed = "; ".join(f"{name} of {', '.join(own)}" for name, own in untabled.items() if own)
+    if listed:
+        typer.echo(
+            f"in no table of the report: {listed}; a table under 'ablations' shows them,"
+            " results.jsonl has them anyway",
+            err=True,
+        )
 
 
 def _who(cell: Cell) -> str:
@@ -251,6 +272,7 @@ def run_study(
         limit_bytes()  # a limit that is no number would make every cell fail
         loaded = load()
         store = Store(out or Path("runs") / loaded.name)
+        _say_untabled(loaded)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
             with store.lock():
@@ -413,6 +435,6 @@ def studies() -> None:
     """List the studies that ship with the package."""
     from attnwarp_eval.study.study import load_study, shipped_studies
 
-    for name in shipped_studies():
-        loaded = load_study(name)
-        typer.echo(f"{name:12} {loaded.title}")
+    names = list(shipped_studies())
+    for name in names:
+        typer.echo(f"{name:{max(map(len, names))}}  {load_study(name).title}")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
+
+EXPORTED = re.compile(r"images/orbit_\d+_of_\d+\.png")
+"""Pictures of an export, which hold its cameras' names of ``orbit_name`` (splats/export.py); here
+as ``--help`` imports nothing heavy."""
 
 app = typer.Typer(
     help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
@@ -74,7 +79,7 @@ def render(
 @app.command()
 def export(
     scene: Annotated[str, typer.Argument(help="A scene's name, or the path of its YAML.")],
-    out: Annotated[Path, typer.Argument(help="Folder; what is in it already is overwritten.")],
+    out: Annotated[Path, typer.Argument(help="Folder; an export in it is overwritten.")],
     views: Annotated[
         int, typer.Option(min=1, help="Views around the scene; every 8th is of the split 'test'.")
     ] = 64,
@@ -94,12 +99,37 @@ def export(
         from attnwarp_eval.scene.file import load_scene
 
         loaded = load_scene(scene)
+        _check_no_capture(out)
         with progress() as show:
             attnwarp_eval.splats.export.export(
                 loaded, out, views=views, size=size, spp=spp, points=points, noise=noise, seed=seed,
                 progress=lambda text: show.step(f"{loaded.name}: {text}"),
             )  # fmt: skip
     typer.echo(out / "transforms.json")
+
+
+def _check_no_capture(folder: Path) -> None:
+    """Refuse to write over the poses of a capture, which nothing could bring back.
+
+    Raises:
+        InputError: the folder's transforms.json names other views than an export does.
+    """
+    import json
+
+    from attnwarp.errors import InputError
+
+    path = folder / "transforms.json"
+    if not path.is_file():
+        return
+    try:
+        frames = json.loads(path.read_bytes())["frames"]
+        exported = all(EXPORTED.fullmatch(frame["file_path"]) for frame in frames)
+    except (ValueError, LookupError, TypeError, RecursionError):
+        exported = False
+    if not exported:
+        raise InputError(
+            f"{path}: is of a capture that this command did not write; name another folder"
+        )
 
 
 @app.command()

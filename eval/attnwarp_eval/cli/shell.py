@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -38,6 +39,22 @@ def fail(message: str, code: int = USAGE) -> typer.Exit:
     """Print an error on stderr; raise what this returns."""
     typer.echo(f"attnwarp-eval: {message}", err=True)
     return typer.Exit(code)
+
+
+def check_not_of_run(out: Path, run: Path) -> None:
+    """Refuse to write a command's result over a file of a run.
+
+    Args:
+        out: file of the result.
+        run: folder that the command reads.
+
+    Raises:
+        InputError: the file says what the run is, or is its report.
+    """
+    from attnwarp.io.file import check_other
+
+    for name in ("study.json", "results.jsonl", "report.md", "report.html"):
+        check_other(out, run / name, f"a file of the run {run}")
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names
+from attnwarp_eval.cli.shell import TOO_LITTLE, check_not_of_run, clear_errors, fail, names
 
 app = typer.Typer(
     help="Ask people which edited scene they prefer, and score their answers.",
@@ -54,6 +54,8 @@ def build(
                     f"--questions: got {questions!r}, expected different ones of"
                     f" {', '.join(QUESTIONS)}{suggest(name, list(QUESTIONS))}"
                 )
+        for run in runs:
+            check_not_of_run(out, run)
         items = read_items(runs, names(methods))
         text = build_page(items, Design(asked, plans, choices, checks, seed), title)
         write_atomic(out, text.encode())

@@ -222,6 +222,11 @@ def load_study(name_or_path: str, **overrides: Any) -> Study:
         raise StudyError(
             f"{path}: expected keys such as scenes, variants, probes; got a {type(data).__name__}"
         )
+    if {"objects", "cameras"} <= data.keys():
+        raise StudyError(
+            f"{path}: is a scene; name it under 'scenes' in a study, or as run STUDY --scenes"
+            f" {path}"
+        )
     data = _beside(data, path.parent)
     every = data.get("scenes")
     files = {scene_name(where): where for where in every or () if is_scene_file(where)}

@@ -68,6 +68,13 @@ def test_the_writers_of_a_persons_files_follow_a_link_and_the_others_replace_it(
     assert {path.name for path in (tmp_path / "big").iterdir()} == {"new.ply", "old.ply"}
 
 
+def test_a_folder_in_a_files_place_is_named_and_nothing_is_left(tmp_path):
+    (tmp_path / "a.ply").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"a\.ply: is a folder, expected a file"):
+        write_atomically(tmp_path / "a.ply", lambda stream: stream.write(b"x"))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
 @pytest.mark.parametrize("name", [255 * "n", 63 * "\N{GRINNING FACE}"], ids=["1 byte", "4 bytes"])
 def test_a_name_as_long_as_the_file_system_takes_can_be_written(tmp_path, name):
     write_atomically(tmp_path / name, lambda stream: stream.write(b"whole"))

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -163,6 +164,16 @@ def test_without_splats_it_fits_them_first(place, tmp_path):
     assert result.exit_code == 0, result.output
     assert (tmp_path / "fit" / "splats.ply").is_file()
     assert (tmp_path / "edited.ply").is_file()
+
+
+def test_a_captures_own_masks_are_not_written_over_and_no_fit_comes_first(place, tmp_path):
+    """Oracle: the bytes of the masks."""
+    masks = shutil.copytree(place / "black", tmp_path / "masks")
+    before = {path.name: path.read_bytes() for path in masks.iterdir()}
+    result = run(place, tmp_path, "--fit-iterations", 5)
+    assert result.exit_code == 2 and "has no manifest.json" in result.output
+    assert {path.name: path.read_bytes() for path in masks.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [masks]
 
 
 def test_an_interrupt_while_it_fits_leaves_a_checkpoint(place, tmp_path):

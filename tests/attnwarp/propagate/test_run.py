@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import shutil
 import time
 import weakref
 from dataclasses import replace
@@ -22,7 +23,7 @@ from attnwarp import Camera, Gaussians
 from attnwarp.editing.editor import edit, shared_noise
 from attnwarp.editing.schedule import Schedule
 from attnwarp.editing.small import load_editor
-from attnwarp.errors import InputError
+from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import FileFormatError, read_image, read_ply
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate import run as run_module
@@ -486,12 +487,56 @@ def test_a_folder_of_another_edit_is_refused_by_name(
     assert files(finished[1]) == before
 
 
-@pytest.mark.parametrize("name", ["times.json", "manifest.json"])
-def test_json_that_is_no_object_is_refused_by_its_file(name, scene, editor, tmp_path):
-    (tmp_path / name).write_text("[1]")
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("times.json", "remove it"), ("manifest.json", "name another folder")]
+)
+@pytest.mark.parametrize(
+    ("text", "problem"), [("[1]", "holds no JSON object"), ("{", "not JSON .*")]
+)
+def test_json_that_is_no_object_is_refused_by_its_file(
+    name, remedy, text, problem, scene, editor, tmp_path
+):
+    (tmp_path / name).write_text(text)
     settings = replace(QUICK, sources=2)  # which the manifest is asked for first
-    with pytest.raises(FileFormatError, match=f"{name}: holds no JSON object; remove it"):
+    with pytest.raises(FileFormatError, match=f"{name}: {problem}; {remedy}"):
         run(scene, editor, tmp_path, settings)
+
+
+@pytest.mark.parametrize("words", ["a bear", "a robot"])
+def test_results_without_a_manifest_are_taken_for_no_edit_and_stay(
+    words, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the files before the call."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    (folder / "manifest.json").unlink()
+    before = files(folder)
+    with pytest.raises(InputError, match=r"has no manifest\.json, so it can't be told what"):
+        run(scene, editor, folder, words=words)
+    assert files(folder) == before
+
+
+def test_pictures_of_another_program_where_results_go_are_refused_and_stay(scene, editor, tmp_path):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "v1.png").write_bytes(b"a person's own")
+    with pytest.raises(InputError, match=r"what .*masks/v1\.png is of; name another folder"):
+        run(scene, editor, tmp_path)
+    assert files(tmp_path) == {"masks/v1.png": b"a person's own"}
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda path: path.write_bytes(b"cut")])
+@pytest.mark.parametrize("part", ["masks", "features", "features.png"])
+def test_pictures_of_where_features_went_are_drawn_again(
+    part, damage, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the edit that nobody damaged."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    path = folder / part if part.endswith(".png") else next((folder / part).glob("*.png"))
+    damage(path)
+    with pytest.warns(InputWarning, match=f"{path.name}: missing or damaged"):
+        run(scene, editor, folder)
+    assert files(folder) == files(finished[1])
 
 
 def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):

@@ -1,9 +1,13 @@
 """The commands about scenes: what is wrong with an option is one line and exit code 2."""
 
+import json
+
 import pytest
 from typer.testing import CliRunner
 
 from attnwarp_eval.cli.main import app
+
+EXPORT = ["scenes", "export", "spheres", "--size", "16", "--spp", "1", "--points", "10"]
 
 
 @pytest.mark.parametrize(
@@ -19,3 +23,29 @@ def test_a_value_that_makes_no_sense_is_told_in_a_line(tmp_path, arguments, says
         catch_exceptions=False,
     )
     assert done.exit_code == 2 and says in done.stderr
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps({"frames": [{"file_path": "images/IMG_0001.jpg"}]}),
+        json.dumps(
+            {"frames": [{"file_path": "images/orbit_000_of_1.png"}, {"file_path": "b.png"}]}
+        ),
+        "{",
+    ],
+)
+def test_an_export_leaves_the_poses_of_a_capture_alone(tmp_path, text):
+    (tmp_path / "transforms.json").write_text(text)
+    done = CliRunner().invoke(app, [*EXPORT, str(tmp_path)])
+    assert done.exit_code == 2 and "of a capture that this command did not write" in done.stderr
+    assert (tmp_path / "transforms.json").read_text() == text
+    assert [path.name for path in tmp_path.iterdir()] == ["transforms.json"]
+
+
+def test_an_export_is_made_anew_in_its_own_folder(tmp_path):
+    for views in ("2", "3"):
+        done = CliRunner().invoke(app, [*EXPORT, str(tmp_path / "out"), "--views", views])
+        assert done.exit_code == 0, done.output
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert len(frames) == 3

@@ -257,15 +257,21 @@ def test_what_is_written_never_replaces_the_baseline_or_each_other(stored, run, 
     path = tmp_path / "baseline.jsonl"
     shutil.copy(stored / "baseline.jsonl", path)
     other = str(tmp_path / "summary")
+    (run / "report.html").write_text("its report")
+    study = (run / "study.json").read_bytes()
     for arguments, message in (
         (("--json", path), "is the baseline"),
         (("--markdown", path), "is the baseline"),
+        (("--json", run / "study.json"), f"is a file of the run {run}"),
+        (("--html", run / "report.html"), f"is a file of the run {run}"),
         (("--json", other, "--html", other), "is that of --json too"),
         (("--update", "--markdown", other), "--markdown: --update compares nothing"),
     ):
         done = gate(path, run, *arguments)
         assert done.exit_code == 2 and message in done.stderr and done.stderr.count("\n") == 1
     assert path.read_bytes() == (stored / "baseline.jsonl").read_bytes()
+    assert (run / "study.json").read_bytes() == study
+    assert (run / "report.html").read_text() == "its report"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["baseline.jsonl", "run"]
 
 

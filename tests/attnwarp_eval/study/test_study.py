@@ -136,6 +136,45 @@ def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):
     assert path in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("tables", "expected"),
+    [
+        ([], ["in no table of the report: depth of corrected, again, slipped; warp of corrected, again, slipped;"]),
+        ([("warp", ["again", "slipped"])], ["in no table of the report: depth of corrected, again, slipped;"]),
+        ([("warp", ["again"]), ("depth", ["again", "slipped"])], ["in no table of the report: warp of slipped;"]),
+        ([("warp", ["again", "slipped"]), ("depth", ["again", "slipped"])], []),
+    ],
+)  # fmt: skip
+def test_variants_that_no_table_would_show_are_named_before_they_are_computed(
+    tmp_path, tables, expected
+):
+    ablations = [
+        {"title": probe, "probe": probe, "baseline": "corrected", "variants": variants}
+        for probe, variants in tables
+    ]
+    path = write(tmp_path, ablations=ablations)
+    done = CliRunner().invoke(app, ["run", path, "--dry-run", "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0
+    lines = done.stderr.splitlines()
+    assert [line.partition(" a table")[0] for line in lines] == expected
+
+
+def test_a_scene_in_place_of_a_study_is_told_as_one(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text("name: own\nobjects: []\nlights: []\ncameras: {}\n")
+    with pytest.raises(StudyError) as caught:
+        load_study(str(path))
+    assert str(caught.value) == (
+        f"{path}: is a scene; name it under 'scenes' in a study, or as run STUDY --scenes {path}"
+    )
+
+
+def test_titles_of_shipped_studies_stand_in_one_column():
+    done = CliRunner().invoke(app, ["studies"])
+    starts = {line.index(load_study(line.split()[0]).title) for line in done.stdout.splitlines()}
+    assert len(starts) == 1
+
+
 def test_a_study_that_does_not_exist_names_those_that_do():
     with pytest.raises(StudyError, match="did you mean 'quick'"):
         load_study("quik")

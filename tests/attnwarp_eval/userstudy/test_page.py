@@ -52,6 +52,13 @@ def color(data):
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.partition(",")[2])))).mean((0, 1))
 
 
+def test_the_page_is_not_written_over_a_file_of_a_run(run):
+    before = (run.root / "study.json").read_bytes()
+    done = build(run.root, "--out", run.root / "study.json")
+    assert done.exit_code == 2 and f"is a file of the run {run.root}" in done.stderr
+    assert (run.root / "study.json").read_bytes() == before
+
+
 def test_the_page_loads_nothing_and_shows_each_method_its_own_pictures(run, tmp_path):
     done = build(run.root, "--out", tmp_path / "a.html", "--title", "</script><b>Which?")
     assert done.exit_code == 0, done.output
