@@ -14,8 +14,9 @@ from attnwarp.editing.editor import Image, edit
 from training.assess import Figure, figure
 from training.depth_editor import Prompts, attributes_of
 from training.editing_pairs import GROUPS, load_pairs
-from training.editor import TOKENS
-from training.editor_assess import SEED, nearest
+from training.editor_assess import SEED
+from training.editor_judge import nearest
+from training.editor_net import TOKENS
 from training.editor_pictures import Row
 from training.worlds import sentence
 

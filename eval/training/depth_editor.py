@@ -2,7 +2,7 @@
 
 UNet and ControlNet (Zhang et al. 2023, "Adding Conditional Control to Text-to-Image Diffusion Models")
 are trained together: with no large text-to-image model to keep, there is nothing to freeze.
-Latents, noise schedule and loss are those of :mod:`training.editor`, and so are the first weights.
+Latents, noise schedule and loss are those of :mod:`training.editor_net`, and the first weights are an editor's.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from attnwarp.editing.controlnet import control_image
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from training.clip import true_of
 from training.editing_pairs import LOOKS, PAIRS_PROTOCOL, SIZE, VIEWS, Worlds, load_pairs
-from training.editor import (
+from training.editor import tokenizer_of, weights_of
+from training.editor_answers import codes
+from training.editor_net import (
     HEADS,
     LAYERS,
     TEXT_WIDTH,
@@ -34,11 +36,8 @@ from training.editor import (
     loss_of,
     noised,
     scheduler,
-    tokenizer_of,
     tokens_of,
-    weights_of,
 )
-from training.editor_answers import codes
 from training.editor_pictures import Pictures, Row
 from training.editor_pool import PicturePool, Rows
 from training.steps import Task, train_steps
@@ -255,8 +254,7 @@ def recipe_of(name: str, stage: DepthStage) -> dict[str, Any]:
     """Everything that a stage's result depends on."""
     from training import editor, editor_pool, steps
 
-    constants = {key: getattr(editor, key) for key in editor.CONSTANTS}
-    constants |= steps.constants()
+    constants = editor.constants() | steps.constants()
     names = ("POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT")
     constants |= {key: getattr(editor_pool, key) for key in names}
     constants |= {

@@ -1,15 +1,13 @@
 """Recipe of the bundled editors: a picture and an instruction in, the edited picture out.
 
-A small InstructPix2Pix (Brooks et al. 2023) in diffusers' format: the picture before the edit is concatenated to the
-noisy latents. It predicts the edited picture itself, from betas whose last step is pure noise (Lin et al. 2024,
-"Common diffusion noise schedules and sample steps are flawed").
+The network is in :mod:`training.editor_net`. Its stages can be stopped, gone on with, and started from another's result.
 """
 
 from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +16,9 @@ import numpy as np
 import torch
 from tokenizers import Tokenizer
 
-from attnwarp.editing.latents import BLOCK, CHANNELS
-from attnwarp.editing.small_unet import OPEN, SETTLED, EditUNet
+from attnwarp.editing.small_unet import OPEN, SETTLED
 from attnwarp.errors import InputError
-from training import assemblies, editor_pool, steps
+from training import assemblies, editor_draws, editor_injection, editor_net, editor_pool, steps
 from training.byte_pairs import learn_byte_pairs
 from training.editing_pairs import (
     AMBIGUOUS,
@@ -34,28 +31,23 @@ from training.editing_pairs import (
     instruction,
     load_mixed,
 )
+from training.editor_net import (
+    SHIFT,
+    TOKENS,
+    VOCABULARY,
+    EditorNet,
+    draw_steps,
+    loss_of,
+    noised,
+    scheduler,
+    tokens_of,
+)
 from training.editor_pool import Batch, PairPool
 from training.steps import Task, train_steps
 from training.worlds import OBJECTS
 
 Tensor = torch.Tensor
 
-WIDTHS = (64, 128)
-LAYERS = 1
-HEADS = 4
-TEXT_WIDTH = 128
-TEXT_LAYERS = 2
-VOCABULARY = 1500
-TOKENS = 24
-
-T_STEPS = 1000
-NOISY_SHARE = 0.6
-"""Share of the steps drawn from the noisier ones, where the answer is decided."""
-MOST_WEIGHT = 5.0
-SD_BETAS = (0.00085, 0.012)
-"""Stable Diffusion's, first and last."""
-SHIFT = 16.0
-"""How many times the signal-to-noise amplitude of Stable Diffusion's is at a step, see :func:`scheduler`."""
 DROP = 0.05
 """Probability that the text, the picture or both are left out, each."""
 UNCLEAR = 0.35
@@ -64,11 +56,11 @@ KINDS = {"color": 0.45, "material": 0.15, "pattern": 0.05, "ground": 0.2, "time"
 INJECTED_SHARE = 0.7
 """Of the steps of a stage with injection; the others are plain."""
 
-CONSTANTS = (
+NET_CONSTANTS = (
     "WIDTHS", "LAYERS", "HEADS", "TEXT_WIDTH", "TEXT_LAYERS", "VOCABULARY", "TOKENS", "T_STEPS", "NOISY_SHARE",
-    "MOST_WEIGHT", "DROP", "UNCLEAR", "KINDS",
+    "MOST_WEIGHT",
 )  # fmt: skip
-"""What every stage's result depends on."""
+"""What every stage's result depends on, of :mod:`training.editor_net`."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +80,8 @@ class Stage:
         seed: of everything random.
         unclear: share of pairs whose instruction leaves the answer to the noise.
         draws: whether the noise's mean adds to the text (:class:`attnwarp.editing.small_unet.EditUNet`).
-        shift: of the noise schedule, see :func:`scheduler`.
-        noisy_from: :data:`NOISY_SHARE` of the steps are drawn from here on.
+        shift: of the noise schedule, see :func:`training.editor_net.scheduler`.
+        noisy_from: :data:`training.editor_net.NOISY_SHARE` of the steps are drawn from here on.
         composed: share of the open pairs at settled steps whose result has one answer in a region and another
             outside it. Without them the network takes a thing to have one colour, and its late steps undo
             an answer that holds in a part only.
@@ -126,74 +118,6 @@ STAGES = {
 """``small-plain`` is "drawn" and ``small`` "features"."""
 
 
-class EditorNet(torch.nn.Module):
-    """The UNet and the text encoder, trained together."""
-
-    def __init__(self, vocabulary: int, size: int, *, draws: bool = True) -> None:
-        super().__init__()
-        from transformers import CLIPTextConfig, CLIPTextModel
-
-        self.unet = EditUNet(
-            sample_size=size // BLOCK, in_channels=2 * CHANNELS, out_channels=CHANNELS,
-            down_block_types=("DownBlock2D",) * len(WIDTHS), mid_block_type="UNetMidBlock2D",
-            up_block_types=("CrossAttnUpBlock2D",) * len(WIDTHS), block_out_channels=WIDTHS, layers_per_block=LAYERS,
-            cross_attention_dim=TEXT_WIDTH, attention_head_dim=HEADS, norm_num_groups=16,
-        )  # fmt: skip
-        if not draws:
-            self.unet.draw = None
-        self.text = CLIPTextModel(
-            CLIPTextConfig(
-                vocab_size=vocabulary, hidden_size=TEXT_WIDTH, intermediate_size=2 * TEXT_WIDTH,
-                num_hidden_layers=TEXT_LAYERS, num_attention_heads=4, max_position_embeddings=TOKENS,
-                pad_token_id=0, bos_token_id=1, eos_token_id=1,
-            )
-        )  # fmt: skip
-        # The first prediction is the picture before the edit.
-        torch.nn.init.zeros_(self.unet.conv_out.weight)
-        torch.nn.init.zeros_(self.unet.conv_out.bias)
-
-    def forward(self, noisy: Tensor, before: Tensor, t: Tensor, tokens: Tensor) -> Tensor:
-        """(B, 48, h, w) predicted latents of the edited pictures."""
-        with halves(noisy.device):
-            context = self.text(tokens).last_hidden_state
-            both = torch.cat([noisy, before], dim=1)
-            return self.unet(both, t, context, return_dict=False)[0].float()
-
-
-def halves(device: torch.device) -> torch.autocast:
-    """Matrices multiplied in bfloat16 where the device is a GPU; pictures, targets and losses stay in float32."""
-    on_gpu = device.type == "cuda"
-    # A recorded graph cannot use weights that were converted outside it.
-    return torch.autocast(device.type, torch.bfloat16, enabled=on_gpu, cache_enabled=False)
-
-
-def scheduler(shift: float = 1.0) -> Any:
-    """The noise schedule and the sampler, as diffusers' pipelines load them.
-
-    Args:
-        shift: by which the ratio of signal to noise, in amplitude, is multiplied at every step. A mean
-            over a thing is read from as many cells as it has, so the same step of Stable Diffusion hides
-            four times as much on 16 x 16 latents as on its 64 x 64 (Hoogeboom et al. 2023, "simple
-            diffusion", section 2.3). More of it shows an answer while features still have most of
-            their weight.
-    """
-    from diffusers import DDIMScheduler
-
-    settings: dict[str, Any] = {
-        "num_train_timesteps": T_STEPS, "beta_schedule": "scaled_linear", "beta_start": SD_BETAS[0], "beta_end": SD_BETAS[1],
-        "rescale_betas_zero_snr": True, "timestep_spacing": "trailing", "prediction_type": "sample", "clip_sample": False,
-        "set_alpha_to_one": True, "steps_offset": 0,
-    }  # fmt: skip
-    plain = DDIMScheduler(**settings)
-    if shift == 1:
-        return plain
-    alphas = plain.alphas_cumprod.double()
-    shifted = shift**2 * alphas / (1 + (shift**2 - 1) * alphas)
-    before = torch.cat([torch.ones(1, dtype=torch.float64), shifted[:-1]])
-    betas = (1 - shifted / before).tolist()
-    return DDIMScheduler(**settings | {"rescale_betas_zero_snr": False, "trained_betas": betas})
-
-
 def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
     """Byte pairs learned from instructions: any text can be written with it, words of the worlds in a token or two.
 
@@ -217,22 +141,6 @@ def make_tokenizer(count: int = 80_000, worlds: int = 200) -> Tokenizer:
     return learn_byte_pairs(corpus, vocabulary=VOCABULARY, most_tokens=TOKENS, length=TOKENS)
 
 
-def tokens_of(tokenizer: Tokenizer, texts: Sequence[str]) -> Tensor:
-    """(N, 24) int64, padded with 0."""
-    return torch.tensor(
-        [code.ids for code in tokenizer.encode_batch(list(texts))], dtype=torch.int64
-    )
-
-
-def draw_steps(count: int, generator: torch.Generator, noisy_from: int) -> Tensor:
-    """(count,) steps, more of them noisy, on the generator's device."""
-    device = generator.device
-    noisy = torch.randint(noisy_from, T_STEPS, (count,), generator=generator, device=device)
-    rest = torch.randint(0, noisy_from, (count,), generator=generator, device=device)
-    share = torch.rand(count, generator=generator, device=device)
-    return torch.where(share < NOISY_SHARE, noisy, rest)
-
-
 def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """The conditions, left out at random: (before, tokens)."""
     draw = torch.rand(len(batch.t), generator=generator, device=generator.device)
@@ -242,40 +150,28 @@ def dropped(batch: Batch, empty: Tensor, generator: torch.Generator) -> tuple[Te
     return before, torch.where(no_text[:, None], empty, batch.tokens)
 
 
-def noised(x: Tensor, noise: Tensor, alphas: Tensor) -> Tensor:
-    """sqrt(alpha-bar) x + sqrt(1 - alpha-bar) noise, with (B,) alpha-bar."""
-    a = alphas[:, None, None, None]
-    return a.sqrt() * x + (1 - a).sqrt() * noise
-
-
-def loss_of(prediction: Tensor, target: Tensor, weight: Tensor, alphas: Tensor) -> Tensor:
-    """Mean squared error of the edited picture's latents, weighted by cell and by min(SNR + 1, 5)."""
-    by_step = (alphas / (1 - alphas) + 1).clamp(max=MOST_WEIGHT)
-    error = (prediction - target).square().mean(dim=1, keepdim=True)
-    return (by_step[:, None, None, None] * weight * error).mean()
+def constants() -> dict[str, Any]:
+    """What every stage's result depends on, by name."""
+    own = {"DROP": DROP, "UNCLEAR": UNCLEAR, "KINDS": KINDS}
+    return own | {key: getattr(editor_net, key) for key in NET_CONSTANTS}
 
 
 def recipe_of(name: str, stage: Stage) -> dict[str, Any]:
     """Everything that a stage's result depends on; a checkpoint of another recipe is not gone on with."""
-    constants = {key: globals()[key] for key in CONSTANTS}
-    constants |= steps.constants()
+    of_stages = constants() | steps.constants()
     names = ("SENTENCES", "POINTS", "THING_WEIGHT", "MOST_THING_WEIGHT", "HALF_PLANES")
-    constants |= {key: getattr(editor_pool, key) for key in names}
+    of_stages |= {key: getattr(editor_pool, key) for key in names}
     if stage.draws:
-        from training import editor_draws
-
-        constants |= {key: getattr(editor_draws, key) for key in ("DRAW_STEPS", "DRAW_GAIN")}
-        constants["SETTLED"], constants["OPEN"] = SETTLED, OPEN
+        of_stages |= {key: getattr(editor_draws, key) for key in ("DRAW_STEPS", "DRAW_GAIN")}
+        of_stages["SETTLED"], of_stages["OPEN"] = SETTLED, OPEN
     if stage.inject != "none":
-        from training import editor_injection
-
         of_injection = (
             "FIRST_WEIGHT", "WEIGHT_SPREAD", "LEAST_WEIGHT", "MOST_ALPHA", "CARRIED", "MOST_OWN", "NO_TEXT", "WAYS",
             "INJECTED_KINDS",
         )  # fmt: skip
-        constants |= {key: getattr(editor_injection, key) for key in of_injection}
-        constants["INJECTED_SHARE"] = INJECTED_SHARE
-    return {"stage": name, **asdict(stage), "constants": constants, "pairs": PAIRS_PROTOCOL}
+        of_stages |= {key: getattr(editor_injection, key) for key in of_injection}
+        of_stages["INJECTED_SHARE"] = INJECTED_SHARE
+    return {"stage": name, **asdict(stage), "constants": of_stages, "pairs": PAIRS_PROTOCOL}
 
 
 def tokenizer_of(out: Path) -> Tokenizer:
@@ -325,10 +221,8 @@ def train_stage(
             weights |= {k: v for k, v in net.state_dict().items() if k.startswith("unet.draw.")}
         net.load_state_dict(weights)
         if begins and not (out / f"{name}.pt").exists():
-            from training.editor_draws import teach_draws
-
             start = time.perf_counter()
-            teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
+            editor_draws.teach_draws(net, tokenizer, pool.worlds, seed=stage.seed)
             spent = time.perf_counter() - start
     net.to(device)
     alphas = scheduler(stage.shift).alphas_cumprod.to(device)
@@ -367,8 +261,6 @@ def tasks_of(
         # Some plain steps among those with injection, so that clear instructions are not forgotten.
         tasks.append(Task(share * (1 - injected), count, draw, functools.partial(plain_loss, net)))
         if injected:
-            from training import editor_injection
-
             inject = stage.inject == "features"
             drawn = functools.partial(
                 editor_injection.inputs, pool, alphas, empty, size, inject=inject, noisy_from=stage.noisy_from

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,9 @@ from training.editing_pairs import (
     instruction,
     load_pairs,
 )
+from training.editor_judge import Answer, nearest, outside_psnr
 from training.editor_pictures import Pictures, Row
+from training.editor_scenes import scene_figures
 from training.worlds import COLORS
 
 SEED = 77
@@ -31,35 +33,6 @@ SEED = 77
 ASSESSED = ("color", "material", "ground", "time")
 LARGE_WORLDS = 20
 """Worlds that pictures of twice the size are judged on: they take four times as long."""
-
-Lab = npt.NDArray[np.float64]
-
-
-def mean_lab(image: Image, mask: npt.NDArray[np.bool_]) -> Lab:
-    """(3,) CIELAB of the mean colour in a mask, averaged in linear light."""
-    from skimage.color import rgb2lab
-
-    from attnwarp_eval.colors import to_linear, to_srgb
-
-    mean = to_linear(image[mask].astype(np.float64)).mean(axis=0)
-    return np.asarray(rgb2lab(to_srgb(mean)[None, None])[0, 0])
-
-
-def nearest(image: Image, answers: Sequence[Image], mask: npt.NDArray[np.bool_]) -> int:
-    """Which of some pictures has the mean colour in the mask that is nearest to the picture's (CIEDE2000)."""
-    from skimage.color import deltaE_ciede2000
-
-    own = mean_lab(image, mask)
-    return int(np.argmin([deltaE_ciede2000(own, mean_lab(a, mask)) for a in answers]))
-
-
-def outside_psnr(image: Image, before: Image, mask: npt.NDArray[np.bool_]) -> float:
-    """dB between two pictures where the mask is not."""
-    return float(-10 * np.log10(max(np.square(image[~mask] - before[~mask]).mean(), 1e-10)))
-
-
-Answer = Callable[[Image, str, int], Image]
-"""The edited picture of a picture, an instruction and a seed."""
 
 
 def answers_of(editor: Any, steps: int = 20) -> Answer:
@@ -256,7 +229,6 @@ def assess_editor(
         scenes: whether to judge it on the package's own scenes too.
     """
     from attnwarp.editing.small import IMAGE_GUIDANCE, TEXT_GUIDANCE, load_editor
-    from training.editor_scenes import scene_figures
 
     torch.set_num_threads(1)
     editor = load_editor(str(folder), text_guidance=TEXT_GUIDANCE, image_guidance=IMAGE_GUIDANCE)

@@ -19,7 +19,8 @@ from training.assess import Figure, figure
 from training.card_sections import Kept, percent, short_of
 from training.depth_editor import attributes_of
 from training.editing_pairs import GROUPS, THING, Worlds, instruction
-from training.editor_assess import SEED, Answer, draw_row, mask_of, nearest, picture_of
+from training.editor_assess import SEED, draw_row, mask_of, picture_of
+from training.editor_judge import Answer, nearest
 from training.editor_pictures import Pictures
 from training.worlds import ATTRIBUTES, sentence
 

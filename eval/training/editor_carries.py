@@ -32,7 +32,8 @@ from attnwarp.warp import EXACT_DEPTH_TOLERANCE, Surface, WarpSettings, warp_sur
 from training.assess import Figure, figure
 from training.card_sections import Kept, percent, short_of
 from training.editing_pairs import GROUPS, SIZE, VIEWS, Worlds
-from training.editor_assess import SEED, nearest
+from training.editor_assess import SEED
+from training.editor_judge import nearest
 from training.editor_pictures import Pictures, Row
 
 INSTRUCTION = "change its color"
@@ -250,7 +251,7 @@ def _same_color(image: Image, mask: Mask, case: Case) -> int:
     """The case's answer whose colour is nearest to another picture's."""
     from skimage.color import deltaE_ciede2000
 
-    from training.editor_assess import mean_lab
+    from training.editor_judge import mean_lab
 
     own = mean_lab(image, mask)
     return int(np.argmin([deltaE_ciede2000(own, mean_lab(a, case.thing)) for a in case.answers]))

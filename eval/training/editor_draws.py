@@ -21,8 +21,8 @@ from training.editing_pairs import (
     ambiguous_instruction,
     instruction,
 )
-from training.editor import TOKENS, EditorNet, tokens_of
 from training.editor_answers import codes
+from training.editor_net import TOKENS, EditorNet, tokens_of
 
 DRAW_STEPS = 3_000
 """Of the layers alone."""

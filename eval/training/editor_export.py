@@ -14,7 +14,8 @@ from attnwarp.editing.latents import HaarLatents
 from attnwarp.editing.small import write_sums
 from training import steps
 from training.depth_editor import DEPTH_STAGES, DepthNet
-from training.editor import STAGES, TOKENS, EditorNet, scheduler, tokenizer_of
+from training.editor import STAGES, tokenizer_of
+from training.editor_net import TOKENS, EditorNet, scheduler
 
 
 @dataclass(frozen=True)

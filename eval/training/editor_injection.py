@@ -17,8 +17,8 @@ from torch import Tensor
 from attnwarp.editing.attention import Call, Layer, choose_layers, hooked
 from attnwarp.editing.latents import BLOCK, CHANNELS
 from training.editing_pairs import SIZE
-from training.editor import T_STEPS, EditorNet, draw_steps, loss_of, noised
 from training.editor_answers import settled
+from training.editor_net import T_STEPS, EditorNet, draw_steps, loss_of, noised
 from training.editor_pool import Batch, PairPool, Rows
 
 FIRST_WEIGHT, WEIGHT_SPREAD, LEAST_WEIGHT = 0.9, 0.15, 0.05

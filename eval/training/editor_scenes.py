@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from training.assess import Figure, figure
-from training.editor_assess import Answer, nearest
+from training.editor_judge import Answer, nearest
 
 SCENES = ("bear", "person", "dinosaur", "face", "garden", "stump")
 """The scenes that have edits, as the paper's."""

@@ -12,7 +12,8 @@ from PIL import ImageDraw
 from attnwarp.editing.editor import Image
 from training.depth_editor import Prompts
 from training.editing_pairs import GROUPS, SIZE, Worlds
-from training.editor_assess import Answer, picture_of
+from training.editor_assess import picture_of
+from training.editor_judge import Answer
 from training.editor_pictures import Pictures, Row
 from training.worlds import NOUNS, OBJECTS
 

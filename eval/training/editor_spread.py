@@ -15,7 +15,8 @@ import torch
 from attnwarp.editing.editor import Image, edit
 from training.card_sections import Kept
 from training.editing_pairs import GROUPS, THING, Worlds, ambiguous_instruction
-from training.editor_assess import SEED, draw_row, mask_of, nearest, picture_of
+from training.editor_assess import SEED, draw_row, mask_of, picture_of
+from training.editor_judge import nearest
 from training.editor_pictures import Pictures
 from training.worlds import COLORS, GROUNDS, STATUES
 

@@ -25,8 +25,9 @@ from training.depth_editor import (
     train_depth_stage,
 )
 from training.editing_pairs import LOOKS, PAIR_SPLITS, SIZE, THING, Worlds, edit_looks
-from training.editor import EditorNet, make_tokenizer
+from training.editor import make_tokenizer
 from training.editor_export import export_depth_editor
+from training.editor_net import EditorNet
 from training.editor_pictures import Row
 from training.worlds import COLORS, HUES
 

@@ -16,7 +16,7 @@ from attnwarp.editing.editor import edit
 from attnwarp.editing.latents import HaarLatents, haar_basis
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError
-from training import editing_pairs, editor, editor_draws, editor_injection, steps
+from training import editing_pairs, editor, editor_draws, editor_injection, editor_net, steps
 from training.data import SPLITS
 from training.edit import app
 from training.editing_pairs import (
@@ -248,10 +248,10 @@ def check_export(folder):
 
 def test_the_control_differs_from_the_injection_in_what_goes_over_alone(pool, tokenizer):
     torch.manual_seed(0)
-    net = editor.EditorNet(tokenizer.get_vocab_size(), 64)
+    net = editor_net.EditorNet(tokenizer.get_vocab_size(), 64)
     torch.nn.init.normal_(net.unet.conv_out.weight, std=0.05)
-    alphas = editor.scheduler().alphas_cumprod
-    empty = editor.tokens_of(tokenizer, [""])[0]
+    alphas = editor_net.scheduler().alphas_cumprod
+    empty = editor_net.tokens_of(tokenizer, [""])[0]
     inputs = [
         editor_injection.inputs(
             pool, alphas, empty, 64, 3, torch.Generator().manual_seed(2), inject=inject
@@ -275,7 +275,7 @@ def test_the_target_is_the_recorded_answer_where_features_went_and_ones_own_else
 ):
     ways = dict.fromkeys(editor_injection.WAYS, 0.0) | {way: 1.0}
     monkeypatch.setattr(editor_injection, "WAYS", ways)
-    alphas, empty = editor.scheduler().alphas_cumprod, torch.zeros(24, dtype=torch.int64)
+    alphas, empty = editor_net.scheduler().alphas_cumprod, torch.zeros(24, dtype=torch.int64)
     x, control = (
         editor_injection.inputs(
             pool, alphas, empty, 64, 12, torch.Generator().manual_seed(5), inject=inject
@@ -300,7 +300,7 @@ def test_layers_of_the_noise_learn_what_the_answer_it_picks_adds_to_an_open_sent
     tokenizer, monkeypatch
 ):
     torch.manual_seed(0)
-    net = editor.EditorNet(tokenizer.get_vocab_size(), 64)
+    net = editor_net.EditorNet(tokenizer.get_vocab_size(), 64)
     # What a trained text encoder would give: kinds of sentences far from each other, an own shift for each answer.
     kinds = {kind: torch.randn(1, 128) + 0.1 * torch.randn(200, 128) for kind in AMBIGUOUS}
     settled = torch.randn(1, 128) + 0.1 * torch.randn(300, 128)
@@ -335,7 +335,7 @@ def test_a_clear_sentence_differs_from_an_open_one_by_its_answer_alone(data, tok
         def text(self, tokens):
             texts = [tokenizer.decode(row.tolist()) for row in tokens]
             value = torch.tensor([float("red" in text.split()) for text in texts])
-            states = value[:, None, None].expand(-1, editor.TOKENS, 3)
+            states = value[:, None, None].expand(-1, editor_net.TOKENS, 3)
             return types.SimpleNamespace(last_hidden_state=states)
 
     opened, clear, shifts = editor_draws.differences(
@@ -351,7 +351,7 @@ def test_a_clear_sentence_differs_from_an_open_one_by_its_answer_alone(data, tok
 
 def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
     torch.manual_seed(0)
-    net = editor.EditorNet(tokenizer.get_vocab_size(), 64).unet.double()
+    net = editor_net.EditorNet(tokenizer.get_vocab_size(), 64).unet.double()
     torch.nn.init.normal_(net.conv_out.weight, std=0.05)
     sample, text = torch.randn((2, 96, 8, 12)).double(), torch.randn((2, 5, 128)).double()
     result = net(sample, 885, encoder_hidden_states=text).sample
@@ -369,10 +369,10 @@ def test_what_the_noise_draws_is_added_to_the_tokens_of_the_text(tokenizer):
     assert torch.equal(late, net(sample, torch.tensor([850, 500]), text).sample)
 
 
-@pytest.mark.parametrize("shift", [1, editor.SHIFT])
+@pytest.mark.parametrize("shift", [1, editor_net.SHIFT])
 def test_the_schedule_ends_in_pure_noise(shift):
-    scheduler = editor.scheduler(shift)
-    first, last = (beta**0.5 for beta in editor.SD_BETAS)
+    scheduler = editor_net.scheduler(shift)
+    first, last = (beta**0.5 for beta in editor_net.SD_BETAS)
     root = np.cumprod(1 - np.linspace(first, last, 1000) ** 2) ** 0.5
     # Lin et al. 2024, algorithm 1: the root is shifted so that it ends in 0, and scaled so that it begins as before.
     root = (root - root[-1]) * root[0] / (root[0] - root[-1])
@@ -386,7 +386,7 @@ def test_the_schedule_ends_in_pure_noise(shift):
 
 
 def test_more_steps_are_drawn_where_the_answer_is_decided():
-    drawn = editor.draw_steps(20_000, torch.Generator().manual_seed(0), 600)
+    drawn = editor_net.draw_steps(20_000, torch.Generator().manual_seed(0), 600)
     assert float((drawn >= 600).float().mean()) == pytest.approx(0.6, abs=0.02)
     assert int(drawn.min()) >= 0 and int(drawn.max()) == 999
 

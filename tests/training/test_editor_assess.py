@@ -6,7 +6,8 @@ import pytest
 from training import editing_pairs, editor_assess
 from training.assess import figure
 from training.editing_pairs import GROUPS, load_pairs
-from training.editor_assess import assess, editor_card, nearest, outside_psnr, unedited
+from training.editor_assess import assess, editor_card, unedited
+from training.editor_judge import nearest, outside_psnr
 
 
 @pytest.fixture(scope="module")
