@@ -283,6 +283,14 @@ def run_study(
                         " so. Name another folder with --out to start afresh.",
                         err=True,
                     )
+                others = len(store.done() - {cell.id for cell in planned.cells})
+                if others:
+                    typer.echo(
+                        f"attnwarp-eval: {others} of the cells in {store.root} are of other sizes,"
+                        " scenes, seeds or settings than this run; they are kept, and the report is"
+                        " of this run alone. Name another folder with --out to keep the former one.",
+                        err=True,
+                    )
                 try:
                     summary = _watch(planned, store, jobs, scheduler, keep_going)
                 except ClusterLost:

@@ -287,6 +287,17 @@ def test_a_run_killed_half_way_goes_on_and_gives_the_same_bytes(undisturbed, fol
     assert without_timings(run) == undisturbed
 
 
+def test_a_run_that_takes_the_place_of_anothers_report_says_so(finished, folder):
+    run = folder / "reused"
+    shutil.copytree(finished, run)
+    assert "Name another folder" not in call("run", "study.yaml", "--out", run).stderr
+    again = call("run", "study.yaml", "--size", "72", "--out", run)
+    assert again.exit_code == 0, again.stderr
+    # No cell of one size is one of the other.
+    assert f"{CELLS} of the cells in {run} are of other sizes" in again.stderr
+    assert len(Store(run).done()) == 2 * CELLS
+
+
 def test_two_workers_give_the_same_numbers_as_one_process(undisturbed, folder):
     run = folder / "parallel"
     done = call("run", "study.yaml", "--out", run, "--jobs", "2")
