@@ -37,6 +37,7 @@ __all__ = [
     "TextImageEncoder",
     "TokenEncoder",
     "available",
+    "check_kind",
     "kind_of",
     "load_encoder",
 ]
@@ -109,6 +110,23 @@ def kind_of(name: str) -> Kind:
     raise InputError(f"encoder {name!r}: unknown{guess} Known are {', '.join([*BUNDLED, *REAL])}")
 
 
+def check_kind(name: str, kind: Kind) -> None:
+    """Refuse a name that is not of an encoder of this kind; nothing is loaded.
+
+    Raises:
+        InputError: no such name, or one of another kind.
+
+    Example:
+        >>> check_kind("dino-small", "dino")
+    """
+    actual = kind_of(name)
+    if actual != kind:
+        fitting = ", ".join(n for n, (k, _) in (BUNDLED | REAL).items() if k == kind)
+        raise InputError(
+            f"encoder {name!r}: is of kind {actual!r}, expected {kind!r}; name one of {fitting}"
+        )
+
+
 @overload
 def load_encoder(name: str, kind: Literal["clip"], *, device: str = "cpu") -> TextImageEncoder: ...
 @overload
@@ -143,12 +161,10 @@ def load_encoder(name: str, kind: Kind | None = None, *, device: str = "cpu") ->
         >>> encoder.tokens([np.zeros((64, 96, 3))]).shape
         (1, 8, 8, 192)
     """
-    actual = kind_of(name)
-    if kind is not None and actual != kind:
-        fitting = ", ".join(n for n, (k, _) in (BUNDLED | REAL).items() if k == kind)
-        raise InputError(
-            f"encoder {name!r}: is of kind {actual!r}, expected {kind!r}; name one of {fitting}"
-        )
+    if kind is None:
+        kind_of(name)
+    else:
+        check_kind(name, kind)
     if name in BUNDLED:
         if importlib.util.find_spec("attnwarp.encoders.bundled") is None:
             raise InputError(

@@ -288,6 +288,11 @@ class _Run:
                 f"size: {longest} px in place of {asked.size}, as this editor's sides are multiples"
                 f" of {multiple}"
             )
+        if len(self.plan.sources) < asked.sources:
+            announce(
+                f"sources: {len(self.plan.sources)} in place of {asked.sources}, as there are"
+                f" {len(self.scene.cameras)} views"
+            )
         if len(self.plan.stages) < asked.stages:
             on_sources = "" if self.plan.stages[0] else " that tunes on the sources alone"
             announce(

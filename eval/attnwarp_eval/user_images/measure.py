@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp.encoders import EncoderInfo, Kind, load_encoder
+from attnwarp.encoders import EncoderInfo, Kind, check_kind, load_encoder
 from attnwarp.encoders._weights import device_of
 from attnwarp.errors import InputError
 from attnwarp_eval import metrics
@@ -323,6 +323,13 @@ def _possible(
 def _load(
     wanted: Sequence[_Figure], encoders: Mapping[Kind, str | None], device: str, done: Measured
 ) -> dict[Kind, Any]:
+    for kind, name in encoders.items():
+        if name is None or name == "none":
+            continue
+        try:
+            check_kind(name, kind)  # also where no figure needs it
+        except InputError as error:
+            raise InputError(f"--{kind}: {error}") from None
     loaded: dict[Kind, Any] = {}
     for kind in dict.fromkeys(figure.encoder for figure in wanted if figure.encoder is not None):
         named = encoders.get(kind)

@@ -523,6 +523,8 @@ def test_other_folders_and_flags_that_will_not_do(data, models):
         ),
         ((one, "--prompt=x", "--clip=dino-small"), "is of kind 'dino', expected 'clip'"),
         ((one, "--prompt=x", "--clip=clap"), "--clip: encoder 'clap': unknown; did you mean"),
+        # Where no figure needs it, too.
+        ((one, "--clip=clap"), "--clip: encoder 'clap': unknown; did you mean"),
         (
             (one, "--prompt=x", "--background=red"),
             "--background: got 'red', expected black, white or r,g,b",
