@@ -288,7 +288,7 @@ def run_study(
                     typer.echo(
                         f"attnwarp-eval: {others} of the cells in {store.root} are of other sizes,"
                         " scenes, seeds or settings than this run; they are kept, and the report is"
-                        " of this run alone. Name another folder with --out to keep the former one.",
+                        " of this run alone. Name another folder with --out to keep the former.",
                         err=True,
                     )
                 try:
