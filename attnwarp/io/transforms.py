@@ -13,6 +13,7 @@ import json
 import math
 import os
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,7 @@ def read_transforms(
 
     Warns:
         InputWarning: keys that are not understood; frames that no split names; a frame whose
-            intrinsics differ from those at the top.
+            intrinsics differ from those at the top; an image that several frames name.
 
 
     Example:
@@ -352,6 +353,7 @@ def _read_file(
             stacklevel=2,
         )
     _warn_of_own_intrinsics(path, data, frames)
+    _warn_of_doubles(path, names)
     splits = _splits(path, data, names, paths, split)
     cameras, available = with_images(
         path,
@@ -422,6 +424,19 @@ def _check_keys(values: _Values, ignore_keys: Sequence[str]) -> None:
             key,
             f"got {brief(value)}: {effect}, which is not supported; prepare the images without it,"
             f" or pass ignore_keys=[{key!r}] (--ignore-key {key})",
+        )
+
+
+def _warn_of_doubles(path: Path, names: Sequence[str]) -> None:
+    """Say which images several frames name: one may be held out, and fitted all the same."""
+    doubles = [name for name, count in Counter(names).items() if count > 1]
+    if doubles:
+        warnings.warn(
+            f"{path}: {len(doubles)} of {len(set(names))} images are named by several frames, such"
+            f" as {brief(doubles[0])}; leave one frame of each, or a view may be held out and"
+            " fitted too",
+            InputWarning,
+            stacklevel=3,
         )
 
 

@@ -561,6 +561,14 @@ def test_a_frame_to_fit_on_is_not_held_out_as_well(tmp_path):
     assert read_transforms(folder_of(tmp_path, **lists)).splits == ["train", "test", "train"]
 
 
+def test_an_image_that_two_frames_name_is_said(tmp_path):
+    frames = [{"file_path": f"images/{i}.png", "transform_matrix": pose(i)} for i in (0, 1, 0)]
+    for i in range(2):
+        image(tmp_path / f"images/{i}.png")
+    with pytest.warns(InputWarning, match=r"1 of 2 images are named by several.*'images/0.png'"):
+        assert len(read_transforms(write(tmp_path, frames, **LENS)).cameras) == 3
+
+
 def test_frames_in_no_split_are_counted(tmp_path):
     lists = split_names(tmp_path, lambda name: name)
     lists["train_filenames"].pop()
