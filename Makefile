@@ -12,7 +12,7 @@ PYTEST := $(BIN)/python -m pytest -n $(JOBS) --durations=25 --durations-min=1
 # Of the gate: the run, and what it says.
 GATE := build/gate
 
-# Where LLVM is installed, each process of the tests would compile Mitsuba's integrators. Its own tests choose themselves.
+# Where LLVM is installed, each process of the tests would compile Mitsuba's integrators. The tests of LLVM choose their own variant.
 test test-all: export ATTNWARP_MITSUBA ?= scalar_rgb
 
 .PHONY: demo test test-all gate baseline bench docs lint checks kernels kernels-float64 collected measured venv clean

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+import attnwarp.render
 from attnwarp.gaussians import Gaussians
 from attnwarp.losses import normal_consistency
-from attnwarp.render import render as rendered
 from benchmarks import render, warp
 
 STUDY = {
@@ -52,7 +52,9 @@ def main(float64: bool) -> None:
 def consistency_of_normals(splats: Gaussians) -> None:
     """The loss's kernels, forward and backward."""
     means = splats.means.clone().requires_grad_(True)
-    view = rendered(dataclasses.replace(splats, means=means), render.camera(32), backend="cpu")
+    view = attnwarp.render.render(
+        dataclasses.replace(splats, means=means), render.camera(32), backend="cpu"
+    )
     normal_consistency(view).backward()
 
 

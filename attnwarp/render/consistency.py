@@ -33,8 +33,8 @@ def normal_consistency(
     lens = depth_normals.Lens(
         *(float(value) for value in (K[0, 0], K[0, 1], K[1, 1], K[0, 2], K[1, 2]))
     )
-    turn = rotation.detach().to(torch.float32).reshape(9).contiguous().numpy()
-    result: Tensor = _NormalConsistency.apply(depth, alpha, normal, lens, turn)
+    turned = rotation.detach().to(torch.float32).reshape(9).contiguous().numpy()
+    result: Tensor = _NormalConsistency.apply(depth, alpha, normal, lens, turned)
     return result
 
 
@@ -46,16 +46,16 @@ class _NormalConsistency(torch.autograd.Function):
         alpha: Tensor,
         normal: Tensor,
         lens: depth_normals.Lens,
-        turn: np.ndarray,
+        rotation: np.ndarray,
     ) -> Tensor:
         sums = np.empty(depth.shape[0])
         maps = _maps(depth, alpha, normal)
         run_jobs(
             depth_normals.disagreement,
-            [(*rows, lens, turn, maps, sums) for rows in _rows(depth)],
+            [(*rows, lens, rotation, maps, sums) for rows in _rows(depth)],
         )
         ctx.save_for_backward(depth, alpha, normal)
-        ctx.lens, ctx.turn = lens, turn
+        ctx.lens, ctx.rotation = lens, rotation
         return depth.new_tensor(sums.sum() / max(1, depth.numel()))
 
     @staticmethod
@@ -65,13 +65,16 @@ class _NormalConsistency(torch.autograd.Function):
         pixels = max(1, maps.depth.size)
         share = np.float32(float(upstream) / pixels)
         d_depth, d_alpha, d_normal = (_pool.empty(part.shape, np.float32) for part in maps)
-        asked = _pool.empty((4, *maps.depth.shape), np.float32)
+        to_neighbors = _pool.empty((4, *maps.depth.shape), np.float32)
         rows = _rows(ctx.saved_tensors[0])
         run_jobs(
             depth_normals.disagreement_backward,
-            [(*r, ctx.lens, ctx.turn, share, maps, d_alpha, d_normal, asked) for r in rows],
+            [
+                (*r, ctx.lens, ctx.rotation, share, maps, d_alpha, d_normal, to_neighbors)
+                for r in rows
+            ],
         )
-        run_jobs(depth_normals.collect, [(*r, asked, d_depth) for r in rows])
+        run_jobs(depth_normals.gather, [(*r, to_neighbors, d_depth) for r in rows])
         return *map(torch.from_numpy, (d_depth, d_alpha, d_normal)), None, None
 
 

@@ -3,8 +3,8 @@
 
 The definition is :func:`attnwarp.losses.normal_consistency` in torch. A pixel's surface normal is
 the cross product of the differences of its neighbours' points, so all is done in one pass over the
-pixels. Backward, a pixel says what it asks of each neighbour's depth; a second pass collects that,
-so no two threads add to one place.
+pixels. Backward, a pixel writes its gradients in its neighbours' depths; a second pass gathers
+them, so no two threads add to one place.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from attnwarp.render._kernels.compilation import bare, f32, inlined
 
 LEFT, RIGHT, UP, DOWN = range(4)
-"""Rows of what a pixel asks of its neighbours' depths."""
+"""Rows of a pixel's gradients in its neighbours' depths."""
 
 
 class Lens(NamedTuple):
@@ -48,11 +48,11 @@ def _ray_x(lens, y, j):
 
 
 @inlined
-def _surface(lens, turn, z, n, j, ys):
+def _surface(lens, rotation, z, n, j, ys):
     """A pixel's surface from its neighbours' depths.
 
     Args:
-        turn: rows of the rotation from world to camera, 9 values.
+        rotation: rows of the rotation from world to camera, 9 values.
         z: depth of the pixel, and left, right, above and below of it.
         n: its rendered normal.
         j: its column.
@@ -86,19 +86,19 @@ def _surface(lens, turn, z, n, j, ys):
     inverse = one / np.sqrt(square if good else one)
     unit = (cx * inverse, cy * inverse, cz * inverse)
     seen = (
-        turn[0] * n[0] + turn[1] * n[1] + turn[2] * n[2],
-        turn[3] * n[0] + turn[4] * n[1] + turn[5] * n[2],
-        turn[6] * n[0] + turn[7] * n[1] + turn[8] * n[2],
+        rotation[0] * n[0] + rotation[1] * n[1] + rotation[2] * n[2],
+        rotation[3] * n[0] + rotation[4] * n[1] + rotation[5] * n[2],
+        rotation[6] * n[0] + rotation[7] * n[1] + rotation[8] * n[2],
     )
     return good, unit, inverse, seen, (ax, ay, az), (bx, by, bz), (xl, xr, xu, xd)
 
 
 @bare
-def disagreement(begin, end, lens, turn, maps, sums):
+def disagreement(begin, end, lens, rotation, maps, sums):
     """Rows ``begin`` to ``end``: the sum over each row of alpha - normal . N.
 
     Args:
-        turn: (9,) float32 rotation from world to camera, row by row.
+        rotation: (9,) float32 rotation from world to camera, row by row.
         sums: (H,) float64.
     """
     height, width = maps.depth.shape
@@ -112,20 +112,20 @@ def disagreement(begin, end, lens, turn, maps, sums):
                 j = k + 1
                 z = row[j], row[k], row[k + 2], above[j], below[j]
                 n = normal[j, 0], normal[j, 1], normal[j, 2]
-                good, unit, _, seen, _, _, _ = _surface(lens, turn, z, n, j, ys)
+                good, unit, _, seen, _, _, _ = _surface(lens, rotation, z, n, j, ys)
                 along = seen[0] * unit[0] + seen[1] * unit[1] + seen[2] * unit[2]
                 total += alpha[j] - along if good else f32(0)
         sums[i] = total
 
 
 @bare
-def disagreement_backward(begin, end, lens, turn, share, maps, d_alpha, d_normal, asked):
+def disagreement_backward(begin, end, lens, rotation, share, maps, d_alpha, d_normal, to_neighbors):
     """Rows ``begin`` to ``end``: gradients of ``share`` times the sum over pixels.
 
     Args:
         share: float32.
         d_alpha, d_normal: of the maps' shapes.
-        asked: (4, H, W) float32, what each pixel asks of its neighbours' depths.
+        to_neighbors: (4, H, W) float32, each pixel's gradients in its neighbours' depths.
     """
     height, width = maps.depth.shape
     for i in range(begin, end):
@@ -138,12 +138,14 @@ def disagreement_backward(begin, end, lens, turn, share, maps, d_alpha, d_normal
                 j = k + 1
                 z = row[j], row[k], row[k + 2], above[j], below[j]
                 n = normal[j, 0], normal[j, 1], normal[j, 2]
-                good, u, inverse, seen, a, b, x = _surface(lens, turn, z, n, j, ys)
+                good, u, inverse, seen, a, b, x = _surface(lens, rotation, z, n, j, ys)
                 part = share if good else f32(0)
                 d_alpha[i, j] = part
                 for axis in range(3):
                     d_normal[i, j, axis] = -part * (
-                        turn[axis] * u[0] + turn[3 + axis] * u[1] + turn[6 + axis] * u[2]
+                        rotation[axis] * u[0]
+                        + rotation[3 + axis] * u[1]
+                        + rotation[6 + axis] * u[2]
                     )
                 # Through the unit length, then through the cross product b x a.
                 along = seen[0] * u[0] + seen[1] * u[1] + seen[2] * u[2]
@@ -153,10 +155,10 @@ def disagreement_backward(begin, end, lens, turn, share, maps, d_alpha, d_normal
                 cz = scale * (u[2] * along - seen[2])
                 dax, day, daz = cy * b[2] - cz * b[1], cz * b[0] - cx * b[2], cx * b[1] - cy * b[0]
                 dbx, dby, dbz = a[1] * cz - a[2] * cy, a[2] * cx - a[0] * cz, a[0] * cy - a[1] * cx
-                asked[LEFT, i, j] = -(x[0] * dax + y * day + daz)
-                asked[RIGHT, i, j] = x[1] * dax + y * day + daz
-                asked[UP, i, j] = -(x[2] * dbx + y_up * dby + dbz)
-                asked[DOWN, i, j] = x[3] * dbx + y_down * dby + dbz
+                to_neighbors[LEFT, i, j] = -(x[0] * dax + y * day + daz)
+                to_neighbors[RIGHT, i, j] = x[1] * dax + y * day + daz
+                to_neighbors[UP, i, j] = -(x[2] * dbx + y_up * dby + dbz)
+                to_neighbors[DOWN, i, j] = x[3] * dbx + y_down * dby + dbz
         for j in range(width):
             if 0 < i < height - 1 and 0 < j < width - 1:
                 continue
@@ -164,22 +166,22 @@ def disagreement_backward(begin, end, lens, turn, share, maps, d_alpha, d_normal
             for axis in range(3):
                 d_normal[i, j, axis] = 0
             for side in range(4):
-                asked[side, i, j] = 0
+                to_neighbors[side, i, j] = 0
 
 
 @bare
-def collect(begin, end, asked, d_depth):
-    """Rows ``begin`` to ``end``: the gradient in depth, from what the four neighbours ask."""
+def gather(begin, end, to_neighbors, d_depth):
+    """Rows ``begin`` to ``end``: the gradient in depth, from those of the four neighbours."""
     height, width = d_depth.shape
     for i in range(begin, end):
         for j in range(width):
             total = f32(0)
             if j > 0:
-                total += asked[RIGHT, i, j - 1]
+                total += to_neighbors[RIGHT, i, j - 1]
             if j < width - 1:
-                total += asked[LEFT, i, j + 1]
+                total += to_neighbors[LEFT, i, j + 1]
             if i > 0:
-                total += asked[DOWN, i - 1, j]
+                total += to_neighbors[DOWN, i - 1, j]
             if i < height - 1:
-                total += asked[UP, i + 1, j]
+                total += to_neighbors[UP, i + 1, j]
             d_depth[i, j] = total
