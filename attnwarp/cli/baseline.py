@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from attnwarp.cli.files import check_kept, check_seen, read_splats, read_views
+from attnwarp.cli.files import check_inputs_stay, check_seen, read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
     MaxSizeOption,
@@ -68,7 +68,7 @@ def baseline(
     with clear_errors(f"stopped; what {out} holds is whole, and the same command goes on from it"):
         changes = assignments(change or [], {})
         check_out(out)
-        check_kept([out / "edited.ply"], [ply])
+        check_inputs_stay([out / "edited.ply"], [ply])
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
         from attnwarp import check

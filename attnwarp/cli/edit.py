@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from attnwarp.cli.files import check_kept, check_seen, read_splats, read_views
+from attnwarp.cli.files import check_inputs_stay, check_seen, read_splats, read_views
 from attnwarp.cli.options import (
     DataArgument,
     Kind,
@@ -118,7 +118,7 @@ def edit(
         check_segmenter(segmenter, words)
         check_out(out)
         results = ("source.png", "edited.ply", "edited-3dgs.ply")
-        check_kept((out / name for name in results), (source_picture, ply))
+        check_inputs_stay((out / name for name in results), (source_picture, ply))
         check_words(instruction)
         guide_of(editor)  # refuses what is no editor
         from attnwarp import check

@@ -104,7 +104,7 @@ def check_seen(path: Path, splats: Gaussians, cameras: Sequence[Camera]) -> None
     raise InputError(f"{path}: its splats cover less than {COVERED:.1%} of each view; {UNSEEN}")
 
 
-def check_kept(results: Iterable[Path], read: Iterable[Path | None]) -> None:
+def check_inputs_stay(results: Iterable[Path], read: Iterable[Path | None]) -> None:
     """Refuse to write over what a command reads, under one name or two, or by a link.
 
     Args:
@@ -114,7 +114,8 @@ def check_kept(results: Iterable[Path], read: Iterable[Path | None]) -> None:
     Raises:
         InputError: a result would replace a file that is read.
     """
-    existing = {_identity(path.lstat): path for path in results}
+    # A PLY that is written to a link goes to the file that it leads to.
+    existing = {_identity(look): path for path in results for look in (path.lstat, path.stat)}
     existing.pop(None, None)
     for path in read:
         if path is None:

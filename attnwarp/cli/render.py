@@ -10,7 +10,7 @@ from typing import Annotated, BinaryIO
 
 import typer
 
-from attnwarp.cli.files import UNSEEN, check_kept, read_splats, read_views, write_image
+from attnwarp.cli.files import UNSEEN, check_inputs_stay, read_splats, read_views, write_image
 from attnwarp.cli.options import (
     AntialiasedOption,
     Reading,
@@ -66,7 +66,7 @@ def render(
         splats = read_splats(model, kind, antialiased)
         dataset = read_views(cameras, reading, missing_images="none", points=False)
         views = dataset.cameras
-        check_kept((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
+        check_inputs_stay((out / f"{name}.png" for name in file_stems(views)), dataset.image_paths)
         out.mkdir(parents=True, exist_ok=True)
         seen = False
         with display(title=out.name) as show:

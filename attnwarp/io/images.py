@@ -179,7 +179,7 @@ def _alpha_lost_by_opencv(image: Any) -> npt.NDArray[np.uint8 | np.uint16] | Non
     """
     image.load()
     clear = image.info.get("transparency")
-    if image.mode == "I;16" and clear is not None:
+    if image.mode in ("I", "I;16") and clear is not None:
         values = np.array(image, np.uint16)
         alpha = np.where(values == clear, 0, 65535).astype(np.uint16)
         return np.stack([values, values, values, alpha], axis=2)
@@ -223,7 +223,7 @@ def _unturned(path: Path) -> bytes | None:
             if struct.unpack_from(f"{order}H", data, value) == (1,):
                 return None
             return data[:value] + struct.pack(f"{order}H", 1) + data[value + 2 :]
-    except struct.error:
+    except (struct.error, OverflowError):
         pass  # damaged, as the decoders will find
     return None
 

@@ -43,6 +43,9 @@ SEGMENTS_FOLDER = "segments"
 VIEWER_PLY = "edited-3dgs.ply"
 """Edited 2D splats as thin 3D ones, for viewers of 3DGS; the command writes it."""
 
+RESULTS = ("source.json", "source.png", "features.png", "edited.ply", VIEWER_PLY, "result.json")
+"""Files beside the manifest."""
+
 FOLDERS = ("views", "masks", "features", "stages", "renders/before", "renders/after")
 
 
@@ -57,12 +60,15 @@ class Folder:
     Attributes:
         path: see there.
         names: file names of the views, without suffix.
+        whole: edits whose record :meth:`edited` removed for a picture beside them. Made again, each
+            has to be the same.
     """
 
     def __init__(
         self, path: Path, cameras: Sequence[Camera], folders: Sequence[str] = FOLDERS
     ) -> None:
         self.path, self.folders = path, folders
+        self.whole: set[str] = set()
         self.names = file_stems(cameras)
 
     def claim(self, manifest: dict[str, Any]) -> None:
@@ -97,7 +103,7 @@ class Folder:
         """
         if self.has(MANIFEST):
             return
-        places = [self.path / "source.json", *(self.path / name for name in self.folders)]
+        places = [self.path / name for name in (*RESULTS, SEGMENTS_FOLDER, *self.folders)]
         files = (
             file for place in places for file in (place.iterdir() if place.is_dir() else [place])
         )
@@ -157,6 +163,8 @@ class Folder:
             return False
         damaged = next((name for name in (picture, *further) if not self.has_picture(name)), None)
         if damaged is not None:
+            if damaged != picture:
+                self.whole.add(picture)
             (self.path / record).unlink()
             warnings.warn(
                 f"{self.path / damaged}: missing or damaged; the view is edited again",

@@ -387,20 +387,28 @@ class _Run:
             _, features = self._shown(source.recording)
             self._principal = Principal(features)
         if stored:
-            pixels = to_bytes(self._composite(view, source.picture))
-            if not np.array_equal(pixels, self.folder.read_picture(file)):
-                raise InputError(
-                    f"{self.folder.path}: the source's edit is not the one in {file}; go on"
-                    " with the same device, number of threads and versions, or name another folder"
-                )
+            self._check_same(file, to_bytes(self._composite(view, source.picture)), "source's edit")
         elif before:
             self._write_view(0, view, source.picture, sight, before)
         else:
             self._write_source(view, source)
         return source
 
+    def _check_same(self, file: str, pixels: Bytes, what: str) -> None:
+        """Refuse an edit that is made again and differs from the one that others rest on."""
+        if not np.array_equal(pixels, self.folder.read_picture(file)):
+            raise InputError(
+                f"{self.folder.path}: the {what} is not the one in {file}; go on with the same"
+                " device, number of threads and versions, or name another folder"
+            )
+
+    def _write_edit(self, file: str, pixels: Bytes) -> None:
+        if file in self.folder.whole:
+            self._check_same(file, pixels, "view's edit")
+        self.folder.write_picture(file, pixels)
+
     def _write_source(self, view: int, source: Source) -> None:
-        self.folder.write_picture("source.png", to_bytes(self._composite(view, source.picture)))
+        self._write_edit("source.png", to_bytes(self._composite(view, source.picture)))
         if source.recording is not None:
             layer, features = self._shown(source.recording)
             size = layer.size(source.recording.plan.latent_size)
@@ -495,7 +503,7 @@ class _Run:
             self.folder.write_picture(
                 f"features/{name}.png", self._warped_features(view, sight, recordings)
             )
-        self.folder.write_picture(f"views/{name}.png", to_bytes(self._composite(view, picture)))
+        self._write_edit(f"views/{name}.png", to_bytes(self._composite(view, picture)))
         # Last: a view counts as edited once this is there.
         self.folder.write_json(f"views/{name}.json", about)
 

@@ -466,6 +466,14 @@ def test_an_edit_leaves_the_files_that_it_is_given_alone(command, option, name, 
     assert done.exit_code == 2
     assert f"{path}: is read, and a result would replace it" in done.stderr
     assert path.read_bytes() == b"a person's own" and list(tmp_path.iterdir()) == [path]
+    # Where a result is written through a link, the file that it leads to is the result's.
+    if option == "--ply":
+        link = tmp_path / "out" / name
+        link.parent.mkdir()
+        link.symlink_to(path)
+        arguments = (data, "--instruction", "make it red", "--out", link.parent, option, path)
+        done = in_process(*command, *arguments)
+        assert done.exit_code == 2 and f"{link}: is read, and a result" in done.stderr
 
 
 def test_views_of_the_same_file_name_do_not_overwrite_each_other(data, tmp_path):

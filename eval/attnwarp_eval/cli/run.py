@@ -202,29 +202,29 @@ def _print_plan(load: Callable[[], Study], out: Path | None) -> None:
     )
     Console().print(terminal(table))
     scenes = f"scenes {', '.join(loaded.scene_names)}; " if loaded.scenes else ""
-    _say_untabled(loaded)
+    _name_untabulated(loaded)
     typer.echo(
         f"study {loaded.name}: {scenes}seeds {', '.join(map(str, loaded.seeds))};"
         f" {len(planned.cells)} cells, {planned.reused} done in {store.root}"
     )
 
 
-def _say_untabled(study: Study) -> None:
+def _name_untabulated(study: Study) -> None:
     """Name the variants that a study measures and its report shows in no table or front."""
     from attnwarp_eval.study.probes import probe
 
-    shown = {(a.probe, name) for a in study.ablations for name in (a.baseline, *a.variants)}
-    shown |= {(front.probe, name) for front in study.fronts for name in front.variants}
-    untabled = {
-        name: [variant for variant in variants if (name, variant) not in shown]
+    tabulated = {(a.probe, name) for a in study.ablations for name in (a.baseline, *a.variants)}
+    tabulated |= {(front.probe, name) for front in study.fronts for name in front.variants}
+    untabulated = {
+        name: [variant for variant in variants if (name, variant) not in tabulated]
         for name, variants in study.probes.items()
-        if probe(name).columns
+        if probe(name).columns and not probe(name).tabulates_all
     }
-    listed = "; ".join(f"{name} of {', '.join(own)}" for name, own in untabled.items() if own)
+    listed = "; ".join(f"{name} of {', '.join(own)}" for name, own in untabulated.items() if own)
     if listed:
         typer.echo(
-            f"in no table of the report: {listed}; a table under 'ablations' shows them,"
-            " results.jsonl has them anyway",
+            f"attnwarp-eval: in no table of the report: {listed}; a table under 'ablations' shows"
+            " them, results.jsonl has them anyway",
             err=True,
         )
 
@@ -272,7 +272,7 @@ def run_study(
         limit_bytes()  # a limit that is no number would make every cell fail
         loaded = load()
         store = Store(out or Path("runs") / loaded.name)
-        _say_untabled(loaded)
+        _name_untabulated(loaded)
         with resumable(lambda: f"{len(store.done())} cells are kept"):
             planned = plan(loaded, store)
             with store.lock():

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Annotated, cast
 
 import typer
 
 from attnwarp_eval.cli.shell import TOO_LITTLE, clear_errors, fail, names, progress, resumable
-
-EXPORTED = re.compile(r"images/orbit_\d+_of_\d+\.png")
-"""Pictures of an export, which hold its cameras' names of ``orbit_name`` (splats/export.py); here
-as ``--help`` imports nothing heavy."""
 
 app = typer.Typer(
     help="The scenes whose truth is known: list them, read one, look at one.", no_args_is_help=True
@@ -117,6 +112,7 @@ def _check_no_capture(folder: Path) -> None:
     import json
 
     from attnwarp.errors import InputError
+    from attnwarp_eval.splats.export import EXPORTED
 
     path = folder / "transforms.json"
     if not path.is_file():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -105,6 +106,10 @@ def orbit(scene: Scene, count: int, size: int | None = None) -> list[Camera]:
                 )
         cameras.append(camera)
     return cameras
+
+
+EXPORTED = re.compile(r"images/orbit_\d+_of_\d+\.png")
+"""Pictures of an export: its cameras' names are of :func:`orbit_name`."""
 
 
 def orbit_name(index: int, count: int) -> str:

@@ -79,6 +79,14 @@ def test_a_tiff_that_asks_to_be_turned_comes_as_it_is_stored(
     assert image_size(path) == (shape[1], shape[0])
 
 
+def test_a_bigtiff_whose_directory_lies_beyond_all_memory_is_refused_in_one_line(tmp_path):
+    path = tmp_path / "a.tif"
+    path.write_bytes(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 2**63 + 5))
+    for read in (read_image, image_size):
+        with pytest.raises(FileFormatError, match=r"a\.tif"):
+            read(path)
+
+
 def test_files_come_as_rgb_in_their_own_depth(tmp_path):
     rgb = np.array([[[60000, 3, 500]]], np.uint16)
     cv2.imwrite(str(tmp_path / "deep.png"), rgb[..., ::-1])

@@ -25,6 +25,7 @@ from attnwarp.editing.schedule import Schedule
 from attnwarp.editing.small import load_editor
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io import FileFormatError, read_image, read_ply
+from attnwarp.io.images import encode_png
 from attnwarp.propagate import preset, propagate
 from attnwarp.propagate import run as run_module
 from attnwarp.propagate.pictures import to_bytes
@@ -537,6 +538,37 @@ def test_pictures_of_where_features_went_are_drawn_again(
     with pytest.warns(InputWarning, match=f"{path.name}: missing or damaged"):
         run(scene, editor, folder)
     assert files(folder) == files(finished[1])
+
+
+def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
+    finished, scene, editor, tmp_path
+):
+    """As with other threads or on another device: the tuned scene rests on the former edit."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    other = np.zeros_like(read_image(folder / "source.png"))
+    for part, place in (("features.png", "source.png"), ("masks", "views")):
+        copy = tmp_path / part
+        shutil.copytree(folder, copy)
+        beside = copy / part if part.endswith(".png") else next((copy / part).glob("*.png"))
+        beside.unlink()
+        path = copy / place if place.endswith(".png") else copy / place / beside.name
+        path.write_bytes(encode_png(other))
+        with (
+            pytest.warns(InputWarning, match="missing or damaged"),
+            pytest.raises(InputError, match="edit is not the one in"),
+        ):
+            run(scene, editor, copy)
+
+
+@pytest.mark.parametrize("name", ["features.png", "edited.ply", "segments/x.png", "views/x.json"])
+def test_a_persons_files_where_results_go_are_left_alone(name, scene, editor, tmp_path):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(b"mine")
+    with pytest.raises(InputError, match=r"has no manifest\.json"):
+        run(scene, editor, tmp_path)
+    assert path.read_bytes() == b"mine"
 
 
 def test_a_folder_of_another_scene_is_refused_by_name(finished, scene, editor):

@@ -139,9 +139,9 @@ def test_a_wrong_study_says_where_and_what_to_do(tmp_path, changes, message):
 @pytest.mark.parametrize(
     ("tables", "expected"),
     [
-        ([], ["in no table of the report: depth of corrected, again, slipped; warp of corrected, again, slipped;"]),
-        ([("warp", ["again", "slipped"])], ["in no table of the report: depth of corrected, again, slipped;"]),
-        ([("warp", ["again"]), ("depth", ["again", "slipped"])], ["in no table of the report: warp of slipped;"]),
+        ([], ["attnwarp-eval: in no table of the report: depth of corrected, again, slipped; warp of corrected, again, slipped;"]),
+        ([("warp", ["again", "slipped"])], ["attnwarp-eval: in no table of the report: depth of corrected, again, slipped;"]),
+        ([("warp", ["again"]), ("depth", ["again", "slipped"])], ["attnwarp-eval: in no table of the report: warp of slipped;"]),
         ([("warp", ["again", "slipped"]), ("depth", ["again", "slipped"])], []),
     ],
 )  # fmt: skip

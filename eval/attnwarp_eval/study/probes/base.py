@@ -147,6 +147,7 @@ class Probe(ABC, Generic[E]):
         main: whether tables of a report speak of it where they name no probe.
         columns: of the table of variants, title -> metric; ``{layer}`` stands for a feature grid.
             Without any, no table of variants can be made of its figures.
+        tabulates_all: whether its own section has every variant, in a study's tables or not.
         contrasts: metrics in which a variant is tested against a baseline.
         times_in_turn: stages of the :class:`InTurn` that its records have.
         stage: of :class:`InTurn`, the one whose seconds its figures cost.
@@ -165,6 +166,7 @@ class Probe(ABC, Generic[E]):
     always: ClassVar[bool] = False
     main: ClassVar[bool] = False
     columns: ClassVar[Mapping[str, str]] = {}
+    tabulates_all: ClassVar[bool] = False
     contrasts: ClassVar[Sequence[str]] = ()
     times_in_turn: ClassVar[Sequence[str]] = ()
     stage: ClassVar[str] = ""

@@ -204,6 +204,7 @@ class EditingProbe(Probe[EditResult]):
     study_part = StudyPart
     variant_part = VariantPart
     metrics = metrics_of("multiview.", "fidelity.", "embedding.", "depth.", "image.")
+    tabulates_all = True
     columns: ClassVar[Mapping[str, str]] = {
         "same answer": "multiview.same_answer.edit",
         "... where the source saw it": "multiview.same_answer.edit_seen",
