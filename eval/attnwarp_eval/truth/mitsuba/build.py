@@ -8,7 +8,7 @@ import math
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from attnwarp_eval.scene.materials import (
     SpotSpec,
 )
 from attnwarp_eval.scene.scene import Scene
-from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Rectangle, Sphere
+from attnwarp_eval.scene.shapes import Box, Mesh, MeshNotice, Rectangle, Shape, Sphere
 from attnwarp_eval.scene.spec import MeshSpec, ObjectSpec, SkySpec, SunSpec
 from attnwarp_eval.scene.textures import Plain, albedo
 from attnwarp_eval.truth.llvm import SCALAR, variant
@@ -74,17 +74,17 @@ def owner_of_number(scene: Scene, world: Any) -> npt.NDArray[np.int64]:
     in the others.
     """
     mi = library()
-    shapes, owners = world.shapes(), _owners(scene)
-    numbers = list(range(1, len(shapes) + 1))
-    if mi.variant() != SCALAR:
+    owners = _owners(scene)
+    # A fog's own box, which comes last, belongs to no object.
+    numbers = list(range(1, len(owners) + 2))
+    if mi.variant() != SCALAR:  # whose shapes must stay unseen, see load_world
         import drjit
 
         numbers = [
             int(np.array(drjit.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0])
-            for shape in shapes
+            for shape in world.shapes()
         ]
     table = np.full(max(numbers) + 1, -1, dtype=np.int64)
-    # A fog's own box, which comes last, belongs to no object.
     table[numbers[: len(owners)]] = owners
     return table
 
@@ -126,6 +126,7 @@ def load_world(
     texel: float | None = None,
     *,
     aims_at_sky: bool = True,
+    unseen: bool = False,
 ) -> tuple[Any, Array, Any]:
     """The loaded Mitsuba scene with some of its lights, the (3,) world position of its origin, and
     the fog or None.
@@ -133,21 +134,13 @@ def load_world(
     Args:
         texel: size of a baked texel in scene units; :func:`texel_size` if left out.
         aims_at_sky: see :class:`~attnwarp_eval.truth.passes.Pass`.
+        unseen: load shapes that Python never sees, for the integrator aov. It counts references to
+            every shape at every sample; for a shape that Python knows each count takes the
+            interpreter's lock, and a picture up to twenty times as long.
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel
     base = (mi.variant(), scene.world_hash, texel, TEXELS)
-    forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
-    shone = {
-        f"light_{k}": _beam(scene, k, center)
-        if narrow
-        else light_form(scene.spec.lights[k], center)
-        for k in lights
-    }
-    if not aims_at_sky:
-        for k in lights:
-            if isinstance(scene.spec.lights[k], SkySpec):
-                shone[f"light_{k}"] |= {"sampling_weight": 0.0}
     # Asked for or not: what is not there does not make another world.
     lamps = lamps and any(item.emission for item in scene.spec.objects)
     media = media and (
@@ -155,6 +148,31 @@ def load_world(
     )
 
     def make() -> tuple[Any, Array, Any]:
+        if not unseen:
+            forms, center, _ = cached(base, lambda: load_shapes(scene, texel))
+            return assembled(forms, center)
+        center = _middle(scene.shapes())
+        with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
+            named = zip(_shapes(scene, center, texel, Path(folder)), _owners(scene), strict=True)
+            return assembled(
+                {
+                    name: (form, owner, functools.partial(dict, form))
+                    for (name, form), owner in named
+                },
+                center,
+            )
+
+    def assembled(forms: dict[str, Form], center: Array) -> tuple[Any, Array, Any]:
+        shone = {
+            f"light_{k}": _beam(scene, k, center)
+            if narrow
+            else light_form(scene.spec.lights[k], center)
+            for k in lights
+        }
+        if not aims_at_sky:
+            for k in lights:
+                if isinstance(scene.spec.lights[k], SkySpec):
+                    shone[f"light_{k}"] |= {"sampling_weight": 0.0}
         shapes: dict[str, Any] = {}
         fog = None
         around: tuple[Array, Array] | None = None
@@ -180,24 +198,22 @@ def load_world(
                 extra["exterior"] = fog
                 if item.material.thin:
                     extra["interior"] = fog
-            shapes[key] = mi.load_dict(form() | extra, optimize=False) if extra else shape
+            shapes[key] = form() | extra if extra else shape
         if fog is not None and around is not None:
             # Last, so that the others' places are those of :func:`_owners`.
             pose = np.diag([*((around[1] - around[0]) / 2), 1.0])
             pose[:3, 3] = (around[0] + around[1]) / 2 - center
-            shapes["medium"] = mi.load_dict(
-                {
-                    "type": "cube",
-                    "to_world": mi.ScalarTransform4f(pose),
-                    "bsdf": {"type": "null"},
-                    "interior": fog,
-                }
-            )
+            shapes["medium"] = {
+                "type": "cube",
+                "to_world": mi.ScalarTransform4f(pose),
+                "bsdf": {"type": "null"},
+                "interior": fog,
+            }
         # optimize=False: the default merges shapes, after which their indices mean something else.
         return mi.load_dict({"type": "scene"} | shapes | shone, optimize=False), center, fog
 
     cameras = scene.spec.cameras.model_dump_json(exclude={"size"}) if media else ""
-    return cached((*base, lights, lamps, media, narrow, cameras, aims_at_sky), make)
+    return cached((*base, lights, lamps, media, narrow, cameras, aims_at_sky, unseen), make)
 
 
 def interior(item: ObjectSpec) -> InteriorSpec | None:
@@ -275,18 +291,15 @@ def forget() -> None:
         sys.modules["drjit"].flush_malloc_cache()
 
 
-def load_shapes(
-    scene: Scene, texel: float
-) -> tuple[dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]], Array, list[tuple[str, str]]]:
-    """Shapes that neither shine nor hold a medium: name -> (shape, object, what it is loaded from);
-    origin; plugins.
-    """
+Form = tuple[Any, int, Callable[[], dict[str, Any]]]
+"""A shape, the index of its object, and what the shape is loaded from."""
+
+
+def load_shapes(scene: Scene, texel: float) -> tuple[dict[str, Form], Array, list[tuple[str, str]]]:
+    """Shapes that neither shine nor hold a medium, by name; origin; plugins."""
     mi = library()
-    shapes = scene.shapes()
-    warn_of_strays(scene, shapes)
-    bounds = np.stack([shape.bounds() for shape in shapes])
-    center = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
-    out: dict[str, tuple[Any, int, Callable[[], dict[str, Any]]]] = {}
+    center = _middle(scene.shapes())
+    out: dict[str, Form] = {}
     plugins: list[tuple[str, str]] = []
     with tempfile.TemporaryDirectory(prefix="attnwarp-") as folder:
         for (name, form), owner in zip(
@@ -306,6 +319,13 @@ def load_shapes(
     return out, center, plugins
 
 
+def _middle(shapes: Sequence[Shape]) -> Array:
+    """(3,) middle of the bounding box, in world coordinates; the origin of what is loaded."""
+    bounds = np.stack([shape.bounds() for shape in shapes])
+    middle: Array = (bounds[:, 0].min(0) + bounds[:, 1].max(0)) / 2
+    return middle
+
+
 def _faces(scene: Scene) -> Iterator[Sphere | Rectangle | Mesh]:
     for shape in scene.shapes():
         if isinstance(shape, Box):
@@ -322,6 +342,7 @@ def _shapes(
     scene: Scene, center: Array, texel: float, folder: Path
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     mi = library()
+    warn_of_strays(scene, scene.shapes())
     for index, shape in enumerate(_faces(scene)):
         item = scene.spec.objects[shape.object_id]
         texture = item.texture

@@ -90,7 +90,13 @@ def _render_passes(scene: Scene, camera: Camera, plan: Plan, seed: int) -> Image
             # Lamps, seen directly, are the other pass's.
             options |= {"hide_emitters": True}
         world, center, fog = load_world(
-            scene, step.lights, step.lamps, plan.media, step.beam, aims_at_sky=step.aims_at_sky
+            scene,
+            step.lights,
+            step.lamps,
+            plan.media,
+            step.beam,
+            aims_at_sky=step.aims_at_sky,
+            unseen=step.first != "any",
         )
         pass_seed = len(plan.passes) * int(seed) + number
         if step.first != "any":
@@ -178,7 +184,7 @@ def position_and_shape(scene: Scene, camera: Camera) -> tuple[Array, npt.NDArray
     """
     mi = library(variant())
     # Textures show in no position: of the fewest texels.
-    world, center, _ = load_world(scene, (), False, False, texel=math.inf)
+    world, center, _ = load_world(scene, (), False, False, texel=math.inf, unseen=True)
     integrator = mi.load_dict({"type": "aov", "aovs": "position:position,shape:shape_index"})
     # One sample in the middle of each pixel: stratified without jitter. Averaged positions would
     # lie nowhere.
