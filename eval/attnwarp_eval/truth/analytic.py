@@ -1,4 +1,4 @@
-"""Closed-form ray tracing of spheres and rectangles in float64."""
+"""Closed-form ray tracing of spheres, rectangles and known triangles in float64."""
 
 from __future__ import annotations
 
@@ -79,3 +79,56 @@ def nearest_hit(
         t_out[i] = best
         index[i] = which
     return t_out, index
+
+
+NO_TRIANGLE = 0xFFFFFFFF
+"""Open3D's INVALID_ID."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def meet_triangles(
+    t: Array,
+    index: npt.NDArray[np.int64],
+    face: npt.NDArray[np.uint32],
+    rough: npt.NDArray[np.float32],
+    origins: Array,
+    directions: Array,
+    normals: Array,
+    corners: Array,
+    limit: float,
+) -> None:
+    """Put the triangles that another tracer found among the first hits, in place.
+
+    Where a ray meets the plane of its triangle is computed in float64.
+
+    Args:
+        t, index: (N,) as :func:`nearest_hit` returns them. Where a triangle is nearer they become
+            its own; the indices of all others grow by the number of triangles.
+        face: (N,) the triangle that each ray meets first, or :data:`NO_TRIANGLE`.
+        rough: (N,) the other tracer's distance to it, in units of the direction's length.
+        origins, directions: (N, 3) of the rays.
+        normals, corners: (T, 3) a plane for each triangle.
+        limit: the plane's distance is taken if it differs from ``rough`` by at most this share of
+            it, else ``rough`` is.
+    """
+    for i in range(len(t)):
+        if index[i] >= 0:
+            index[i] += len(normals)
+        f = face[i]
+        if f == NO_TRIANGLE:
+            continue
+        distance = np.float64(rough[i])
+        # In the order in which numpy.einsum adds three products.
+        above = (
+            normals[f, 0] * (corners[f, 0] - origins[i, 0])
+            + normals[f, 2] * (corners[f, 2] - origins[i, 2])
+        ) + normals[f, 1] * (corners[f, 1] - origins[i, 1])
+        along = (normals[f, 0] * directions[i, 0] + normals[f, 2] * directions[i, 2]) + normals[
+            f, 1
+        ] * directions[i, 1]
+        exact = above / along
+        if abs(exact - distance) <= limit * distance:
+            distance = exact
+        if distance < t[i]:
+            t[i] = distance
+            index[i] = f

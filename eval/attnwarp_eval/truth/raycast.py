@@ -19,7 +19,7 @@ from attnwarp_eval._open3d import open3d
 from attnwarp_eval.scene.extent import warn_of_strays
 from attnwarp_eval.scene.scene import Scene
 from attnwarp_eval.scene.shapes import Box, Mesh, Rectangle, Shape, Sphere
-from attnwarp_eval.truth.analytic import nearest_hit
+from attnwarp_eval.truth.analytic import meet_triangles, nearest_hit
 from attnwarp_eval.two_view import Hits
 
 Array = npt.NDArray[np.float64]
@@ -33,8 +33,6 @@ together than this along a ray count as one."""
 REFINEMENT_LIMIT = 1e-3
 """Refinement may move a hit by this share of its distance. More happens only where the plane is
 seen edge on, and there Open3D's own answer is the better one."""
-
-MISS = 0xFFFFFFFF  # Open3D's INVALID_ID
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +83,8 @@ class Geometry:
         ((32, 32), 'ground')
     """
 
+    refinement_limit = REFINEMENT_LIMIT
+
     def __init__(self, scene: Scene | Sequence[Shape]) -> None:
         shapes = list(scene) if isinstance(scene, Sequence) else scene.shapes()
         if not shapes:
@@ -124,7 +124,7 @@ class Geometry:
         corners = self._vertices[self._faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self._face_normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        self._face_corner = corners[:, 0]
+        self._face_corner = np.ascontiguousarray(corners[:, 0])
         self._object = np.concatenate(
             [np.full(len(m.faces), m.object_id, np.int32) for m in meshes]
             + [
@@ -304,37 +304,24 @@ class Geometry:
 
     def _cast(self, origins: Array, directions: Array) -> tuple[Array, npt.NDArray[np.int64]]:
         """Nearest hits of rays in local coordinates: t (infinite on a miss) and primitive (-1)."""
-        n_faces = len(self._faces)
-        t, primitive = nearest_hit(
-            np.ascontiguousarray(origins),
-            np.ascontiguousarray(directions),
-            self._spheres,
-            self._rectangles,
-        )
-        primitive = np.where(primitive >= 0, primitive + n_faces, -1)
+        origins, directions = np.ascontiguousarray(origins), np.ascontiguousarray(directions)
+        t, primitive = nearest_hit(origins, directions, self._spheres, self._rectangles)
         if self._embree is None:
             return t, primitive
         rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
         answer = self._embree.cast_rays(self._o3d.core.Tensor(rays))
-        face = answer["primitive_ids"].numpy().astype(np.int64)
-        rough = answer["t_hit"].numpy().astype(np.float64)
-        hit = np.flatnonzero(face != MISS)
-        face, rough = face[hit], rough[hit]
-        refined = self._refined(rough, face, origins[hit], directions[hit])
-        nearer = refined < t[hit]
-        t[hit[nearer]] = refined[nearer]
-        primitive[hit[nearer]] = face[nearer]
+        meet_triangles(
+            t,
+            primitive,
+            answer["primitive_ids"].numpy(),
+            answer["t_hit"].numpy(),
+            origins,
+            directions,
+            self._face_normal,
+            self._face_corner,
+            self.refinement_limit,
+        )
         return t, primitive
-
-    def _refined(
-        self, rough: Array, face: npt.NDArray[np.int64], origins: Array, directions: Array
-    ) -> Array:
-        """Where rays meet the planes of the triangles that Open3D found, in float64."""
-        normal = self._face_normal[face]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            exact = np.einsum("ij,ij->i", normal, self._face_corner[face] - origins)
-            exact /= np.einsum("ij,ij->i", normal, directions)
-            return np.where(np.abs(exact - rough) <= REFINEMENT_LIMIT * rough, exact, rough)
 
     def _normal(self, primitive: npt.NDArray[np.int64], points: Array) -> Array:
         """(N, 3) unit geometric normals of either sign at ``points`` on ``primitive``; NaN for

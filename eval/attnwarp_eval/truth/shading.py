@@ -232,13 +232,14 @@ def buried(
     """
     left = np.arange(len(points))
     for start in range(0, rays, 8):
-        # Most points are out in the open: eight directions at a time leave few of them for the next
-        # eight.
+        # Most points are out in the open: the first direction leaves few of them for the next.
         asked = left
         open_ = np.zeros(len(asked), dtype=bool)
         for direction in hemisphere(normals[asked], 8, start * 0.0477):
-            eyes = points[asked] + 2 * geometry.extent * direction
-            open_ |= geometry.reached(eyes, points[asked], primitive_id[asked])
+            shut = np.flatnonzero(~open_)
+            point = points[asked[shut]]
+            eyes = point + 2 * geometry.extent * direction[shut]
+            open_[shut] = geometry.reached(eyes, point, primitive_id[asked[shut]])
         left = asked[~open_]
     out = np.zeros(len(points), dtype=bool)
     out[left] = True

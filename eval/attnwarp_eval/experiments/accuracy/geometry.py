@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numba
 import numpy as np
@@ -98,8 +97,7 @@ def depth(
     class Unrefined(Geometry):
         """Open3D's own hits, in the recentred and rescaled world."""
 
-        def _refined(self, rough: Array, *_: Any) -> Array:
-            return rough
+        refinement_limit = 0.0
 
     meshes = triangles(scene)
     camera = scene.with_size(size, size).source

@@ -43,6 +43,9 @@ Array = npt.NDArray[np.float64]
 TEXELS = 2048
 """Most texels along the longer side of a baked texture."""
 
+AT_ONCE = 1 << 14
+"""Texels that are baked at a time, so that what is computed of them stays in a core's cache."""
+
 SKY_ROWS = 256
 """Rows of the map that carries the sky's ramp; the ramp is linear in the sine of the elevation, so
 few would do.
@@ -187,8 +190,9 @@ def load_world(
                     "type": "area",
                     "radiance": _rgb(item.emission.radiance, item.emission.color),
                 }
-            if media and interior(item):
-                extra["interior"] = medium_form(item.material.interior)
+            inside = interior(item)
+            if media and inside:
+                extra["interior"] = medium_form(inside)
             if (
                 fog is not None
                 and isinstance(item.material, GlassMaterial)
@@ -352,7 +356,9 @@ def _shapes(
             if isinstance(texture, Plain) and not texture.variation:
                 color[:] = albedo(texture, points[0, :1])  # one colour for millions of texels
             else:
-                color[:] = albedo(texture, points.reshape(-1, 3)).reshape(points.shape)
+                texels, colors = points.reshape(-1, 3), color.reshape(-1, 3)
+                for some in range(0, len(texels), AT_ONCE):
+                    colors[some : some + AT_ONCE] = albedo(texture, texels[some : some + AT_ONCE])
             bitmap = mi.Bitmap(color)
             return {
                 "type": "bitmap",
