@@ -46,11 +46,13 @@ def endpoint_error(
     estimate = floats(xy, truth.shape, "xy")
     visible_pixels = mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
-    if not np.isfinite(truth[visible_pixels]).all():
+    seen = np.flatnonzero(visible_pixels)
+    exact = truth.reshape(-1, 2)[seen]
+    if not np.isfinite(exact).all():
         raise ValueError(
             "true_xy: not finite in a visible pixel; positions and labels do not belong together"
         )
-    offset = (estimate - truth)[visible_pixels]
+    offset = estimate.reshape(-1, 2)[seen] - exact
     layer = np.hypot(offset[:, 0], offset[:, 1])
     unit = np.broadcast_to(np.asarray(image_px, dtype=np.float64), (2,))
     one = bool((unit == 1).all())
@@ -58,7 +60,7 @@ def endpoint_error(
     defined = np.isfinite(layer)
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
-        inside = region[visible_pixels]
+        inside = region.ravel()[seen]
         total = int(inside.sum())
         among = inside & defined
         px = image[among]
@@ -112,9 +114,12 @@ def feature_error(
     estimate = floats(warped, truth.shape, "warped")
     passed, visible_pixels = mask(accepted, shape, "accepted"), mask(visible, shape, "visible")
     band = None if edge is None else mask(edge, shape, "edge")
-    surface = np.isfinite(truth).all(axis=0)
-    square = ((estimate - truth) ** 2).sum(axis=0)
-    power = (truth**2).sum(axis=0)
+    surface = np.ones(shape, dtype=bool)
+    square, power = np.zeros(shape), np.zeros(shape)
+    for ours, true in zip(estimate, truth, strict=True):  # by channels, which fit in a cache
+        surface &= np.isfinite(true)
+        square += (ours - true) ** 2
+        power += true**2
     figures: dict[str, float] = {}
     for suffix, region in regions(band, shape).items():
         groups = {
@@ -123,10 +128,10 @@ def feature_error(
             "all_accepted": passed & surface,
         }
         for name, group in groups.items():
-            among = group & region
-            total = float(power[among].sum())
+            among = np.flatnonzero(group & region)
+            total = float(power.ravel()[among].sum())
             figures[f"warp.feature_{name}{suffix}"] = (
-                float(np.sqrt(square[among].sum() / total)) if total > 0 else float("nan")
+                float(np.sqrt(square.ravel()[among].sum() / total)) if total > 0 else float("nan")
             )
         figures[f"warp.feature_pixels{suffix}"] = int((passed & visible_pixels & region).sum())
     return figures
