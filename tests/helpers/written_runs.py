@@ -40,10 +40,10 @@ def record(views, *, spec=None, environment=ENVIRONMENT, cost=None, **extra):
     }
 
 
-def outcome(kind, scene, variants, data, cell_id=""):
+def outcome(kind, scene, variants, data, cell_id="", seed=0):
     """An expected cell of probe ``kind``; ``data`` is its record's JSON or None."""
     typed = None if data is None else probe(kind).read(data)
-    return Outcome(cell_id or f"{kind}-{scene}", kind, scene, tuple(variants), kind, 0, typed)
+    return Outcome(cell_id or f"{kind}-{scene}", kind, scene, tuple(variants), kind, seed, typed)
 
 
 def results(study, cells):

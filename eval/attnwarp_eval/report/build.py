@@ -12,6 +12,7 @@ from attnwarp_eval.report.findings import findings
 from attnwarp_eval.report.fronts import fronts
 from attnwarp_eval.report.galleries import galleries
 from attnwarp_eval.report.measured import failures, measured
+from attnwarp_eval.report.settling import settling
 from attnwarp_eval.study.probes import probes
 from attnwarp_eval.study.probes.base import Layout, Place
 from attnwarp_eval.study.results import Results
@@ -64,7 +65,7 @@ def build(results: Results, root: Path, *, timings: bool = True, pictures: bool 
         for place, section in probe.sections(results, layout):
             of_probes[place].append(section)
     sections = [
-        *([claims(results)] if study.scenes else []),
+        *([claims(results), *settling(results, timings)] if study.scenes else []),
         *(galleries(results) if pictures else []),
         *of_probes[Place.INSTRUMENT],
         *ablations(results),

@@ -22,6 +22,7 @@ from attnwarp_eval.statistics.intervals import (
     interval,
     paired,
 )
+from attnwarp_eval.statistics.planning import Parts, parts
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.study import parse_variant
@@ -138,6 +139,8 @@ class JudgedClaim:
     """Of the contrast, adjusted over the claims."""
     below_floor: tuple[str, ...] = ()
     """Scenes in which both sides disagree less than true views do."""
+    parts: Parts | None = None
+    """What the contrast's spread between scenes is made of."""
 
 
 Comparison = tuple[str, str, frozenset[str]]
@@ -213,6 +216,7 @@ def judge(results: Results, claims: list[Claim]) -> list[JudgedClaim]:
             _in_general(claim, contrast, p),
             p,
             _below_floor(m),
+            parts(m.a, m.b),
         )
         for (claim, m), contrast, p in zip(measurements, contrasts, adjusted, strict=True)
         if contrast.views

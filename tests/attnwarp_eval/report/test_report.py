@@ -18,6 +18,7 @@ from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
 from attnwarp_eval.report.fronts import fronts
+from attnwarp_eval.report.settling import settling
 from attnwarp_eval.statistics.intervals import interval
 from attnwarp_eval.study.edit_truth import EditTruth, Judgement
 from attnwarp_eval.study.probes import probe
@@ -246,6 +247,75 @@ def test_a_claim_that_only_some_scenes_show_is_mixed_and_cannot_be_told():
         results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]}), [SLIP_CLAIM]
     )
     assert (finding.here, finding.verdict, finding.agreement) == ("mixed", "can't tell", (2, 3))
+
+
+def test_what_would_settle_a_claim_is_worked_out_from_the_scenes_differences():
+    """Oracle: scipy's power of the t test for the number shown, and for one scene less."""
+    differences = [0.5, -0.05, 0.6]
+    run = results({"good": [[0.1]] * 3, "slipped": [[0.1 + d] for d in differences]})
+    (section,) = settling(run)
+    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
+    needed, fewest, most = re.fullmatch(r"(\d+) \((\d+) to (.+)\)", row["scenes needed"]).groups()
+    needed, effect = int(needed), np.mean(differences) / np.std(differences, ddof=1)
+
+    def power(scenes):
+        beyond = stats.t.ppf(0.975, scenes - 1)
+        return stats.nct.sf(beyond, scenes - 1, effect * math.sqrt(scenes))
+
+    assert power(needed) >= 0.8 > power(needed - 1)
+    assert int(fewest) < needed
+    # An effect that may be 0: the observed t is within the middle 80 % of Student's t, or it is not.
+    assert (most == "over 1000") == (stats.t.cdf(effect * math.sqrt(3), 2) < 0.9)
+    assert row["scenes"] == "3"
+    assert "share of seeds" not in row
+    assert "hours" not in section.tables[0].without_timings().columns
+    # A claim with a verdict needs nothing.
+    assert settling(results(CLEAR)) == []
+
+
+def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_others_contain():
+    def cell(scene, value, variant, seconds):
+        data = written_runs.record(
+            [("v0", 0.0, {SLIP: value})], cost={"seconds": seconds, "counters": {}}
+        )
+        return written_runs.outcome("warp", scene, [variant], data, f"{variant}-{scene}")
+
+    seconds = {"truth": 3000.0, "whole": 600.0, "method: edit": 500.0, "warm": 9.0, "steady": None}
+    cells = [cell(scene, 0.1, "good", seconds) for scene in SCENES]
+    cells += [
+        cell(scene, 0.1 + d, "slipped", {"truth": 0.0})
+        for scene, d in zip(SCENES, [0.5, -0.05, 0.6], strict=True)
+    ]
+    (section,) = settling(written_runs.results(study(), cells))
+    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
+    assert row["hours"] == row["scenes needed"].split()[0]  # 3600 s a scene
+    assert "1.00 a scene as here" in section.text[1]
+
+
+def test_the_share_of_seeds_and_the_narrower_interval_are_shown_where_scenes_have_several():
+    """Oracle: variances by hand. Scenes differ by 0.6, 0, 0.6; seeds of a scene by 0.2 about it."""
+    cells = [
+        written_runs.outcome(
+            "warp",
+            scene,
+            [variant],
+            written_runs.record(
+                [("v0", 0.0, {SLIP: value})], cost={"seconds": {"truth": 1.0}, "counters": {}}
+            ),
+            f"{variant}-{scene}-{seed}",
+            seed=seed,
+        )
+        for seed, sign in ((0, -1), (1, 1))
+        for scene, middle in zip(SCENES, [0.6, 0.0, 0.6], strict=True)
+        for variant, value in (("good", 0.1), ("slipped", 0.1 + middle + 0.2 * sign))
+    ]
+    (section,) = settling(written_runs.results(study(seeds=[0, 1]), cells))
+    row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
+    between, within = np.var([0.6, 0.0, 0.6], ddof=1), np.var([-0.2, 0.2], ddof=1) / 2
+    assert row["share of seeds"] == f"{100 * within / between:.0f} %"  # 33 %
+    half = stats.t.ppf(0.975, 2) * math.sqrt(between / 3)
+    narrower = half * math.sqrt(1 - within / between / 2)
+    assert float(row["± with as many seeds again"]) == pytest.approx(narrower, rel=0.05)
 
 
 def test_a_claim_about_the_editors_working_needs_every_editor_to_agree():

@@ -1,0 +1,187 @@
+"""How much must be measured before a difference can be told: more scenes, or more seeds? Pure
+functions: numbers in, numbers out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from attnwarp_eval.statistics.intervals import ByView
+
+MOST_SCENES = 1000
+"""Where :func:`scenes_needed` stops counting."""
+
+
+def scenes_needed(mean: float, deviation: float, *, power: float = 0.8, level: float = 0.95) -> int:
+    """The fewest scenes with which a paired test would tell a difference from 0.
+
+    The test is Student's t, two-sided. Its power follows the noncentral t distribution (Cohen 1988,
+    Statistical Power Analysis for the Behavioral Sciences, ch. 2).
+
+    Args:
+        mean: the true difference.
+        deviation: the standard deviation of the scenes' true differences, >= 0.
+        power: the probability that the test tells, in (0, 1).
+        level: 1 minus the rate at which it tells where nothing is, in (0, 1).
+
+    Returns:
+        At least 2; :data:`MOST_SCENES` + 1 where more than those are needed.
+
+    Raises:
+        ValueError: a number that is not finite, or a negative deviation.
+
+    Example:
+        >>> scenes_needed(0.8, 1.0), scenes_needed(0.5, 1.0)  # Cohen's large and medium effects
+        (15, 34)
+    """
+    if not (math.isfinite(mean) and math.isfinite(deviation) and deviation >= 0):
+        raise ValueError(
+            f"mean, deviation: got {mean} and {deviation}, expected finite numbers and no negative"
+            " deviation"
+        )
+    low, high = 2, MOST_SCENES + 1  # more scenes never tell less
+    while low < high:
+        middle = (low + high) // 2
+        if _power(abs(mean), deviation, middle, level) >= power:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+def _power(mean: float, deviation: float, scenes: int, level: float) -> float:
+    from scipy import stats
+
+    if deviation == 0:
+        return float(mean > 0)
+    beyond = float(stats.t.ppf(0.5 + level / 2, scenes - 1))
+    return 1 - _noncentral(beyond, scenes - 1, mean / deviation * math.sqrt(scenes))
+
+
+def _noncentral(t: float, free: int, shift: float) -> float:
+    """The distribution function of a noncentral t with ``free`` degrees of freedom.
+
+    That of (normal + shift) / sqrt(chi^2 / free), averaged over quantiles of the latter: within
+    1e-4, and defined for every shift, where scipy's has no value for large ones.
+    """
+    from scipy import special
+
+    return float(special.ndtr(t * _roots(free) - shift).mean())
+
+
+@lru_cache(maxsize=64)
+def _roots(free: int) -> npt.NDArray[np.float64]:
+    from scipy import stats
+
+    quantiles = (np.arange(2000) + 0.5) / 2000
+    roots: npt.NDArray[np.float64] = np.sqrt(stats.chi2.ppf(quantiles, free) / free)
+    return roots
+
+
+def effect_interval(
+    mean: float, deviation: float, scenes: int, *, level: float = 0.8
+) -> tuple[float, float]:
+    """Within which bounds the true mean over the true deviation may lie.
+
+    The noncentral t distributions under which the observed t would be at either end (Steiger &
+    Fouladi 1997, "Noncentrality interval estimation and the evaluation of statistical models").
+
+    Args:
+        mean, deviation: of the scenes' differences, as observed; the deviation > 0.
+        scenes: how many, at least 2.
+        level: coverage, in (0, 1).
+
+    Returns:
+        The bounds, lower first.
+
+    Example:
+        >>> [round(bound, 2) for bound in effect_interval(1.0, 1.0, 6)]
+        [0.3, 1.61]
+    """
+    from scipy import optimize
+
+    observed = mean / deviation * math.sqrt(scenes)
+    reach = 10 + 5 * abs(observed)  # no root of a chi^2 over its mean is 5 within these quantiles
+
+    def bound(share: float) -> float:
+        def missed(shift: float) -> float:
+            return _noncentral(observed, scenes - 1, shift) - share
+
+        return float(optimize.brentq(missed, -reach, reach)) / math.sqrt(scenes)
+
+    return bound(0.5 + level / 2), bound(0.5 - level / 2)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What the spread of a difference between scenes is made of.
+
+    Attributes:
+        scenes: standard deviation of the scenes' means.
+        seeds: how many seeds a scene has, in the mean.
+        share: of that deviation's square, what seeds add by being few, in [0, 1]. NaN with one
+            seed.
+
+    Example:
+        >>> round(Parts(2.0, 2, 0.5).with_seeds(4) ** 2, 9)  # of 4, seeds had 2 and now have 1
+        3.0
+    """
+
+    scenes: float
+    seeds: float
+    share: float
+
+    def with_seeds(self, seeds: float) -> float:
+        """The standard deviation of the scenes' means, had they ``seeds`` seeds each."""
+        return self.scenes * math.sqrt(1 - self.share + self.share * self.seeds / seeds)
+
+
+def parts(a: ByView, b: ByView) -> Parts:
+    """Split the spread of b - a between scenes into that of scenes and that of their seeds.
+
+    A scene's mean over few seeds misses its mean over all seeds. The variance of that, estimated
+    from the differences between seeds of one scene, is part of what scenes differ by: the usual
+    estimate of variance components (Searle, Casella & McCulloch 1992, Variance Components, ch. 3).
+
+    Args:
+        a, b: scene -> "view/seed" -> value. Only views that both have count.
+
+    Returns:
+        NaN for the deviation of fewer than two scenes, and for the share where no scene has two
+        seeds.
+
+    Example:
+        >>> zero = {s: {"v/0": 0.0, "v/1": 0.0} for s in ("bear", "fence")}
+        >>> split = parts(zero, {"bear": {"v/0": 1.0, "v/1": 3.0}, "fence": {"v/0": 5, "v/1": 7}})
+        >>> split.seeds, round(split.share, 3)  # 2 / 2 of 8
+        (2.0, 0.125)
+    """
+    by_seed = [scene for scene in _differences(a, b) if scene]
+    if len(by_seed) < 2:
+        return Parts(math.nan, math.nan, math.nan)
+    means = [np.mean(np.concatenate(list(seeds.values()))) for seeds in by_seed]
+    deviation = float(np.std(means, ddof=1))
+    seeds = float(np.mean([len(seeds) for seeds in by_seed]))
+    several = [[np.mean(own) for own in seeds.values()] for seeds in by_seed if len(seeds) > 1]
+    if not several or deviation == 0:
+        return Parts(deviation, seeds, math.nan)
+    within = float(np.mean([np.var(own, ddof=1) / len(own) for own in several]))
+    return Parts(deviation, seeds, min(1.0, within / deviation**2))
+
+
+def _differences(a: ByView, b: ByView) -> list[dict[str, list[float]]]:
+    """For each scene the differences of its views, by seed."""
+    scenes = []
+    for scene in sorted(set(a) & set(b)):
+        seeds: dict[str, list[float]] = {}
+        for key in sorted(a[scene].keys() & b[scene].keys()):
+            difference = b[scene][key] - a[scene][key]
+            if math.isfinite(difference):
+                seeds.setdefault(key.rpartition("/")[2], []).append(difference)
+        scenes.append(seeds)
+    return scenes
