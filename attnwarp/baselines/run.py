@@ -32,7 +32,7 @@ from attnwarp.editing.editor import Editor
 from attnwarp.editing.schedule import START_PROTOCOL
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
-from attnwarp.propagate.folder import Folder, record_of
+from attnwarp.propagate.folder import Folder
 from attnwarp.propagate.pictures import Bytes, enlarged, full_size, resized, to_bytes
 from attnwarp.propagate.progress import Step
 from attnwarp.propagate.scene import (
@@ -285,7 +285,7 @@ class _Run:
                 self.folder.write_picture(self._picture(number, view), pixels)
                 about = {"view": self.names[view], "round": number + 1, **edit.about}
                 # Last: a view counts as edited once this is there.
-                self.folder.write_json(record_of(self._picture(number, view)), about)
+                self.folder.write_record(self._picture(number, view), about)
         self.times.write()
 
     def _picture(self, number: int, view: int) -> str:

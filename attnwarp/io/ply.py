@@ -183,7 +183,8 @@ def write_ply(
         tolerance: share of a splat's largest scale by which rounding may move it.
 
     Warns:
-        InputWarning: "auto" writes an origin, or "world" moves splats by more than ``tolerance``.
+        InputWarning: "auto" writes an origin, "world" moves splats by more than ``tolerance``, or
+            ``third_scale`` is longer than every splat.
 
     Raises:
         ValueError: a value of ``gaussians`` is out of range (not finite, a zero quaternion),
@@ -215,6 +216,13 @@ def write_ply(
         if not (np.isfinite(third_scale) and third_scale > 0):
             raise ValueError(
                 f"third_scale: got {third_scale}, expected a positive length such as {THIRD_SCALE}"
+            )
+        if len(g) and third_scale > scales.max():
+            warnings.warn(
+                f"{path}: third_scale {third_scale:g} is longer than every splat"
+                f" ({scales.max():.3g} at most), so viewers show needles; {THIRD_SCALE} is usual",
+                InputWarning,
+                stacklevel=2,
             )
         scales = np.concatenate([scales, np.full((len(g), 1), third_scale)], axis=1)
     origin, means = _place(Path(path), original, coordinates, tolerance)

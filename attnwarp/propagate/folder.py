@@ -14,6 +14,7 @@ times.json               seconds by part, over all sittings
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -145,11 +146,18 @@ class Folder:
         """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
         return read_image(self.path / name)
 
+    def write_record(self, picture: str, about: dict[str, Any]) -> None:
+        """Write what an edit was, with the hash of its picture, which is there already: by this
+        record the view counts as edited.
+        """
+        sha256 = hashlib.sha256((self.path / picture).read_bytes()).hexdigest()
+        self.write_json(record_of(picture), {**about, "sha256": sha256})
+
     def edited(self, picture: str, *further: str) -> bool:
         """Whether a view is edited: beside its picture stands a record, NAME.json.
 
-        A picture that is missing or damaged all the same leaves no edit. Its record is removed,
-        so that the view is edited again.
+        A picture that is missing, damaged or another one all the same leaves no edit. Its record is
+        removed, so that the view is edited again.
 
         Args:
             picture: of the edit.
@@ -162,17 +170,26 @@ class Folder:
         if not self.has(record):
             return False
         damaged = next((name for name in (picture, *further) if not self.has_picture(name)), None)
+        what = "missing or damaged"
+        if damaged != picture and not self._is_own(picture):
+            damaged, what = picture, "not the picture that the edit made"
         if damaged is not None:
             if damaged != picture:
                 self.whole.add(picture)
             (self.path / record).unlink()
             warnings.warn(
-                f"{self.path / damaged}: missing or damaged; the view is edited again",
+                f"{self.path / damaged}: {what}; the view is edited again",
                 InputWarning,
                 stacklevel=2,
             )
             return False
         return True
+
+    def _is_own(self, picture: str) -> bool:
+        """Whether a picture is the one that its record names; those of former code name none."""
+        sha256 = self.read_json(record_of(picture)).get("sha256")
+        data = (self.path / picture).read_bytes()
+        return sha256 is None or sha256 == hashlib.sha256(data).hexdigest()
 
     def has_picture(self, name: str) -> bool:
         """Whether a picture is there and can be read: a disk or a person may have damaged it."""

@@ -415,8 +415,8 @@ class _Run:
             picture = self._principal.picture(features, size)
             shape = self.scene.images[view].shape
             self.folder.write_picture("features.png", enlarged(picture, (shape[0], shape[1])))
-        self.folder.write_json(
-            "source.json",
+        self.folder.write_record(
+            "source.png",
             {
                 "view": self.names[view],
                 "branches": list(source.branches),
@@ -505,7 +505,7 @@ class _Run:
             )
         self._write_edit(f"views/{name}.png", to_bytes(self._composite(view, picture)))
         # Last: a view counts as edited once this is there.
-        self.folder.write_json(f"views/{name}.json", about)
+        self.folder.write_record(f"views/{name}.png", about)
 
     def _warped_features(self, view: int, sight: Sight, recordings: Sequence[Recording]) -> Bytes:
         h, w = (side // self.editor.factor for side in self.sizes[view])

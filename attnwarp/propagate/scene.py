@@ -147,9 +147,10 @@ def render_picture(gaussians: Gaussians, camera: Camera, near: float, backend: s
 
 def editor_digest(editor: Any) -> str:
     """SHA-256 of an editor's networks, schedule and guidance."""
-    parts: list[Any] = [type(editor).__name__]
-    for name in ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt"):
-        parts.append(getattr(editor, name, None))
+    settings = ("text_guidance", "image_guidance", "guidance", "control_scale", "negative_prompt")
+    # One list: numbers one after another could be read as others, 1.5 and 12 as 1.51 and 2.
+    values = [type(editor).__name__, *(getattr(editor, name, None) for name in settings)]
+    parts: list[Any] = [values]
     parts += [editor.schedule.prediction, editor.schedule.alphas.cpu().numpy()]
     for name in ("unet", "vae", "text_encoder", "controlnet"):
         network = getattr(editor, name, None)

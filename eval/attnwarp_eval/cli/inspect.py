@@ -205,7 +205,7 @@ def _report(pair: Pair, layer: tuple[int, int] | None, place: tuple[int, int]) -
             return report(pair, *place)
         return cell_report(pair, layer, *cell_of(pair, layer, *place))
     except ValueError as error:
-        raise InputError(f"--pixel: {error}") from None
+        raise InputError(f"--pixel: {str(error).removeprefix('pixel: ')}") from None
 
 
 def _layer(text: str | None, pair: Pair) -> tuple[int, int] | None:

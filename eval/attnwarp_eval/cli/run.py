@@ -423,7 +423,8 @@ def verify(run: Annotated[Path, typer.Argument(help="The run's folder.")]) -> No
     if not problems.ok:
         bad = len(problems.damaged) + len(problems.failed) + len(problems.missing)
         raise fail(
-            f"{run}: {bad} problems in {problems.checked} cells; run the study again to recompute"
+            f"{run}: {bad} problem{'s' * (bad != 1)} in {problems.checked}"
+            f" cell{'s' * (problems.checked != 1)}; run the study again to recompute"
             " them",
             TOO_LITTLE,
         )

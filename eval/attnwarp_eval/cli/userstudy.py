@@ -78,12 +78,15 @@ def score(
 
     from rich.console import Console
 
+    from attnwarp.cli.shell import check_out
     from attnwarp_eval.document import write
     from attnwarp_eval.files import write_atomic
     from attnwarp_eval.userstudy.answers import read_answers
     from attnwarp_eval.userstudy.score import report, score
 
     with clear_errors():
+        if out is not None:
+            check_out(out)
         people, notes = read_answers(answers)
         try:
             result = score(people)

@@ -118,9 +118,10 @@ def report(result: Score) -> Report:
     """The score as a document."""
     counted = [p for p in result.people if p.name not in result.failed and p.choices]
     whole = result.preferences[OVERALL]
+    made = sum(len(p.choices) for p in counted)
     lead = [
-        f"{len(counted)} people made {sum(len(p.choices) for p in counted)} choices between"
-        f" {len(whole.methods)} methods."
+        f"{len(counted)} {'person' if len(counted) == 1 else 'people'} made {made}"
+        f" choice{'s' * (made != 1)} between {len(whole.methods)} methods."
     ]
     if result.failed:
         lead.append(f"**Left out, as they failed an attention check: {', '.join(result.failed)}.**")

@@ -286,6 +286,14 @@ def test_a_comment_makes_three_scales_2d_and_the_third_is_dropped_whatever_it_is
     assert g.kind == "2d" and g.scales.shape == (4, 2)
 
 
+def test_a_third_scale_longer_than_every_splat_is_warned_about(tmp_path):
+    g = model(kind="2d")
+    longest = float(g.scales.max())
+    with pytest.warns(InputWarning, match=r"third_scale .* is longer than every splat"):
+        write_ply(tmp_path / "a.ply", g, third_scale=1.01 * longest, coordinates="world")
+    write_ply(tmp_path / "a.ply", g, third_scale=0.99 * longest, coordinates="world")
+
+
 def test_the_usual_third_scale_is_recognised_after_a_tool_dropped_the_comments(tmp_path):
     columns = columns_of(4, np.random.default_rng(0))
     columns["scale_2"][:] = np.log(1e-6)

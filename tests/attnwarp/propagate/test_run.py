@@ -554,11 +554,28 @@ def test_an_edit_made_again_for_a_picture_beside_it_has_to_be_the_same(
         beside.unlink()
         path = copy / place if place.endswith(".png") else copy / place / beside.name
         path.write_bytes(encode_png(other))
+        record = path.with_suffix(".json")
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        record.write_text(json.dumps(json.loads(record.read_text()) | {"sha256": sha256}))
         with (
             pytest.warns(InputWarning, match="missing or damaged"),
             pytest.raises(InputError, match="edit is not the one in"),
         ):
             run(scene, editor, copy)
+
+
+@pytest.mark.parametrize("place", ["source.png", "views/*.png"])
+def test_another_picture_in_place_of_an_edit_is_not_taken_for_it(
+    place, finished, scene, editor, tmp_path
+):
+    """Oracle: the bytes of the edit that nobody touched."""
+    folder = tmp_path / "folder"
+    shutil.copytree(finished[1], folder)
+    path = next(folder.glob(place))
+    path.write_bytes(encode_png(255 - read_image(path)))
+    with pytest.warns(InputWarning, match=f"{path.name}: not the picture that the edit made"):
+        run(scene, editor, folder)
+    assert files(folder) == files(finished[1])
 
 
 @pytest.mark.parametrize("name", ["features.png", "edited.ply", "segments/x.png", "views/x.json"])

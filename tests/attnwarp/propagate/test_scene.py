@@ -6,11 +6,13 @@ import json
 import numpy as np
 import pytest
 import torch
+from tiny_editors import pix2pix
 from tiny_scenes import cameras
 
 from attnwarp import Camera
+from attnwarp.editing.pix2pix import InstructPix2Pix
 from attnwarp.fit import Views
-from attnwarp.propagate.scene import Scene, images_of
+from attnwarp.propagate.scene import Scene, editor_digest, images_of
 
 RANDOM = np.random.default_rng(0)
 BYTES = RANDOM.integers(0, 256, (32, 32, 3), dtype=np.uint8)
@@ -56,3 +58,22 @@ def test_photographs_keep_their_type_and_transparent_ones_lie_over_black():
     opaque, over = images_of(Views([view, view], [BYTES, clear]))
     assert opaque is BYTES
     assert np.allclose(over, BYTES / 255 / 5, rtol=0, atol=1e-7)
+
+
+def test_editors_of_other_guidance_have_other_digests_where_their_digits_read_alike():
+    pipe = pix2pix()
+    digests = {
+        editor_digest(
+            InstructPix2Pix(
+                pipe.unet,
+                pipe.vae,
+                pipe.text_encoder,
+                pipe.tokenizer,
+                pipe.scheduler,
+                text_guidance=text,
+                image_guidance=image,
+            )
+        )
+        for text, image in ((1.5, 12), (1.51, 2), (15, 12))
+    }
+    assert len(digests) == 3

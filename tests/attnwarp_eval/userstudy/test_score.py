@@ -165,3 +165,17 @@ def test_answers_of_two_pages_are_not_mixed(tmp_path):
     assert done.exit_code == 2 and "answers of another page than" in done.stderr
     done = score(tmp_path / "none.json")
     assert done.exit_code == 2 and "No such file" in done.stderr
+
+
+def test_a_file_in_place_of_the_results_folder_is_answered_before_the_work(tmp_path):
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    done = score(answers(tmp_path, "a", [choice("q", "x", "y", "left")]), "--out", taken)
+    assert done.exit_code == 2
+    assert "taken: --out is a file, expected a folder" in done.output.replace("\n", "")
+    assert taken.read_text() == "mine"
+
+
+def test_one_person_is_not_called_people(tmp_path):
+    done = score(answers(tmp_path, "a", [choice("q", "x", "y", "left")]))
+    assert done.output.startswith("1 person made 1 choice between 2 methods")
