@@ -29,6 +29,7 @@ from attnwarp_eval.study.record import Json, Record
 from attnwarp_eval.study.results import Results
 from attnwarp_eval.study.schema import Study
 from attnwarp_eval.study.warping import warp_figures, warp_truth
+from attnwarp_eval.truth.llvm import variant
 from attnwarp_eval.truth.mitsuba import position_and_shape
 from attnwarp_eval.two_view import TwoView
 from attnwarp_eval.world import World
@@ -66,12 +67,14 @@ class Transport:
         not_simulated: effects that are not -> the same.
         plan: of the rendering, as JSON.
         everything_on: the integrator that would simulate everything.
+        variant: of Mitsuba, which draws the pictures' noise; None in former records.
     """
 
     needed: Mapping[str, str]
     not_simulated: Mapping[str, str]
     plan: Mapping[str, Any]
     everything_on: str
+    variant: str | None = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,10 @@ class Extra:
 
     def to_json(self) -> Json:
         """The record's entry ``effects``."""
-        return {} if self.transport is None else {"effects": dataclasses.asdict(self.transport)}
+        if self.transport is None:
+            return {}
+        effects = dataclasses.asdict(self.transport)
+        return {"effects": {k: v for k, v in effects.items() if (k, v) != ("variant", None)}}
 
 
 @register
@@ -128,7 +134,7 @@ class Calibration(Probe[Extra]):
             work.meter.count(pixels=size * size)
             draw = partial(of_warp, work.world, name, spec["spp"], truth, view)
             work.add(name, figures, draw)
-        return Extra(Transport(**transport_of(work.world.scene)))
+        return Extra(Transport(**transport_of(work.world.scene), variant=variant()))
 
     def read_extra(self, data: Json) -> Extra:
         """From the record's entry ``effects``, if it has one."""
@@ -260,6 +266,19 @@ class Calibration(Probe[Extra]):
                 " in the repository has that for every scene that ships."
             ),
         ]
+        variants = sorted(
+            {
+                record.extra.transport.variant
+                for _, record in results.finished(self.name)
+                if record.extra.transport and record.extra.transport.variant
+            }
+        )
+        if variants:
+            text.append(
+                f"The pictures are of Mitsuba's {' and '.join(f'`{name}`' for name in variants)}."
+                " Another variant draws other noise, and an editor of pictures that differ by noise"
+                " makes edits that differ too."
+            )
         columns = [
             "scene",
             "effects",

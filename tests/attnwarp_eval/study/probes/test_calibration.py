@@ -17,6 +17,10 @@ from attnwarp_eval.effects.table import plan_words, transport_of
 from attnwarp_eval.scene.file import load_scene
 from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.probes.base import Layout, Place
+from attnwarp_eval.study.run import plan as plan_run
+from attnwarp_eval.study.store import Store
+from attnwarp_eval.study.study import parse_study
+from attnwarp_eval.study.work import compute
 from attnwarp_eval.truth import Geometry, two_view
 from attnwarp_eval.truth.features import SolidField
 from attnwarp_eval.truth.plan import plan
@@ -176,5 +180,22 @@ def test_the_report_says_which_effects_the_studys_scenes_call_for(tmp_path):
     ((scene, usual, beyond, missing, planned, full, why),) = section.tables[0].rows
     assert scene == "fog" and "shadows" in usual and "medium (" in beyond and missing == "–"
     assert planned == full == "volpath" and "medium" in why
+    assert not any("Mitsuba's" in text for text in section.text)  # a former record
+    effects = transport_of(load_scene("fog"))
+    (section,) = sections(fog={"effects": {**effects, "variant": "scalar_rgb"}})
+    assert "Mitsuba's `scalar_rgb`" in section.text[-1]
     assert sections(old={}) == []
     assert plan_words(plan(load_scene("lens")).to_dict()) == "path, thin lens"
+
+
+def test_a_record_names_the_variant_that_drew_its_pictures(tmp_path, monkeypatch):
+    monkeypatch.setenv("ATTNWARP_MITSUBA", "scalar_rgb")
+    study = {"name": "s", "scenes": ["spheres"], "size": 16, "spp": 1, "variants": {"a": {}}}
+    run = plan_run(parse_study({**study, "probes": {"depth": ["a"]}}), Store(tmp_path))
+    (cell,) = (cell for cell in run.cells if cell.probe == "calibration")
+    stored = compute(probe("calibration"), cell, tmp_path).to_json()
+    assert stored["effects"]["variant"] == "scalar_rgb"
+    again = probe("calibration").read(stored)
+    assert again.to_json() == stored
+    del stored["effects"]["variant"]
+    assert probe("calibration").read(stored).to_json() == stored
