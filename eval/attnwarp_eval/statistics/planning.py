@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from attnwarp_eval.statistics.intervals import ByView
+from attnwarp_eval.statistics.intervals import ROUNDING, ByView
 
 MOST_SCENES = 1000
 """Where :func:`scenes_needed` stops counting."""
@@ -152,8 +152,8 @@ def parts(a: ByView, b: ByView) -> Parts:
         a, b: scene -> "view/seed" -> value. Only views that both have count.
 
     Returns:
-        NaN for the deviation of fewer than two scenes, and for the share where no scene has two
-        seeds.
+        NaN for the deviation of fewer than two scenes, and for the share where no scene has views
+        that two seeds share. A deviation that is the rounding of the values is 0.
 
     Example:
         >>> zero = {s: {"v/0": 0.0, "v/1": 0.0} for s in ("bear", "fence")}
@@ -161,27 +161,44 @@ def parts(a: ByView, b: ByView) -> Parts:
         >>> split.seeds, round(split.share, 3)  # 2 / 2 of 8
         (2.0, 0.125)
     """
-    by_seed = [scene for scene in _differences(a, b) if scene]
-    if len(by_seed) < 2:
+    scenes = [scene for scene in _differences(a, b) if scene]
+    if len(scenes) < 2:
         return Parts(math.nan, math.nan, math.nan)
-    means = [np.mean(np.concatenate(list(seeds.values()))) for seeds in by_seed]
+    means = [np.mean([d for seeds in scene.values() for d in seeds.values()]) for scene in scenes]
     deviation = float(np.std(means, ddof=1))
-    seeds = float(np.mean([len(seeds) for seeds in by_seed]))
-    several = [[np.mean(own) for own in seeds.values()] for seeds in by_seed if len(seeds) > 1]
-    if not several or deviation == 0:
-        return Parts(deviation, seeds, math.nan)
-    within = float(np.mean([np.var(own, ddof=1) / len(own) for own in several]))
-    return Parts(deviation, seeds, min(1.0, within / deviation**2))
+    values = (v for table in (a, b) for views in table.values() for v in views.values())
+    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    if deviation <= ROUNDING * largest:
+        deviation = 0.0
+    count = float(np.mean([len(scene) for scene in scenes]))
+    variances = [v for scene in scenes if (v := _variance_of_seeds(scene)) is not None]
+    if not variances or deviation == 0:
+        return Parts(deviation, count, math.nan)
+    return Parts(deviation, count, min(1.0, float(np.mean(variances)) / deviation**2))
 
 
-def _differences(a: ByView, b: ByView) -> list[dict[str, list[float]]]:
+Seeds = dict[str, dict[str, float]]
+"""Seed -> view -> difference."""
+
+
+def _variance_of_seeds(scene: Seeds) -> float | None:
+    """What few seeds add to the variance of a scene's mean, from the views that all have."""
+    shared = set.intersection(*(set(views) for views in scene.values()))
+    if len(scene) < 2 or not shared:
+        return None
+    means = [np.mean([views[view] for view in sorted(shared)]) for views in scene.values()]
+    return float(np.var(means, ddof=1)) / len(means)
+
+
+def _differences(a: ByView, b: ByView) -> list[Seeds]:
     """For each scene the differences of its views, by seed."""
     scenes = []
     for scene in sorted(set(a) & set(b)):
-        seeds: dict[str, list[float]] = {}
+        seeds: Seeds = {}
         for key in sorted(a[scene].keys() & b[scene].keys()):
             difference = b[scene][key] - a[scene][key]
             if math.isfinite(difference):
-                seeds.setdefault(key.rpartition("/")[2], []).append(difference)
+                view, _, seed = key.rpartition("/")
+                seeds.setdefault(seed, {})[view] = difference
         scenes.append(seeds)
     return scenes

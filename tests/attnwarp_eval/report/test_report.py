@@ -14,6 +14,7 @@ from scipy import stats
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.document.write import inline, markdown
 from attnwarp_eval.metrics.occlusion import COUNTS
+from attnwarp_eval.report import settling as settling_module
 from attnwarp_eval.report.ablations import ablations
 from attnwarp_eval.report.build import build, problems
 from attnwarp_eval.report.claims import Claim, JudgedClaim, claims, judge, load_claims, together
@@ -289,7 +290,83 @@ def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_othe
     (section,) = settling(written_runs.results(study(), cells))
     row = dict(zip(section.tables[0].columns, section.tables[0].rows[0], strict=True))
     assert row["hours"] == row["scenes needed"].split()[0]  # 3600 s a scene
-    assert "1.00 a scene as here" in section.text[1]
+    assert "1.00 a scene, as here" in section.text[1]
+    # An edit that has no whole is the sum of its parts; a scene that is not done does not count.
+    parts_alone = {"truth": 3100.0, "method: edit": 500.0}
+    cells[0] = cell("one", 0.1, "good", parts_alone)
+    cells[1] = written_runs.outcome("warp", "two", ["good"], None, "good-two")
+    cells.append(cell("two", 0.1, "good", {"truth": 1e6}))
+    (section,) = settling(written_runs.results(study(), cells))
+    assert "1.00 a scene, as here" in section.text[1]
+    assert "hours" not in settling(written_runs.results(study(), cells), False)[0].text[1].lower()
+
+
+def test_hours_are_not_said_where_splats_were_fitted():
+    run = results({"good": [[0.1]] * 3, "slipped": [[0.6], [0.05], [0.7]]})
+    record = run.cells[0].record
+    fitted = dataclasses.replace(record, spec={**record.spec, "fit": {"iterations": 9}})
+    cells = [dataclasses.replace(run.cells[0], record=fitted), *run.cells[1:]]
+    (section,) = settling(dataclasses.replace(run, cells=cells))
+    assert "hours" not in section.tables[0].columns
+
+
+def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table(monkeypatch):
+    """A claim about ranges of yaw has no views in common, so its seeds cannot be told apart."""
+    ranges = dataclasses.replace(
+        SLIP_CLAIM, id="range", b=None, compare_yaw=((0.0, 45.0), (45.0, 180.0))
+    )
+    monkeypatch.setattr(settling_module, "load_claims", lambda: [SLIP_CLAIM, ranges])
+    cells = [
+        written_runs.outcome(
+            "warp",
+            scene,
+            [variant],
+            written_runs.record(
+                [("v0", 10.0, {SLIP: base}), ("v1", 90.0, {SLIP: base + middle})],
+                cost={"seconds": {"truth": 1.0}, "counters": {}},
+            ),
+            f"{variant}-{scene}-{seed}",
+            seed=seed,
+        )
+        for seed, sign in ((0, -1), (1, 1))
+        for scene, middle in zip(SCENES, [0.6, -0.1, 0.6], strict=True)
+        for variant, base in (("good", 0.1), ("slipped", 0.1 + middle + 0.2 * sign))
+    ]
+    run = written_runs.results(study(seeds=[0, 1]), cells)
+    (section,) = settling(run)
+    (table,) = section.tables
+    assert [len(row) for row in table.rows] == [len(table.columns)] * 2
+    assert [row[table.columns.index("share of seeds")] == "–" for row in table.rows] == [
+        False,
+        True,
+    ]
+    assert table.without_timings().rows
+
+
+def test_more_scenes_are_needed_where_more_claims_are_told_apart(monkeypatch):
+    """Oracle: the level that Benjamini and Hochberg leave the larger of two p-values, and scipy."""
+    differences = [0.5, -0.05, 0.6]
+    run = results({"good": [[0.1]] * 3, "slipped": [[0.1 + d] for d in differences]})
+    (finding,) = judge(run, [SLIP_CLAIM])
+    adjusted = dataclasses.replace(finding, p=min(1.0, 4 * finding.contrast.p))
+    level = 1 - 0.05 * finding.contrast.p / adjusted.p
+    monkeypatch.setattr(settling_module, "judge", lambda *_: [adjusted])
+    (section,) = settling(run)
+    needed = int(section.tables[0].rows[0][3].split()[0])
+    effect = np.mean(differences) / np.std(differences, ddof=1)
+
+    def power(scenes):
+        beyond = stats.t.ppf(0.5 + level / 2, scenes - 1)
+        return stats.nct.sf(beyond, scenes - 1, effect * math.sqrt(scenes))
+
+    assert power(needed) >= 0.8 > power(needed - 1)
+
+
+def test_a_claim_of_the_sign_test_has_no_spread_to_plan_with():
+    run = results({"good": [[0.1], [0.7], [0.3]], "slipped": [[0.3], [0.9], [0.5]]})
+    (finding,) = judge(run, [SLIP_CLAIM])
+    assert finding.verdict == "can't tell"
+    assert settling(run) == []
 
 
 def test_the_share_of_seeds_and_the_narrower_interval_are_shown_where_scenes_have_several():

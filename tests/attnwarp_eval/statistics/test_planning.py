@@ -112,3 +112,19 @@ def test_seeds_that_differ_more_than_scenes_have_all_of_the_spread():
     table = {"bear": {"v/0": 0.0, "v/1": 10.0}, "fence": {"v/0": 1.0, "v/1": 11.0}}
     assert against_zero(table).share == 1.0
     assert Parts(2.0, 2, 1.0).with_seeds(8) == pytest.approx(1.0)
+
+
+def test_seeds_that_agree_have_no_share_where_a_view_of_one_is_undefined():
+    agreeing = {"v/0": 0.0, "w/0": 10.0, "v/1": 0.0}
+    table = {"bear": agreeing | {"w/1": math.nan}, "fence": {"v/0": 1.0, "v/1": 1.0}}
+    assert against_zero(table).share == 0.0
+    apart = {"bear": {"v/0": 1.0, "w/1": 2.0}, "fence": {"v/0": 1.0, "w/1": 5.0}}
+    assert math.isnan(against_zero(apart).share)
+
+
+def test_a_spread_of_rounding_is_none():
+    """0.3 and 0.1 + 0.2 differ by 5.6e-17, which is no evidence of anything."""
+    a = {"bear": {"v/0": 0.3}, "fence": {"v/0": 0.7}, "glass": {"v/0": math.inf}}
+    b = {"bear": {"v/0": 0.1 + 0.2}, "fence": {"v/0": 0.7}, "glass": {"v/0": math.inf}}
+    assert parts(a, b).scenes == 0.0
+    assert parts({"bear": {"v/0": math.inf}, **a}, {"bear": {"v/0": 0.5}, **b}).scenes == 0.0
