@@ -282,7 +282,7 @@ class _Run:
         with self.times.part("write"):
             for view, edit in zip(group, edits, strict=True):
                 pixels = to_bytes(self.work.composite(view, edit.picture))
-                self.folder.write_picture(self._picture(number, view), pixels)
+                self.folder.write_edit(self._picture(number, view), pixels)
                 about = {"view": self.names[view], "round": number + 1, **edit.about}
                 # Last: a view counts as edited once this is there.
                 self.folder.write_record(self._picture(number, view), about)

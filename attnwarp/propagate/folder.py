@@ -14,7 +14,6 @@ times.json               seconds by part, over all sittings
 
 from __future__ import annotations
 
-import hashlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -25,14 +24,16 @@ import numpy as np
 import numpy.typing as npt
 
 from attnwarp.camera import Camera
+from attnwarp.digest import digest
 from attnwarp.errors import InputError, InputWarning
 from attnwarp.io.file import FileFormatError, write_atomically
 from attnwarp.io.images import encode_png, read_image
 from attnwarp.io.names import file_stems
 from attnwarp.io.ply import read_ply
 
-FORMAT = 1
-"""Raised when a folder's files change meaning; older folders are then refused."""
+FORMAT = 2
+"""Raised when a folder's files change meaning; older folders are then refused. 2: records have the
+hash of their picture, and the editor's hash tells all guidance apart."""
 
 PROTOCOL = 2
 """Raised when the same settings come to edit views otherwise, so that no folder mixes both. 2:
@@ -61,15 +62,13 @@ class Folder:
     Attributes:
         path: see there.
         names: file names of the views, without suffix.
-        whole: edits whose record :meth:`edited` removed for a picture beside them. Made again, each
-            has to be the same.
     """
 
     def __init__(
         self, path: Path, cameras: Sequence[Camera], folders: Sequence[str] = FOLDERS
     ) -> None:
         self.path, self.folders = path, folders
-        self.whole: set[str] = set()
+        self._again: set[str] = set()  # edits that are made again
         self.names = file_stems(cameras)
 
     def claim(self, manifest: dict[str, Any]) -> None:
@@ -146,37 +145,61 @@ class Folder:
         """(H, W, 3) uint8 of a PNG that :meth:`write_picture` wrote."""
         return read_image(self.path / name)
 
+    def write_edit(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
+        """Write the picture of an edit. Made again, it has to be the same: what was tuned since
+        rests on the former one.
+
+        Raises:
+            InputError: it is another one.
+        """
+        self.check_edit(picture, pixels)
+        self.write_picture(picture, pixels)
+
     def write_record(self, picture: str, about: dict[str, Any]) -> None:
         """Write what an edit was, with the hash of its picture, which is there already: by this
         record the view counts as edited.
         """
-        sha256 = hashlib.sha256((self.path / picture).read_bytes()).hexdigest()
+        sha256 = digest(self.read_picture(picture))
         self.write_json(record_of(picture), {**about, "sha256": sha256})
+        self._again.discard(picture)
+
+    def check_edit(self, picture: str, pixels: npt.NDArray[np.uint8]) -> None:
+        """Hold an edit that is made again against its record, if there is one.
+
+        Raises:
+            InputError: it is another one.
+        """
+        record = record_of(picture)
+        if self.has(record) and self.read_json(record).get("sha256") != digest(pixels):
+            raise InputError(
+                f"{self.path}: the edit is not the one that {picture} was; go on with the same"
+                " device, number of threads and versions, or name another folder"
+            )
 
     def edited(self, picture: str, *further: str) -> bool:
         """Whether a view is edited: beside its picture stands a record, NAME.json.
 
-        A picture that is missing, damaged or another one all the same leaves no edit. Its record is
-        removed, so that the view is edited again.
+        A picture that is missing, damaged or another one all the same leaves no edit: the view is
+        edited again, and its record says what has to come out.
 
         Args:
             picture: of the edit.
             further: pictures that were written with it.
 
         Warns:
-            InputWarning: a record was removed.
+            InputWarning: a view is edited again; once for each.
         """
         record = record_of(picture)
-        if not self.has(record):
+        if not self.has(record) or picture in self._again:
             return False
         damaged = next((name for name in (picture, *further) if not self.has_picture(name)), None)
         what = "missing or damaged"
-        if damaged != picture and not self._is_own(picture):
+        if damaged is None and self.read_json(record).get("sha256") != digest(
+            self.read_picture(picture)
+        ):
             damaged, what = picture, "not the picture that the edit made"
         if damaged is not None:
-            if damaged != picture:
-                self.whole.add(picture)
-            (self.path / record).unlink()
+            self._again.add(picture)
             warnings.warn(
                 f"{self.path / damaged}: {what}; the view is edited again",
                 InputWarning,
@@ -184,12 +207,6 @@ class Folder:
             )
             return False
         return True
-
-    def _is_own(self, picture: str) -> bool:
-        """Whether a picture is the one that its record names; those of former code name none."""
-        sha256 = self.read_json(record_of(picture)).get("sha256")
-        data = (self.path / picture).read_bytes()
-        return sha256 is None or sha256 == hashlib.sha256(data).hexdigest()
 
     def has_picture(self, name: str) -> bool:
         """Whether a picture is there and can be read: a disk or a person may have damaged it."""

@@ -22,7 +22,6 @@ from attnwarp.editing.attention import Layer, Recording
 from attnwarp.editing.editor import Editor
 from attnwarp.editing.inversion import inversion_steps
 from attnwarp.editing.schedule import FRESH_PROTOCOL, START_PROTOCOL
-from attnwarp.errors import InputError
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import write_ply
 from attnwarp.propagate.editing import Guide, Source, Store, Target, ViewEditor
@@ -372,7 +371,7 @@ class _Run:
         name = self.names[view]
         text = f"editing the source, {name}" if not before else f"editing a further source, {name}"
         file = self._picture(view)
-        stored = self.folder.has(record_of(file))
+        stored = self._is_edited(view)
         # Edited again for its features, it is no progress.
         step = 0 if stored else 1
         sight = self._sight(view, self.frozen, len(before)) if before else None
@@ -387,28 +386,15 @@ class _Run:
             _, features = self._shown(source.recording)
             self._principal = Principal(features)
         if stored:
-            self._check_same(file, to_bytes(self._composite(view, source.picture)), "source's edit")
+            self.folder.check_edit(file, to_bytes(self._composite(view, source.picture)))
         elif before:
             self._write_view(0, view, source.picture, sight, before)
         else:
             self._write_source(view, source)
         return source
 
-    def _check_same(self, file: str, pixels: Bytes, what: str) -> None:
-        """Refuse an edit that is made again and differs from the one that others rest on."""
-        if not np.array_equal(pixels, self.folder.read_picture(file)):
-            raise InputError(
-                f"{self.folder.path}: the {what} is not the one in {file}; go on with the same"
-                " device, number of threads and versions, or name another folder"
-            )
-
-    def _write_edit(self, file: str, pixels: Bytes) -> None:
-        if file in self.folder.whole:
-            self._check_same(file, pixels, "view's edit")
-        self.folder.write_picture(file, pixels)
-
     def _write_source(self, view: int, source: Source) -> None:
-        self._write_edit("source.png", to_bytes(self._composite(view, source.picture)))
+        self.folder.write_edit("source.png", to_bytes(self._composite(view, source.picture)))
         if source.recording is not None:
             layer, features = self._shown(source.recording)
             size = layer.size(source.recording.plan.latent_size)
@@ -487,6 +473,8 @@ class _Run:
         sources: Sequence[Source],
     ) -> None:
         name = self.names[view]
+        file, pixels = f"views/{name}.png", to_bytes(self._composite(view, picture))
+        self.folder.check_edit(file, pixels)  # before anything is drawn anew beside it
         about: dict[str, Any] = {"view": name, "stage": stage, "injected": 0.0}
         recordings = [source.recording for source in sources if source.recording is not None]
         if sight is not None and recordings:
@@ -503,9 +491,9 @@ class _Run:
             self.folder.write_picture(
                 f"features/{name}.png", self._warped_features(view, sight, recordings)
             )
-        self._write_edit(f"views/{name}.png", to_bytes(self._composite(view, picture)))
+        self.folder.write_edit(file, pixels)
         # Last: a view counts as edited once this is there.
-        self.folder.write_record(f"views/{name}.png", about)
+        self.folder.write_record(file, about)
 
     def _warped_features(self, view: int, sight: Sight, recordings: Sequence[Recording]) -> Bytes:
         h, w = (side // self.editor.factor for side in self.sizes[view])

@@ -10,6 +10,7 @@ from attnwarp_eval.document.model import Section, Table
 from attnwarp_eval.document.numbers import number, spread
 from attnwarp_eval.report.claims import JudgedClaim, judge, load_claims
 from attnwarp_eval.statistics.planning import MOST_SCENES, effect_interval, scenes_needed
+from attnwarp_eval.study.probes.variant_splats import is_fitted
 from attnwarp_eval.study.record import Record
 from attnwarp_eval.study.results import Results
 
@@ -108,7 +109,7 @@ def _hours_a_scene(results: Results) -> float:
         for records in scenes.values()
         if None not in records
     ]
-    if not done or any("fit" in record.spec for records in done for record in records):
+    if not done or any(is_fitted(record.spec) for records in done for record in records):
         return math.nan
     return fmean(sum(map(_seconds, records)) for records in done) / 3600
 

@@ -87,8 +87,23 @@ def compute_and_write(
     try:
         Store(root).write(compute(probe, cell, Path(root), threads).to_json())
     except Exception as error:
+        if _is_interrupt(error):
+            raise KeyboardInterrupt from error
         return failure(cell, error)
     return None
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Whether an error began as Ctrl-C: native code that it lands in raises one of its own, such as
+    "returned a result with an exception set".
+    """
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        if isinstance(error, KeyboardInterrupt):
+            return True
+        seen.add(id(error))
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def failure(cell: Cell, error: BaseException) -> Failure:

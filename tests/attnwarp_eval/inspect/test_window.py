@@ -411,7 +411,7 @@ def test_the_command_refuses_by_name(tmp_path, folders, monkeypatch):
         ((*small, "--color", "maks"), "--color: got 'maks'; did you mean 'mask'?"),
         ((*small, "--color", "edit disagreement"), "--color: got 'edit disagreement'"),
         ((*small, "--pixel", "30"), "--pixel: got '30', expected COLUMN,ROW"),
-        ((*small, "--pixel", "64,3"), "--pixel: pixel: got (64, 3)"),
+        ((*small, "--pixel", "64,3"), "--pixel: got (64, 3)"),
         ((*small, "--layer", "7"), "--layer: got '7', expected WIDTHxHEIGHT"),
         ((*small, "--layer", "7x7"), "--layer: got '7x7'; expected one of 16x16, 8x8"),
         ((*small, "--scene", "bear"), "so --scene has no meaning"),

@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 from attnwarp.render.threads import set_thread_count
 from attnwarp_eval.cli.main import app
 from attnwarp_eval.cost import environment
+from attnwarp_eval.study.probes import probe
 from attnwarp_eval.study.store import Store
 
 SMALL = {
@@ -238,6 +239,23 @@ def test_an_interrupted_run_says_what_is_kept_and_how_to_go_on(folder):
     last = f"interrupted; {count} cells are kept, the same command goes on from here"
     assert done.stderr.splitlines()[-1] == f"attnwarp-eval: {last}"
     assert "Traceback" not in done.stderr
+
+
+def test_ctrl_c_that_native_code_turns_into_its_own_error_still_ends_the_run(folder, monkeypatch):
+    """As CPython does where a function of an extension is interrupted in the middle."""
+
+    def interrupted(*_):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("<method> returned a result with an exception set") from error
+
+    run = folder / "native"
+    monkeypatch.setattr(probe("warp"), "compute", interrupted)
+    done = call("run", "study.yaml", "--out", run)
+    assert done.exit_code == 130
+    assert "interrupted; " in done.stderr.splitlines()[-1]
+    assert not (run / "failed").exists() or not list((run / "failed").iterdir())
 
 
 def test_an_instrument_that_is_not_calibrated_ends_with_exit_code_3(finished, folder):

@@ -41,6 +41,11 @@ def surface_meaning(study: Study, variant: Variant) -> tuple[Any, ...]:
     return variant.settings(), variant.geometry, splats_meaning(study, variant)
 
 
+def is_fitted(spec: Mapping[str, Any]) -> bool:
+    """Whether a cell's splats are fitted: the seconds of that are the fit's own, in no cell."""
+    return "fit" in spec
+
+
 def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
     """The splats that a cell's spec names.
 
@@ -49,6 +54,6 @@ def splats_of(work: Work, spec: Mapping[str, Any] | None = None) -> Gaussians:
         spec: in place of the cell's own.
     """
     spec = work.spec if spec is None else spec
-    if "fit" in spec:
+    if is_fitted(spec):
         return fit.fit_of(work, spec).gaussians
     return splats(work.cell.scene_file, spec["size"], spec["seed"], **spec["splats"])
