@@ -71,6 +71,15 @@ def results(table, more=(), **changes):
     return written_runs.results(study(**changes), [*cells, *more])
 
 
+def cell(variant, scene, views, *, seed=0, seconds=None):
+    """A warp cell of views (name, yaw, figures)."""
+    cost = {"seconds": seconds or {"steady": 0.1}, "counters": {}}
+    data = written_runs.record(views, cost=cost)
+    return written_runs.outcome(
+        "warp", scene, [variant], data, f"{variant}-{scene}-{seed}", seed=seed
+    )
+
+
 # Differences of 0.50, 0.49 and 0.51 px: an interval of 4.303 * 0.01 / sqrt(3) to either side.
 CLEAR = {"good": [[0.1, 0.1]] * 3, "slipped": [[0.6, 0.6], [0.48, 0.7], [0.7, 0.52]]}
 
@@ -165,14 +174,10 @@ def test_a_comparison_that_a_claim_makes_has_its_verdict_in_the_tables_and_no_pa
         precision: [-0.10, -0.20, -0.12],
     }
     cells = [
-        written_runs.outcome(
-            "warp",
+        cell(
+            variant,
             scene,
-            [variant],
-            written_runs.record(
-                [("v0", 0.0, {m: 0.6 + factor * v[i] for m, v in differences.items()})],
-                cost={"seconds": {"steady": 0.1}, "counters": {}},
-            ),
+            [("v0", 0.0, {m: 0.6 + factor * v[i] for m, v in differences.items()})],
         )
         for variant, factor in (("good", 0), ("slipped", 1))
         for i, scene in enumerate(SCENES)
@@ -275,16 +280,13 @@ def test_what_would_settle_a_claim_is_worked_out_from_the_scenes_differences():
 
 
 def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_others_contain():
-    def cell(scene, value, variant, seconds):
-        data = written_runs.record(
-            [("v0", 0.0, {SLIP: value})], cost={"seconds": seconds, "counters": {}}
-        )
-        return written_runs.outcome("warp", scene, [variant], data, f"{variant}-{scene}")
+    def timed(scene, value, variant, seconds):
+        return cell(variant, scene, [("v0", 0.0, {SLIP: value})], seconds=seconds)
 
     seconds = {"truth": 3000.0, "whole": 600.0, "method: edit": 500.0, "warm": 9.0, "steady": None}
-    cells = [cell(scene, 0.1, "good", seconds) for scene in SCENES]
+    cells = [timed(scene, 0.1, "good", seconds) for scene in SCENES]
     cells += [
-        cell(scene, 0.1 + d, "slipped", {"truth": 0.0})
+        timed(scene, 0.1 + d, "slipped", {"truth": 0.0})
         for scene, d in zip(SCENES, [0.5, -0.05, 0.6], strict=True)
     ]
     (section,) = settling(written_runs.results(study(), cells))
@@ -293,9 +295,9 @@ def test_hours_to_settle_a_claim_are_those_of_the_studys_cells_without_what_othe
     assert "1.00 a scene, as here" in section.text[1]
     # An edit that has no whole is the sum of its parts; a scene that is not done does not count.
     parts_alone = {"truth": 3100.0, "method: edit": 500.0}
-    cells[0] = cell("one", 0.1, "good", parts_alone)
+    cells[0] = timed("one", 0.1, "good", parts_alone)
     cells[1] = written_runs.outcome("warp", "two", ["good"], None, "good-two")
-    cells.append(cell("two", 0.1, "good", {"truth": 1e6}))
+    cells.append(timed("two", 0.1, "good", {"truth": 1e6}))
     (section,) = settling(written_runs.results(study(), cells))
     assert "1.00 a scene, as here" in section.text[1]
     assert "hours" not in settling(written_runs.results(study(), cells), False)[0].text[1].lower()
@@ -317,15 +319,10 @@ def test_claims_with_and_without_a_share_of_seeds_stand_in_one_table(monkeypatch
     )
     monkeypatch.setattr(settling_module, "load_claims", lambda: [SLIP_CLAIM, ranges])
     cells = [
-        written_runs.outcome(
-            "warp",
+        cell(
+            variant,
             scene,
-            [variant],
-            written_runs.record(
-                [("v0", 10.0, {SLIP: base}), ("v1", 90.0, {SLIP: base + middle})],
-                cost={"seconds": {"truth": 1.0}, "counters": {}},
-            ),
-            f"{variant}-{scene}-{seed}",
+            [("v0", 10.0, {SLIP: base}), ("v1", 90.0, {SLIP: base + middle})],
             seed=seed,
         )
         for seed, sign in ((0, -1), (1, 1))
@@ -372,16 +369,7 @@ def test_a_claim_of_the_sign_test_has_no_spread_to_plan_with():
 def test_the_share_of_seeds_and_the_narrower_interval_are_shown_where_scenes_have_several():
     """Oracle: variances by hand. Scenes differ by 0.6, 0, 0.6; seeds of a scene by 0.2 about it."""
     cells = [
-        written_runs.outcome(
-            "warp",
-            scene,
-            [variant],
-            written_runs.record(
-                [("v0", 0.0, {SLIP: value})], cost={"seconds": {"truth": 1.0}, "counters": {}}
-            ),
-            f"{variant}-{scene}-{seed}",
-            seed=seed,
-        )
+        cell(variant, scene, [("v0", 0.0, {SLIP: value})], seed=seed)
         for seed, sign in ((0, -1), (1, 1))
         for scene, middle in zip(SCENES, [0.6, 0.0, 0.6], strict=True)
         for variant, value in (("good", 0.1), ("slipped", 0.1 + middle + 0.2 * sign))
