@@ -139,7 +139,7 @@ def load_world(
         aims_at_sky: see :class:`~attnwarp_eval.truth.passes.Pass`.
         unseen: load shapes that Python never sees, for the integrator aov. It counts references to
             every shape at every sample; for a shape that Python knows each count takes the
-            interpreter's lock, and a picture up to twenty times as long.
+            interpreter's lock, and a picture of positions six to eight times as long.
     """
     mi = library()
     texel = texel_size(scene) if texel is None else texel
