@@ -105,9 +105,10 @@ def welch_interval(
     """
     from scipy import stats
 
-    difference, variance, freedom = map(float, _difference(*_samples(a, b)))
-    # Samples without noise: what is left is the rounding of equal numbers.
-    if variance < 1e-20:
+    first, second = _samples(a, b)
+    difference, variance, freedom = map(float, _difference(first, second))
+    # Samples without noise: what is left is the rounding of equal numbers, whatever their unit.
+    if math.sqrt(variance) <= 1e-12 * max(np.abs(first).max(), np.abs(second).max()):
         return difference, difference, difference
     reach = float(stats.t.ppf(0.5 + level / 2, freedom)) * math.sqrt(variance)
     return difference, difference - reach, difference + reach

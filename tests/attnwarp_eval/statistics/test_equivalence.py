@@ -62,6 +62,16 @@ def test_the_interval_of_a_difference_is_scipys(level):
 
 def test_the_interval_of_samples_without_noise_is_their_difference():
     assert equivalence.welch_interval(np.full(3, 1.0), np.full(4, 1.5)) == (0.5, 0.5, 0.5)
+    # Three times 0.1 has a mean beside it.
+    assert len(set(equivalence.welch_interval(np.full(3, 0.1), np.full(3, 0.3)))) == 1
+
+
+def test_small_numbers_have_noise_too():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(1, 0.1, 7), rng.normal(1.3, 0.5, 9)
+    tiny = np.multiply(equivalence.welch_interval(a * 1e-12, b * 1e-12), 1e12)
+    assert tiny == pytest.approx(equivalence.welch_interval(a, b), rel=1e-9)
+    assert equivalence.welch_interval(np.zeros(3), np.zeros(3)) == (0.0, 0.0, 0.0)
 
 
 def test_sidak_makes_independent_tests_refuse_together_at_the_level():
