@@ -16,7 +16,7 @@ import torch
 from attnwarp import check, losses
 from attnwarp.fit import checkpoint
 from attnwarp.fit.densify import Density
-from attnwarp.fit.model import Model
+from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.fit.settings import FitSettings
 from attnwarp.fit.start import extent_of
 from attnwarp.fit.views import Views
@@ -174,8 +174,9 @@ def fit(
         stop: asked before every iteration; True ends the fit in good order.
 
     Raises:
-        ValueError: ``start`` is of another kind or degree than the settings say, the folder holds a
-            fit of other views, settings or first splats, or a number is out of range.
+        ValueError: ``start`` is of another kind or degree than the settings say or lies on a GPU,
+            the folder holds a fit of other views, settings or first splats, or a number is out of
+            range.
         FileFormatError: the folder's checkpoint is damaged.
         RuntimeError: the loss or a held-out view is no longer finite, or no splat is left; the
             message says what to try. The last checkpoint stays.
@@ -207,6 +208,7 @@ def fit(
         )
     if len(start) == 0:
         raise ValueError("start: holds no splats")
+    check_on_cpu(start)
     if max_seconds is not None:
         check.seconds(max_seconds, "max_seconds")
     check.seconds(checkpoint_seconds, "checkpoint_seconds")

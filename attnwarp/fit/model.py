@@ -33,6 +33,19 @@ in float32.
 """
 
 
+def check_on_cpu(start: Gaussians) -> None:
+    """Refuse splats on a GPU, whose pictures, statistics and random numbers would lie elsewhere.
+
+    Raises:
+        ValueError: they are not in main memory.
+    """
+    if start.means.device.type != "cpu":
+        raise ValueError(
+            f"splats: lie on {start.means.device}, but are fitted and tuned on the CPU; use"
+            " gaussians.to(device='cpu')"
+        )
+
+
 class Model:
     """Splats as Adam sees them: centres, harmonics, logit of opacity, logarithm of scales,
     quaternions.

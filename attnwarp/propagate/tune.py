@@ -18,7 +18,7 @@ from attnwarp.camera import Camera
 from attnwarp.encoders import load_encoder
 from attnwarp.fit import FitSettings, extent_of
 from attnwarp.fit.checkpoint import load, save
-from attnwarp.fit.model import Model
+from attnwarp.fit.model import Model, check_on_cpu
 from attnwarp.gaussians import Gaussians
 from attnwarp.io import FileFormatError
 from attnwarp.propagate.pictures import Image
@@ -154,6 +154,7 @@ class Tuning:
 
     Raises:
         InputError: no such perceptual distance.
+        ValueError: the splats lie on a GPU.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class Tuning:
         stages: int,
         backend: str = "auto",
     ) -> None:
+        check_on_cpu(start)
         self.settings, self.stages, self.backend = settings, stages, backend
         rates = FitSettings(kind=start.kind)
         c, g = settings.color_rate, settings.geometry_rate

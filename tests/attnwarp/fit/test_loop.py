@@ -395,6 +395,14 @@ def test_splats_of_another_kind_or_degree_are_refused(scene):
         fit(start, scene[0], FitSettings())
 
 
+def test_splats_that_lie_elsewhere_than_in_main_memory_are_refused(scene):
+    start, settings = begin(scene, iterations=5, sh_degree=0)
+    # A device without a GPU, which holds no numbers: the door of Gaussians would look at them.
+    object.__setattr__(start, "means", start.means.to("meta"))
+    with pytest.raises(ValueError, match=r"lie on meta, .*use gaussians.to\(device='cpu'\)"):
+        fit(start, scene[0], settings)
+
+
 def test_views_that_show_nothing_of_the_splats_end_in_a_clear_error(scene):
     start, settings = begin(
         scene,
