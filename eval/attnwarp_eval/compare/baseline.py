@@ -72,8 +72,9 @@ def _lines(snapshot: Snapshot) -> Iterator[str]:
             "variants": list(cell.variants),
             "seed": cell.seed,
         }
+        seeds = {"seeds": list(cell.seeds)} if cell.seeds else {}
         yield canonical_json(
-            {**name, "counters": dict(cell.counters), "definition": cell.definition}
+            {**name, **seeds, "counters": dict(cell.counters), "definition": cell.definition}
         )
         for key, figure in sorted(cell.figures.items()):
             values = without_nan(figure.values)
@@ -154,7 +155,8 @@ def _add(cells: list[Measured], data: dict[str, Any]) -> None:
     name = (data["scene"], data["probe"], tuple(map(str, data["variants"])), int(data["seed"]))
     if "counters" in data:
         counters = {key: int(value) for key, value in data["counters"].items()}
-        cells.append(Measured(*name, data["definition"], counters, {}))
+        seeds = tuple(map(int, data.get("seeds", ())))
+        cells.append(Measured(*name, data["definition"], counters, {}, seeds))
         return
     if not cells or cells[-1].key != name:
         raise ValueError("a figure without its cell's line before it")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Any
 
 from attnwarp_eval.canonical_json import digest
@@ -39,6 +40,7 @@ class Measured:
         definition: hash of all that decides its figures but the seed.
         counters: of work.
         figures: gated metrics by key.
+        seeds: all seeds of a cell that has several; empty where ``seed`` is the only one.
 
     A cell whose figures depend on the machine has neither counters nor figures.
     """
@@ -50,6 +52,7 @@ class Measured:
     definition: str
     counters: Mapping[str, int]
     figures: Mapping[str, Figure]
+    seeds: tuple[int, ...] = ()
 
     @property
     def key(self) -> tuple[str, str, tuple[str, ...], int]:
@@ -80,7 +83,8 @@ class Snapshot:
     @property
     def seeds(self) -> frozenset[int]:
         """Of the expected cells."""
-        return frozenset(cell.seed for cell in self.cells) | {key[3] for key in self.missing}
+        own = (cell.seeds or (cell.seed,) for cell in self.cells)
+        return frozenset(chain.from_iterable(own)) | {key[3] for key in self.missing}
 
 
 def read_snapshot(store: Store) -> Snapshot:
@@ -104,13 +108,13 @@ def read_snapshot(store: Store) -> Snapshot:
 
 def snapshot(results: Results) -> Snapshot:
     """The snapshot of results that have been read."""
-    reasons = {(f.scene, f.probe, f.variant): f.error for f in results.failures}
+    reasons = {failure.id: failure.error for failure in results.failures}
     cells, missing = [], {}
     for cell in results.cells:
         if cell.record is not None:
             cells.append(_measured(cell, cell.record))
             continue
-        reason = reasons.get((cell.scene, cell.probe, cell.variants[0]), "not measured")
+        reason = reasons.get(cell.id, "not measured")
         for variant in cell.variants:
             missing[cell.scene, cell.probe, variant, cell.seed] = reason
     return Snapshot(
@@ -144,6 +148,7 @@ def _measured(cell: Outcome, record: Record[Any]) -> Measured:
         definition(record.spec),
         dict(record.cost.counters) if repeatable else {},
         figures,
+        tuple(record.spec.get("seeds", ())),
     )
 
 

@@ -32,7 +32,9 @@ def read_results(store: Store) -> Results:
     """
     study, listed = stored_study(store)
     done = store.done()
-    failures = [Failure.from_json(failure) for failure in store.failures()]
+    # The folder may hold failures of cells that the study had before its content changed.
+    ids = {cell["id"] for cell in listed}
+    failures = [Failure.from_json(f) for f in store.failures() if f["id"] in ids]
     cells = []
     for cell in listed:
         record: Record[Any] | None = None
@@ -42,7 +44,13 @@ def read_results(store: Store) -> Results:
             except StoreError as error:
                 # One damaged file must not cost the report of the others.
                 failures.append(
-                    Failure(cell["scene"], cell["variants"][0], cell["probe"], str(error))
+                    Failure(
+                        cell["scene"],
+                        cell["variants"][0],
+                        cell["probe"],
+                        str(error),
+                        id=cell["id"],
+                    )
                 )
         cells.append(
             Outcome(

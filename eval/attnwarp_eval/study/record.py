@@ -228,11 +228,12 @@ class Failure:
     error: str
     title: str = ""
     traceback: str = field(default="", repr=False)
+    id: str = ""
 
     @classmethod
     def from_json(cls, data: Json) -> Failure:
         """From a failure's file."""
-        names = ("scene", "variant", "probe", "error", "title", "traceback")
+        names = ("scene", "variant", "probe", "error", "title", "traceback", "id")
         return cls(**{name: str(data.get(name, "")) for name in names})
 
 

@@ -184,7 +184,7 @@ class Store:
 
     def write_failure(self, cell_id: str, failure: dict[str, Any]) -> None:
         """Write why a cell failed; the next run tries it again."""
-        write_json(self.failed / f"{cell_id}.json", {"id": cell_id, **failure})
+        write_json(self.failed / f"{cell_id}.json", {**failure, "id": cell_id})
 
     def failures(self) -> list[dict[str, Any]]:
         """Failures of cells that have no record."""

@@ -115,4 +115,5 @@ def failure(cell: Cell, error: BaseException) -> Failure:
         f"{type(error).__name__}: {error}",
         cell.title,
         "".join(traceback.format_exception(error)),
+        cell.id,
     )

@@ -27,6 +27,7 @@ from attnwarp_eval.compare.snapshot import Figure, Measured, definition, shorten
 from attnwarp_eval.compare.write import document, summary
 from attnwarp_eval.metrics.gates import GATES, gated
 from attnwarp_eval.metrics.registry import METRICS
+from attnwarp_eval.report.results import read_results
 from attnwarp_eval.study import Store, load_study
 from attnwarp_eval.study.edit_truth import Judgement
 from attnwarp_eval.study.probes import probes, register, unregister
@@ -175,6 +176,21 @@ def test_a_dropped_or_damaged_cell_is_a_regression(stored, run, damage):
     path = run.parent / "new.jsonl"
     assert gate(path, run, "--update").exit_code == 3
     assert not path.exists()
+
+
+def test_a_failure_of_a_cell_that_the_study_no_longer_has_is_nobodys(stored, run):
+    """As a run leaves it whose size or seeds were changed after a cell had failed."""
+    store = Store(run)
+    cell = next(c for c in store.read_study()["cells"] if c["probe"] == "depth")
+    about = {"scene": cell["scene"], "variant": cell["variants"][0], "probe": "depth"}
+    store.write_failure("0" * 64, {**about, "error": "of another size"})
+    assert not read_results(store).failures
+    store.path(cell["id"]).unlink()
+    told = gate(stored / "baseline.jsonl", run).stdout
+    assert "not measured" in told and "of another size" not in told
+    store.write_failure(cell["id"], {**about, "error": "of its own"})
+    told = gate(stored / "baseline.jsonl", run).stdout
+    assert "of its own" in told and "of another size" not in told
 
 
 def test_figures_of_both_sides_are_of_the_same_views_and_a_single_bad_view_is_told():
@@ -460,6 +476,17 @@ def test_a_cell_of_several_seeds_is_the_same_with_as_many_others():
     assert {f.kind for f in compare(planned([1, 2]), planned([7, 8, 9])).faults} == {"redefined"}
 
 
+def test_a_cell_of_several_seeds_is_another_sample_with_another_of_them(tmp_path):
+    """Margins of equal seeds would call chance a regression."""
+    before = edited({"variability.within": 2.0}, "variability", seeds=[1, 2])
+    after = edited({"variability.within": 3.0}, "variability", seeds=[1, 3])
+    write_baseline(tmp_path / "baseline.jsonl", before)
+    for side in (before, read_baseline(tmp_path / "baseline.jsonl")):
+        assert compare(side, side).exact
+        result = compare(side, after)
+        assert not result.exact and not result.regressed and "seeds differ" in result.too_little
+
+
 def errors(by_seed, scenes=FEWEST_SCENES):
     """Cells of one view a scene, with the same errors by seed in all scenes but for 1 % each."""
     return Snapshot("my", "", tuple(
@@ -557,7 +584,7 @@ EDITED = {
 }
 
 
-def edited(figures, probe="editing", seconds=None):
+def edited(figures, probe="editing", seconds=None, seeds=()):
     """A calibrated run of one edit of one scene."""
     study = {"name": "edits", "scenes": ["ball"], "seeds": [1, 2], "variants": {"ours": {}},
              "probes": {probe: ["ours"]}}  # fmt: skip
@@ -567,6 +594,7 @@ def edited(figures, probe="editing", seconds=None):
         "chord": Longest("yaw015", 1.0),
     }[probe].to_json()
     spec = {"budget": {"seconds": seconds}} if seconds else {}
+    spec |= {"seeds": seeds} if seeds else {}
     cells = [
         written_runs.outcome("calibration", "ball", ["calibration"], written_runs.record(
             [("yaw015", 15.0, {"warp.epe_median": 0.1})])),
